@@ -1,0 +1,155 @@
+"""Where a splat stands when its triangle moves: one local frame per triangle (METHOD 1)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .splats import Splats
+
+CONVENTIONS = ("stga", "gaussian_avatars")
+TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class FaceFrames:
+    """Per triangle: world = scale · rotation @ local + origin.
+
+    origin (F, 3) metres, rotation (F, 3, 3) proper, quaternion (F, 4) wxyz of the same rotation, scale (F,).
+    """
+
+    origin: np.ndarray
+    rotation: np.ndarray
+    quaternion: np.ndarray
+    scale: np.ndarray
+
+
+WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 0, 0, 0]]), np.ones(1))
+"""The single frame of a world-space set of splats (face 0)."""
+
+
+def face_frames(vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, convention: str = "stga") -> FaceFrames:
+    """Local frame of every triangle of a posed mesh.
+
+    vertices, neutral (V, 3) metres; faces (F, 3). Computed and returned in float64.
+    "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit metres of the neutral mesh
+    (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
+    unit the triangle (GaussianAvatars' released code).
+    A triangle without area keeps a proper rotation and a finite scale.
+    """
+    corners = np.asarray(vertices, np.float64)[faces]
+    p0, p1, p2 = corners[:, 0], corners[:, 1], corners[:, 2]
+    origin = corners.mean(1)
+    if convention == "stga":
+        first, normal = _orthonormal(p0 - origin, _normal(p0, p1, p2))
+        rotation = np.stack([first, np.cross(normal, first), normal], axis=-1)
+        scale = np.sqrt(face_areas(vertices, faces) / np.maximum(face_areas(neutral, faces), TINY))
+        # A triangle that had no area in the neutral mesh has no meaningful ratio: keep the local metres as they are.
+        scale = np.where(face_areas(neutral, faces) > TINY, scale, 1.0)
+    elif convention == "gaussian_avatars":
+        first, normal = _orthonormal(p1 - p0, _normal(p0, p1, p2))
+        height = np.cross(first, normal)
+        rotation = np.stack([first, normal, height], axis=-1)
+        scale = (np.linalg.norm(p1 - p0, axis=-1) + np.abs(np.sum(height * (p2 - p0), axis=-1))) / 2
+    else:
+        raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
+    return FaceFrames(origin, rotation, quaternion_from_matrix(rotation), scale)
+
+
+def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area (F,) in square metres of every triangle."""
+    corners = np.asarray(vertices, np.float64)[faces]
+    return np.asarray(np.linalg.norm(_normal(corners[:, 0], corners[:, 1], corners[:, 2]), axis=-1) / 2)
+
+
+def to_world(splats: Splats, frames: FaceFrames) -> Splats:
+    """Bake local splats into world space. SH keep their coefficients: their directions are world directions."""
+    face, scale = splats.face, frames.scale[splats.face]
+    xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
+    rotation = quaternion_multiply(frames.quaternion[face], _unit_quaternion(splats.rotation))
+    log_scale = splats.log_scale + np.log(np.maximum(scale, TINY))[:, None]
+    return replace(
+        splats,
+        xyz=xyz.astype(np.float32),
+        rotation=rotation.astype(np.float32),
+        log_scale=log_scale.astype(np.float32),
+        face=np.zeros_like(face),
+    )
+
+
+def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
+    """Express world-space splats in the frames of the triangles `face` (N,): the inverse of `to_world`."""
+    scale = np.maximum(frames.scale[face], TINY)
+    xyz = np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face]) / scale[:, None]
+    inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
+    rotation = quaternion_multiply(inverse, _unit_quaternion(world.rotation))
+    return replace(
+        world,
+        xyz=xyz.astype(np.float32),
+        rotation=rotation.astype(np.float32),
+        log_scale=(world.log_scale - np.log(scale)[:, None]).astype(np.float32),
+        face=np.asarray(face, np.int32),
+    )
+
+
+def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product of wxyz quaternions (..., 4): rotate by b, then by a."""
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
+    """Unit quaternion wxyz (..., 4), w ≥ 0, of proper rotation matrices (..., 3, 3).
+
+    Builds the outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations by 180°
+    (trace −1) lose no precision.
+    """
+    m = np.asarray(matrix, np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    outer = np.empty((*m.shape[:-2], 4, 4))
+    outer[..., 0, 0] = 1 + xx + yy + zz
+    outer[..., 1, 1] = 1 + xx - yy - zz
+    outer[..., 2, 2] = 1 - xx + yy - zz
+    outer[..., 3, 3] = 1 - xx - yy + zz
+    outer[..., 0, 1] = outer[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
+    outer[..., 0, 2] = outer[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
+    outer[..., 0, 3] = outer[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]
+    outer[..., 1, 2] = outer[..., 2, 1] = m[..., 0, 1] + m[..., 1, 0]
+    outer[..., 1, 3] = outer[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
+    outer[..., 2, 3] = outer[..., 3, 2] = m[..., 1, 2] + m[..., 2, 1]
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    row = np.where(row[..., :1] < 0, -row, row)
+    return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
+
+
+def _normal(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray) -> np.ndarray:
+    return np.cross(p1 - p0, p2 - p0)
+
+
+def _orthonormal(first: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two perpendicular unit vectors along `first` and `normal` (F, 3), also where either has no length."""
+    length = np.linalg.norm(first, axis=-1, keepdims=True)
+    first = np.where(length > TINY, first / np.maximum(length, TINY), np.array([1.0, 0.0, 0.0]))
+    normal = normal - np.sum(normal * first, axis=-1, keepdims=True) * first
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    least = np.eye(3)[np.argmin(np.abs(first), axis=-1)]
+    substitute = np.cross(first, least)
+    substitute /= np.linalg.norm(substitute, axis=-1, keepdims=True)
+    return first, np.where(length > TINY, normal / np.maximum(length, TINY), substitute)
+
+
+def _unit_quaternion(q: np.ndarray) -> np.ndarray:
+    """Normalised in float64; a zero quaternion counts as the identity."""
+    q = np.asarray(q, np.float64)
+    largest = np.max(np.abs(q), axis=-1, keepdims=True)
+    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

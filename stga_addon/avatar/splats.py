@@ -1,0 +1,41 @@
+"""The 3D Gaussians themselves, as plain arrays."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+MAX_SH_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians, raw (before activation), float32 unless said.
+
+    xyz        (N, 3) position in the local frame of its face; world metres for a world-space set
+    rotation   (N, 4) quaternion wxyz, not necessarily normalised
+    log_scale  (N, 3) natural logarithm of the standard deviations
+    opacity    (N,) logit
+    sh         (N, K, 3) spherical harmonics, K = (degree + 1)²; colour = 0.5 + Y·sh, clamped at 0
+    face       (N,) int32 triangle that the splat is bound to; 0 for a world-space set
+    loose      (N,) bool: stands for something outside the mesh (hair, shoulders), so limits that tie a splat
+               to its triangle do not apply
+    """
+
+    xyz: np.ndarray
+    rotation: np.ndarray
+    log_scale: np.ndarray
+    opacity: np.ndarray
+    sh: np.ndarray
+    face: np.ndarray
+    loose: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def sh_degree(self) -> int:
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def rows(self, index: np.ndarray) -> "Splats":
+        """The splats at `index` (a boolean mask or integer array)."""
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})

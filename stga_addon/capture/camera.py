@@ -1,0 +1,54 @@
+"""A calibrated pinhole camera."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+# Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks along +z).
+GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels and pose.
+
+    width, height  image size
+    fl_x, fl_y     focal lengths
+    cx, cy         principal point from the top-left corner of the image (OpenCV; pixel centres lie at .5)
+    world_to_camera  (4, 4) float64, metres, OpenCV camera axes
+    """
+
+    width: int
+    height: int
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    world_to_camera: np.ndarray
+
+    @property
+    def position(self) -> np.ndarray:
+        """Camera centre (3,) in world metres."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return np.asarray(-rotation.T @ translation)
+
+    @property
+    def camera_to_world_gl(self) -> np.ndarray:
+        """(4, 4) pose with OpenGL camera axes: what `transform_matrix` and a Blender camera hold."""
+        return np.asarray(np.linalg.inv(self.world_to_camera) @ GL_TO_CV)
+
+    def scaled(self, factor: float) -> "Camera":
+        """The same camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
+        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fl_x=self.fl_x * x, fl_y=self.fl_y * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+
+def camera_from_gl(
+    camera_to_world: np.ndarray, width: int, height: int, fl_x: float, fl_y: float, cx: float, cy: float
+) -> Camera:
+    """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
+    world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
+    return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)

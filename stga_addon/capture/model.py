@@ -1,0 +1,52 @@
+"""What a studio recorded, independent of how it was stored."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..flame.sequence import FlameSequence
+from .camera import Camera
+
+
+@dataclass(frozen=True)
+class View:
+    """One image: a camera at a timestep. `name` is its `file_path` as the capture wrote it."""
+
+    timestep: int
+    camera_index: int
+    camera: Camera
+    name: str
+    image: Path
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A multi-view recording with a tracked mesh of constant topology per timestep.
+
+    faces      (F, 3) int32, shared by all timesteps
+    neutral    (V, 3) float64 metres: the canonical mesh (expression and pose zero)
+    views      split name ("train", "val", "test") -> its views; empty for a bare mesh sequence
+    timesteps  all timesteps that have a mesh, ascending
+    regions    key region name -> (F,) bool
+    mesh       timestep -> (V, 3) float64, the tracked mesh in world space; read when called
+    expression_mesh  (timestep, zero_pose) -> (V, 3) float64 with the rigid head motion removed (METHOD 3)
+    flame      the parameters and model behind the meshes, for FLAME captures
+    given_selection  timestep -> (F,) bool where the capture came with its own selection
+    warnings   one sentence each, for the person who opened it
+    """
+
+    root: Path
+    layout: str
+    faces: np.ndarray
+    neutral: np.ndarray
+    views: Mapping[str, tuple[View, ...]]
+    timesteps: tuple[int, ...]
+    regions: Mapping[str, np.ndarray]
+    mesh: Callable[[int], np.ndarray]
+    expression_mesh: Callable[[int, str], np.ndarray]
+    flame: FlameSequence | None = None
+    given_selection: Mapping[int, np.ndarray] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
