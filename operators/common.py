@@ -1,0 +1,85 @@
+"""What every operator needs: errors as sentences, and the way from the scene back to the capture."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..stga_addon.capture.model import Capture
+from ..stga_addon.capture.open import open_capture
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene import tags
+from . import ids
+
+
+def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
+    """Decorator of `execute`: a StgaError becomes the operator's error report, without a traceback."""
+
+    def guarded(self: Any, context: Any) -> set[str]:
+        try:
+            return execute(self, context)
+        except StgaError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    return guarded
+
+
+def settings(context: Any) -> Any:
+    """The scene's property group (`ui.properties.Settings`)."""
+    return getattr(context.scene, ids.SETTINGS)
+
+
+def head_of(context: Any) -> Any:
+    """The head the steps work on. Raises StgaError where the scene has none."""
+    head = settings(context).head
+    if head is None:
+        raise StgaError("no head in the scene: import a capture first")
+    return head
+
+
+def needs_head(operator: Any, context: Any) -> bool:
+    """Poll: whether a capture was imported; says what to do where not."""
+    if settings(context).head is not None:
+        return True
+    operator.poll_message_set("Import a capture first")
+    return False
+
+
+def capture_of(head: Any) -> Capture:
+    """Open the capture that a head was imported from again. Raises StgaError where it has moved or changed."""
+    if tags.CAPTURE not in head:
+        raise StgaError(f"{head.name}: was not imported from a capture")
+    model = head.get(tags.FLAME_MODEL)
+    return open_capture(
+        Path(head[tags.CAPTURE]),
+        flame=Path(model) if model else None,
+        principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
+    )
+
+
+def file_path(value: str, what: str) -> Path:
+    """Absolute path of a path property. Raises StgaError where it is empty, or relative to a file never saved."""
+    if not value:
+        raise StgaError(f"{what}: no path given")
+    if value.startswith("//") and not bpy.data.filepath:
+        raise StgaError(f"{what}: {value} is relative to the .blend file, which has not been saved yet")
+    return Path(bpy.path.abspath(value))
+
+
+def register_classes(classes: tuple[type, ...]) -> None:
+    """Register all classes or none."""
+    done: list[type] = []
+    try:
+        for cls in classes:
+            bpy.utils.register_class(cls)
+            done.append(cls)
+    except Exception:
+        unregister_classes(tuple(done))
+        raise
+
+
+def unregister_classes(classes: tuple[type, ...]) -> None:
+    for cls in reversed(classes):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,151 @@
+"""The avatar's own file: one npz that holds everything needed to pose and draw it."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import read_npz, write_npz
+from .embedding import CONVENTIONS
+from .splats import MAX_SH_DEGREE, Splats
+
+FORMAT = "stga-avatar"
+VERSION = 1
+SH_SIZES = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
+
+
+@dataclass(frozen=True)
+class Avatar:
+    """A trained head.
+
+    splats      in the local frames of `faces`
+    convention  of those frames: "stga" or "gaussian_avatars"
+    neutral     (V, 3) float32 metres, the canonical mesh
+    faces       (F, 3) int32
+    settings    how it was trained; anything that JSON holds
+    regions     name -> (F,) bool
+    background  red, green, blue in 0…1 that it was trained against
+    """
+
+    splats: Splats
+    convention: str
+    neutral: np.ndarray
+    faces: np.ndarray
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    regions: Mapping[str, np.ndarray] = field(default_factory=dict)
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+def write_avatar(path: Path, avatar: Avatar) -> None:
+    """Write an avatar file (npz without pickle), atomically.
+
+    Raises StgaError where the avatar would not be read back: wrong shapes, NaN, splats on missing triangles.
+    """
+    _check(path, avatar)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "convention": avatar.convention,
+        "background": list(avatar.background),
+        "regions": list(avatar.regions),
+        "settings": dict(avatar.settings),
+    }
+    arrays = {name: getattr(avatar.splats, name) for name in _SPLAT_FIELDS}
+    arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
+    arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    write_npz(path, arrays)
+
+
+def read_avatar(path: Path) -> Avatar:
+    """Read an avatar file. Raises StgaError naming the file and the field that is missing or malformed."""
+    arrays = read_npz(path)
+    header = _read_header(path, arrays)
+    missing = [name for name in (*_SPLAT_FIELDS, "neutral", "faces", "region_faces") if name not in arrays]
+    if missing:
+        raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
+    names, masks = header["regions"], arrays["region_faces"]
+    if masks.ndim != 2 or len(masks) != len(names):
+        raise StgaError(f"{path}: region_faces has shape {masks.shape}, expected ({len(names)}, faces)")
+    avatar = Avatar(
+        splats=Splats(**{name: arrays[name] for name in _SPLAT_FIELDS}),
+        convention=header["convention"],
+        neutral=arrays["neutral"],
+        faces=arrays["faces"],
+        settings=header["settings"],
+        regions=dict(zip(names, masks, strict=True)),
+        background=tuple(header["background"]),
+    )
+    _check(path, avatar)
+    return avatar
+
+
+# field -> dtype and the shape after the number of splats
+_SPLAT_FIELDS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "xyz": ("float32", (3,)),
+    "rotation": ("float32", (4,)),
+    "log_scale": ("float32", (3,)),
+    "opacity": ("float32", ()),
+    "sh": ("float32", (-1, 3)),
+    "face": ("int32", ()),
+    "loose": ("bool", ()),
+}
+
+
+def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    if "header" not in arrays or arrays["header"].dtype != np.uint8:
+        raise StgaError(f"{path}: is not an avatar file (it has no header)")
+    try:
+        header = json.loads(arrays["header"].tobytes())
+    except (ValueError, RecursionError) as error:
+        raise StgaError(f"{path}: header is not valid JSON ({error})") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
+    if header.get("version") != VERSION:
+        raise StgaError(f"{path}: has avatar format version {header.get('version')!r}, this add-on reads {VERSION}")
+    kinds = {"convention": str, "background": list, "regions": list, "settings": dict}
+    for name, kind in kinds.items():
+        if not isinstance(header.get(name), kind):
+            raise StgaError(f"{path}: header field {name!r} is missing or not a {kind.__name__}")
+    if not all(isinstance(name, str) for name in header["regions"]):
+        raise StgaError(f"{path}: header field 'regions' holds something that is not a name")
+    return header
+
+
+def _check(path: Path, avatar: Avatar) -> None:
+    """Raise StgaError where the parts of an avatar do not fit each other."""
+    if avatar.convention not in CONVENTIONS:
+        raise StgaError(f"{path}: convention is {avatar.convention!r}, expected one of {', '.join(CONVENTIONS)}")
+    _check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
+    _check_array(path, "faces", avatar.faces, "int32", (-1, 3))
+    _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
+    count = len(avatar.splats.xyz) if avatar.splats.xyz.ndim else 0
+    for name, (dtype, tail) in _SPLAT_FIELDS.items():
+        _check_array(path, name, getattr(avatar.splats, name), dtype, (count, *tail))
+    if avatar.splats.sh.shape[1] not in SH_SIZES:
+        raise StgaError(f"{path}: sh has {avatar.splats.sh.shape[1]} coefficients, expected one of {SH_SIZES}")
+    _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
+    for name, mask in avatar.regions.items():
+        _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
+    numbers = [value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1]
+    if len(numbers) != 3 or len(avatar.background) != 3:
+        raise StgaError(f"{path}: background is {avatar.background!r}, expected three numbers between 0 and 1")
+
+
+def _check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
+    """Raise StgaError unless dtype and shape (-1: any) are as expected and every number is finite."""
+    fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype != dtype:
+        expected = ", ".join("any" if size < 0 else str(size) for size in shape)
+        raise StgaError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} ({expected})")
+    if dtype == "float32" and not np.isfinite(array).all():
+        raise StgaError(f"{path}: {name} holds a value that is not finite")
+
+
+def _check_index(path: Path, name: str, index: np.ndarray, count: int, of: str) -> None:
+    if index.size and (index.min() < 0 or index.max() >= count):
+        raise StgaError(f"{path}: {name} refers to {index.min()}…{index.max()}, but there are {count} {of}")

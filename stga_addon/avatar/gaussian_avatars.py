@@ -1,0 +1,86 @@
+"""The pair of files that GaussianAvatars' viewer opens: face-local splats and the FLAME motion that drives them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import write_npz
+from ..flame.sequence import FlameSequence
+from .embedding import face_frames, to_local, to_world
+from .file import Avatar
+from .ply import PROPERTIES, read_vertices, splat_columns, splats_from_columns, stack_columns, write_columns
+from .splats import Splats
+
+PLY_NAME = "point_cloud.ply"
+MOTION_NAME = "flame_param.npz"
+BINDING = "binding_0"
+
+
+def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence) -> None:
+    """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, each atomically.
+
+    Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the triangle as the
+    float property binding_0. The motion holds every timestep of `sequence`, its static offset, and the dynamic
+    offset that the viewer insists on. Raises StgaError where the sequence's mesh is not the avatar's.
+    """
+    if not np.array_equal(sequence.model.faces, avatar.faces):
+        raise StgaError(
+            f"{folder}: the avatar's mesh ({len(avatar.faces)} triangles) is not the FLAME model's "
+            f"({len(sequence.model.faces)}), expected an avatar trained on this model's meshes"
+        )
+    splats = in_convention(avatar, "gaussian_avatars")
+    columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
+    write_columns(folder / PLY_NAME, [*PROPERTIES, BINDING], columns)
+    write_npz(folder / MOTION_NAME, motion_arrays(sequence), compressed=True)
+
+
+def read_gaussian_avatars(path: Path) -> Splats:
+    """Read a GaussianAvatars point_cloud.ply: splats in the "gaussian_avatars" convention, face from binding_0.
+
+    Raises StgaError naming the file and the property that is missing, not finite or not a triangle number.
+    """
+    vertices = read_vertices(path)
+    if BINDING not in (vertices.dtype.names or ()):
+        raise StgaError(f"{path}: has no property {BINDING!r}, which binds a GaussianAvatars splat to its triangle")
+    binding = stack_columns(path, vertices, [BINDING])[:, 0]
+    if ((binding < 0) | (binding >= 2**24) | (binding != np.floor(binding))).any():
+        raise StgaError(f"{path}: property {BINDING!r} holds a value that is not a triangle number")
+    return replace(splats_from_columns(path, vertices), face=binding.astype(np.int32))
+
+
+def in_convention(avatar: Avatar, convention: str) -> Splats:
+    """The avatar's splats in another convention's frames, standing where they stand on the neutral mesh.
+
+    Both conventions put the origin on the centroid, so it is left out and costs no precision. On a deformed
+    triangle the two conventions stretch differently; there the result is another avatar.
+    """
+    if convention == avatar.convention:
+        return avatar.splats
+    here, there = (
+        replace(frames, origin=np.zeros_like(frames.origin))
+        for frames in (
+            face_frames(avatar.neutral, avatar.faces, avatar.neutral, name) for name in (avatar.convention, convention)
+        )
+    )
+    return to_local(to_world(avatar.splats, here), there, avatar.splats.face)
+
+
+def motion_arrays(sequence: FlameSequence) -> dict[str, np.ndarray]:
+    """flame_param.npz of a GaussianAvatars avatar, float32.
+
+    shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation (T, 3), eyes_pose (T, 6),
+    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100 for I and E with a
+    published FLAME.
+    """
+    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    no_offset = np.zeros_like(sequence.model.v_template)
+    names = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
+    arrays = {name: np.stack([getattr(frame, name) for frame in frames]) for name in names}
+    arrays["shape"] = sequence.shape
+    arrays["static_offset"] = no_offset if sequence.static_offset is None else sequence.static_offset
+    arrays["dynamic_offset"] = np.stack(
+        [no_offset if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames], dtype=np.float32
+    )
+    return {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -1,0 +1,59 @@
+"""Where training starts: a regular lattice of splats on every triangle of the neutral mesh."""
+
+import numpy as np
+
+from .embedding import face_areas, face_frames
+from .splats import Splats
+
+NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
+MIN_SPACING = 1e-6  # metres; a triangle without area still needs a scale with a logarithm
+
+
+def lattice_splats(
+    neutral: np.ndarray,
+    faces: np.ndarray,
+    order: int = 2,
+    sh_degree: int = 3,
+    scale_factor: float = 0.6,
+    flatness: float = 0.5,
+    inset: float = 0.1,
+    opacity_logit: float = 0.0,
+    convention: str = "stga",
+) -> Splats:
+    """(order + 1)(order + 2) / 2 splats on every triangle, triangle by triangle, in its local frame.
+
+    neutral (V, 3) metres, faces (F, 3). Order 0 puts one splat on the centroid, order 2 the corners of the four
+    triangles that the edge midpoints cut, order 4 their midpoints too (STGA, initialisation: 15 a triangle).
+    `inset` is the share of the way to the centroid by which every point is pulled inside its triangle, so that
+    neighbouring triangles' points do not coincide. The standard deviation is scale_factor · sqrt(2 · area) / order
+    in the triangle's plane (sqrt(2 · area): the leg of the right isosceles triangle of that area) and
+    `flatness` times that along the normal. Colour starts at raw zero: grey.
+    """
+    weights = lattice_weights(order, inset)
+    frames = face_frames(neutral, faces, neutral, convention)
+    corners = np.asarray(neutral, np.float64)[faces] - frames.origin[:, None]
+    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING)[:, None, None]
+    xyz = np.einsum("pc,fci->fpi", weights, local).reshape(-1, 3)
+
+    spacing = np.sqrt(2 * face_areas(neutral, faces)) / max(order, 1)
+    sigma = scale_factor * np.maximum(spacing, MIN_SPACING) / np.maximum(frames.scale, MIN_SPACING)
+    stretch = np.ones(3)
+    stretch[NORMAL_AXIS[convention]] = flatness
+    count = len(xyz)
+    return Splats(
+        xyz=xyz.astype(np.float32),
+        rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        log_scale=np.repeat(np.log(sigma[:, None] * stretch), len(weights), axis=0).astype(np.float32),
+        opacity=np.full(count, opacity_logit, np.float32),
+        sh=np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32),
+        face=np.repeat(np.arange(len(faces), dtype=np.int32), len(weights)),
+        loose=np.zeros(count, bool),
+    )
+
+
+def lattice_weights(order: int, inset: float) -> np.ndarray:
+    """Barycentric coordinates (P, 3) of the lattice of `order`, pulled towards the centroid by `inset`."""
+    if order == 0:
+        return np.full((1, 3), 1 / 3)
+    steps = [(order - j - k, j, k) for j in range(order + 1) for k in range(order + 1 - j)]
+    return (1 - inset) * np.array(steps) / order + inset / 3

@@ -1,0 +1,72 @@
+"""Captures tracked with FLAME, as VHAP exports them and GaussianAvatars reads them."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from ..errors import StgaError
+from ..flame.masks import key_regions
+from ..flame.model import FlameModel, read_flame
+from ..flame.sequence import FlameSequence, expression_mesh, neutral_mesh, read_frame, read_identity, sequence_mesh
+from ..flame.teeth import TEMPLATE_VERTICES, with_teeth
+from .meshes import file_of, remembered
+from .model import Capture, View
+from .transforms import Transforms, tracked_files
+
+CANONICAL_NAME = "canonical_flame_param.npz"
+PARAMETERS = "flame_param"
+
+
+def open_flame_capture(
+    root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]], model_file: Path | None
+) -> Capture:
+    """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by timestep.
+
+    A model of FLAME's published 5023 vertices always gets teeth, because VHAP and GaussianAvatars track and train
+    with them; a model of any other size is taken as it is. Shape and static offset come from the first timestep.
+    Raises StgaError, also where the model file is not given: FLAME's licence does not let anyone pass it on.
+    """
+    if model_file is None:
+        raise StgaError(f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame")
+    model = flame_model(model_file)
+    files = parameter_files(root, transforms)
+    first = files[min(files)]
+    shape, static_offset = read_identity(first, model)
+    sequence = FlameSequence(
+        model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
+    )
+    regions = key_regions(model)
+    missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"
+    return Capture(
+        root=root,
+        layout="flame",
+        faces=model.faces,
+        neutral=neutral_mesh(sequence),
+        views=views,
+        timesteps=sequence.timesteps,
+        regions=regions,
+        mesh=remembered(lambda timestep: sequence_mesh(sequence, timestep), len(model.v_template)),
+        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        flame=sequence,
+        warnings=() if regions else (missing,),
+    )
+
+
+def flame_model(path: Path) -> FlameModel:
+    """The FLAME model file, with teeth where it has FLAME's 5023 vertices. Raises StgaError."""
+    model = read_flame(path)
+    return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
+
+
+def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:
+    """timestep -> parameter file, ascending; without any frames, those in `flame_param`. Raises StgaError."""
+    frames = transforms.frames
+    if any(frame.flame for frame in frames):
+        return tracked_files(frames, "flame")
+    if frames:
+        return {t: root / PARAMETERS / f"{t:05d}.npz" for t in sorted({frame.view.timestep for frame in frames})}
+    listed = (root / PARAMETERS).glob("*.npz")
+    files = {int(path.stem): path for path in listed if re.fullmatch(r"\d+", path.stem, re.ASCII)}
+    if not files:
+        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz a timestep, such as 00000.npz")
+    return dict(sorted(files.items()))

@@ -1,0 +1,78 @@
+"""Open a capture folder, whichever layout it has."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from ..errors import StgaError
+from .flame_capture import CANONICAL_NAME, PARAMETERS, open_flame_capture
+from .mesh_capture import mesh_files, open_mesh_capture, open_mesh_folder
+from .model import Capture, View
+from .principal_point import principal_point_warning
+from .release import is_release, open_release
+from .transforms import PRINCIPAL_POINTS, SPLITS, Frame, Transforms, has_transforms, read_splits
+
+NO_TRANSFORMS = Transforms({}, None, None)
+
+
+def open_capture(folder: Path, flame: Path | None = None, principal_point: str = "vhap") -> Capture:
+    """Open a capture: cameras and file names now, images and tracked meshes when they are asked for.
+
+    Layouts: "flame" (VHAP and GaussianAvatars; needs the model file `flame`), "mesh" (`mesh_path` per frame, or a
+    bare folder of meshes, which has no views) and "release" (STGA's authors). `principal_point` as in
+    `read_transforms`; the capture carries a warning where the masks speak for another one.
+    Raises StgaError in one sentence naming file, field and what was expected, also for any image, mask or tracked
+    file that is missing.
+    """
+    if principal_point not in PRINCIPAL_POINTS:
+        raise StgaError(f"principal point convention {principal_point!r} is not one of {', '.join(PRINCIPAL_POINTS)}")
+    if not folder.is_dir():
+        raise StgaError(f"{folder}: is not a folder; expected that of a capture")
+    root = folder.resolve()
+    transforms = read_splits(root, principal_point) if has_transforms(root) else NO_TRANSFORMS
+    views = {split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()}
+    _require_files(transforms)
+    capture = _open_layout(root, transforms, views, flame)
+    warning = principal_point_warning(transforms.frames, capture.mesh, principal_point)
+    return capture if warning is None else replace(capture, warnings=(*capture.warnings, warning))
+
+
+def _open_layout(
+    root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]], flame: Path | None
+) -> Capture:
+    frames = transforms.frames
+    if (root / CANONICAL_NAME).is_file() or any(frame.flame for frame in frames):
+        return open_flame_capture(root, transforms, views, flame)
+    if any(frame.mesh for frame in frames):
+        return open_mesh_capture(root, transforms, views)
+    if is_release(root):
+        return open_release(root, views)
+    if not transforms.splits and mesh_files(root):
+        return open_mesh_folder(root)
+    if not transforms.splits and (root / PARAMETERS).is_dir():
+        return open_flame_capture(root, transforms, views, flame)
+    if transforms.splits:
+        expected = "a frame with flame_param_path or mesh_path in the transforms"
+    else:
+        expected = f"transforms_{'|'.join(SPLITS)}.json, transforms.json or meshes"
+    raise StgaError(f"{root}: is not a capture; expected {expected}")
+
+
+def _require_files(transforms: Transforms) -> None:
+    """A file that is missing should be found now, not by the training an hour later."""
+    seen: set[Path] = set()
+    for frame in transforms.frames:
+        for field, path in _files(frame).items():
+            if path is not None and path not in seen:
+                if not path.is_file():
+                    raise StgaError(f"{path}: does not exist, but {frame.where} names it as its {field}")
+                seen.add(path)
+
+
+def _files(frame: Frame) -> dict[str, Path | None]:
+    return {
+        "file_path": frame.view.image,
+        "fg_mask_path": frame.view.mask,
+        "mesh_path": frame.mesh,
+        "flame_param_path": frame.flame,
+    }

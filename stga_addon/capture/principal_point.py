@@ -1,0 +1,69 @@
+"""Does the tracked mesh fall into the masks under the chosen meaning of cx and cy?"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .camera import Camera
+from .transforms import PRINCIPAL_POINTS, Frame, with_principal_point
+
+VIEWS = 4
+NOTABLY = 0.01  # share of the vertices
+
+
+def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
+    """A sentence where another convention puts notably more of the mesh into the masks, else None.
+
+    Looks at a few views with masks, and at none where the conventions agree. Only what falls outside a mask tells:
+    hair and shoulders lie inside the mask and outside the mesh. Raises StgaError where a mask cannot be read.
+    """
+    apart = [frame for frame in frames if _conventions_differ(frame)]
+    spread = np.linspace(0, len(apart) - 1, min(VIEWS, len(apart))).astype(int)
+    outside = [_shares_outside(apart[index], mesh) for index in dict.fromkeys(spread.tolist())]
+    known = [shares for shares in outside if shares is not None]
+    if not known:
+        return None
+    share = dict(zip(PRINCIPAL_POINTS, np.mean(known, axis=0).tolist(), strict=True))
+    best = min(share, key=lambda convention: share[convention])
+    if share[chosen] < 2 * share[best] + NOTABLY:
+        return None
+    return (
+        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read as {chosen!r}, "
+        f"but {share[best]:.1%} with {best!r}: the capture was probably written that way"
+    )
+
+
+def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel positions (N, 2) from the top-left corner and depths (N,) of world points (N, 3) metres."""
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = local[:, 2]
+    scaled = local[:, :2] / np.where(depth > 0, depth, np.inf)[:, None]
+    return scaled * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy], depth
+
+
+def _cameras(frame: Frame) -> list[Camera]:
+    return [with_principal_point(frame.view.camera, frame.principal, name) for name in PRINCIPAL_POINTS]
+
+
+def _conventions_differ(frame: Frame) -> bool:
+    points = np.array([(camera.cx, camera.cy) for camera in _cameras(frame)])
+    return bool((np.ptp(points, axis=0) > 0.5).any())
+
+
+def _shares_outside(frame: Frame, mesh: Callable[[int], np.ndarray]) -> list[float] | None:
+    """Share of the vertices outside the mask under each convention, or None without a mask."""
+    from .images import read_mask
+
+    mask = read_mask(frame.view)
+    if mask is None:
+        return None
+    points = mesh(frame.view.timestep)
+    return [_share_outside(points, camera, mask) for camera in _cameras(frame)]
+
+
+def _share_outside(points: np.ndarray, camera: Camera, mask: np.ndarray) -> float:
+    pixels, depth = project(points, camera)
+    column, row = np.floor(np.clip(pixels, -1, [camera.width, camera.height])).astype(int).T
+    visible = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    inside = mask[row[visible], column[visible]] > 127
+    return 1 - float(inside.sum()) / len(points)

@@ -1,0 +1,71 @@
+"""A capture in a few lines, for the person who is about to train on it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .model import Capture, View
+
+
+def describe(capture: Capture) -> list[tuple[str, str]]:
+    """(label, value) lines: what was recorded, what was tracked, and the warnings last. Reads no image."""
+    views = [view for split in capture.views.values() for view in split]
+    lines = [("folder", str(capture.root)), ("layout", capture.layout)]
+    lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained")]
+    lines += [
+        ("timesteps", spans(capture.timesteps)),
+        ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
+        ("regions", _regions(capture)),
+    ]
+    if capture.given_selection:
+        shares = [float(np.mean(selected)) for selected in capture.given_selection.values()]
+        lines.append(("given selection", f"{len(shares)} timesteps, {np.mean(shares):.1%} of the triangles on average"))
+    return lines + _flame(capture) + [("warning", warning) for warning in capture.warnings]
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """Ascending whole numbers as count, ranges and gaps: "5: 0–2, 6–7 (gap 3–5)"."""
+    starts = [n for i, n in enumerate(numbers) if i == 0 or numbers[i - 1] != n - 1]
+    ends = [n for i, n in enumerate(numbers) if i == len(numbers) - 1 or numbers[i + 1] != n + 1]
+    text = f"{len(numbers)}: " + ", ".join(_span(*pair) for pair in zip(starts, ends, strict=True))
+    gaps = [_span(end + 1, start - 1) for end, start in zip(ends[:-1], starts[1:], strict=True)]
+    return text + (f" ({'gap' if len(gaps) == 1 else 'gaps'} {', '.join(gaps)})" if gaps else "")
+
+
+def _span(first: int, last: int) -> str:
+    return str(first) if first == last else f"{first}–{last}"
+
+
+def _recorded(capture: Capture, views: list[View]) -> list[tuple[str, str]]:
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    masked = sum(view.mask is not None for view in views)
+    splits = [f"{name} {_split(split)}" for name, split in capture.views.items() if split]
+    return [
+        ("cameras", spans(sorted({view.camera_index for view in views}))),
+        ("image size", ", ".join(f"{width} x {height}" for width, height in sizes)),
+        ("masks", f"{masked} of {len(views)} views"),
+        ("splits", "; ".join(splits)),
+    ]
+
+
+def _split(views: Sequence[View]) -> str:
+    cameras = len({view.camera_index for view in views})
+    return f"{len(views)} views ({len({view.timestep for view in views})} timesteps, {cameras} cameras)"
+
+
+def _regions(capture: Capture) -> str:
+    counts = [f"{name} {int(np.count_nonzero(members))}" for name, members in capture.regions.items()]
+    return ", ".join(counts) + " triangles" if counts else "none"
+
+
+def _flame(capture: Capture) -> list[tuple[str, str]]:
+    """Offsets as tracked: the dynamic one is looked up in the first timestep."""
+    if capture.flame is None:
+        return []
+    dynamic = capture.flame.frame(capture.flame.timesteps[0]).dynamic_offset
+    offsets = (("static offset", capture.flame.static_offset), ("dynamic offset", dynamic))
+    return [(name, "none" if offset is None else f"up to {_longest(offset)}") for name, offset in offsets]
+
+
+def _longest(offset: np.ndarray) -> str:
+    return f"{1000 * float(np.linalg.norm(offset, axis=1).max()):.1f} mm"

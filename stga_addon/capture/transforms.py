@@ -1,0 +1,300 @@
+"""Cameras and frames of a capture: `transforms_{train,val,test}.json` or `transforms.json`."""
+
+import itertools
+import math
+import posixpath
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import read_json
+from .camera import Camera, camera_from_gl
+from .model import View
+
+SPLITS = ("train", "val", "test")
+PRINCIPAL_POINTS = ("vhap", "opencv", "centre")
+MAX_PIXELS = 1 << 27  # No studio camera takes larger images; a larger claim would let a small file fill the memory.
+ROTATION_TOLERANCE = 1e-3  # Exporters write float32 poses, some of them rounded to a few decimals.
+MATRIX = "a 4x4 matrix of finite numbers"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One entry of a transforms file.
+
+    principal  (cx, cy) in pixels exactly as the file writes them; the image centre where it does not
+    camera_id  the studio's own name of the camera, or None
+    mesh, flame  the tracked mesh or FLAME parameters of the frame's timestep, or None
+    where      file and entry, to begin messages with
+    """
+
+    view: View
+    principal: tuple[float, float]
+    camera_id: str | None
+    mesh: Path | None
+    flame: Path | None
+    where: str
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """All frames of a capture by split, and the files that the top level names (None where it names none)."""
+
+    splits: dict[str, tuple[Frame, ...]]
+    canonical_mesh: Path | None
+    regions: Path | None
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        return tuple(frame for split in self.splits.values() for frame in split)
+
+
+def has_transforms(folder: Path) -> bool:
+    """Whether the folder holds a transforms file of any split."""
+    return any((folder / name).is_file() for name in ("transforms.json", *map(_split_file, SPLITS)))
+
+
+def read_transforms(path: Path, principal_point: str = "vhap") -> tuple[Frame, ...]:
+    """Read the frames of one transforms file; neither images nor tracked files are opened, nor need they exist.
+
+    A frame's own intrinsics win over those of the top level, because real exports carry wrong ones there.
+    `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means: "vhap"
+    (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "centre" (cx and cy are
+    ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave it only for a
+    sibling folder (union sets of VHAP).
+    Raises StgaError naming the file and the field.
+    """
+    return _numbered(_read_frames(path, read_json(path), principal_point))
+
+
+def read_splits(folder: Path, principal_point: str = "vhap") -> Transforms:
+    """Read every split of a capture folder, as `read_transforms` does; `transforms.json` alone is all training.
+
+    Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.
+    """
+    names = {split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()}
+    documents = {split: _document(folder / name) for split, name in (names or {"train": "transforms.json"}).items()}
+    frames = {split: _read_frames(record.path, record.values, principal_point) for split, record in documents.items()}
+    numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
+    splits = {split: tuple(itertools.islice(numbered, len(frames.get(split, ())))) for split in SPLITS}
+    return Transforms(
+        splits,
+        canonical_mesh=_first_path(documents.values(), "canonical_mesh_path"),
+        regions=_first_path(documents.values(), "regions_path"),
+    )
+
+
+def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
+    """The camera with the principal point that the file's (cx, cy) mean under the convention (`read_transforms`)."""
+    if convention not in PRINCIPAL_POINTS:
+        raise StgaError(f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}")
+    if convention == "centre":
+        return replace(camera, cx=camera.width / 2, cy=camera.height / 2)
+    cx, cy = written
+    return replace(camera, cx=cx, cy=camera.height - cy if convention == "vhap" else cy)
+
+
+def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
+    """timestep -> its tracked file, ascending; `field` is "mesh" or "flame".
+
+    Raises StgaError where a frame has none, or where two frames of a timestep disagree.
+    """
+    files: dict[int, Path] = {}
+    key = "mesh_path" if field == "mesh" else "flame_param_path"
+    for frame in frames:
+        path, timestep = getattr(frame, field), frame.view.timestep
+        if path is None:
+            raise StgaError(f"{frame.where}.{key}: is missing; expected the tracked file of timestep {timestep}")
+        if files.setdefault(timestep, path) != path:
+            raise StgaError(f"{frame.where}.{key}: is {path}, but timestep {timestep} already has {files[timestep]}")
+    return dict(sorted(files.items()))
+
+
+def inside(root: Path, relative: str, where: str) -> Path:
+    """Resolve a path of a capture's file against the folder `root` of that file.
+
+    `..` may lead to a sibling of `root`, not further; links inside the capture are the owner's and are followed.
+    Raises StgaError, beginning with `where`, for absolute paths and for those that lead outside.
+    """
+    text = relative.replace("\\", "/")
+    parts = posixpath.normpath(text).split("/")
+    if not text or "\0" in text or text.startswith("/") or any(PureWindowsPath(part).drive for part in parts):
+        raise StgaError(f"{where}: {relative!r} is not a path relative to {root}")
+    # The first .. leads to the parent, where only a named sibling may follow.
+    if parts[:2] == ["..", ".."] or parts == [".."]:
+        raise StgaError(f"{where}: {relative!r} leads outside {root.parent}, where the capture must stay")
+    return root.parent.joinpath(*parts[1:]) if parts[0] == ".." else root.joinpath(*parts)
+
+
+@dataclass(frozen=True)
+class _Record:
+    """A JSON object with the file it comes from and the place in it, for messages."""
+
+    path: Path
+    place: str
+    values: dict[str, Any]
+
+    def where(self, key: str) -> str:
+        return f"{self.path}: {self.place}{key}"
+
+    def has(self, key: str) -> bool:
+        return self.values.get(key) is not None
+
+    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
+        """A finite number strictly between the bounds."""
+        value = self.values[key]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
+            bounds = (
+                "" if low == -math.inf else f" above {low:g}" + ("" if high == math.inf else f" and below {high:g}")
+            )
+            raise StgaError(f"{self.where(key)}: expected a finite number{bounds}, not {value!r}")
+        return float(value)
+
+    def natural(self, key: str) -> int:
+        value = self.values[key]
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, not {value!r}")
+        return value
+
+    def path_of(self, key: str) -> Path | None:
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, str):
+            raise StgaError(f"{self.where(key)}: expected a relative path, not {value!r}")
+        return inside(self.path.parent.resolve(), value, self.where(key))
+
+
+def _split_file(split: str) -> str:
+    return f"transforms_{split}.json"
+
+
+def _document(path: Path) -> _Record:
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise StgaError(f"{path}: expected a JSON object with the field frames")
+    return _Record(path, "", values)
+
+
+def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
+    if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
+        raise StgaError(f"{path}: frames: expected a list with one entry per image")
+    shared = _Record(path, "", values)
+    timed = any(_timestep_key(entry) for entry in values["frames"] if isinstance(entry, dict))
+    frames = []
+    for number, entry in enumerate(values["frames"]):
+        if not isinstance(entry, dict):
+            raise StgaError(f"{path}: frames[{number}]: expected an object, not {entry!r:.40}")
+        frames.append(_frame(_Record(path, f"frames[{number}].", entry), shared, timed, principal_point))
+    return frames
+
+
+def _frame(record: _Record, shared: _Record, timed: bool, principal_point: str) -> Frame:
+    image = record.path_of("file_path")
+    if image is None:
+        raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
+    if not image.suffix:  # Blender's NeRF exporters leave it out.
+        image = image.with_name(image.name + ".png")
+    key = _timestep_key(record.values)
+    if timed and key is None:
+        raise StgaError(f"{record.where('timestep_index')}: is missing, though other frames have it")
+    width, height = _image_size(record, shared, image)
+    written = _number(record, shared, "cx", width / 2), _number(record, shared, "cy", height / 2)
+    focal = _focal(record, shared, width, height)
+    camera = camera_from_gl(_pose(record), width, height, *focal, *written)
+    view = View(
+        timestep=record.natural(key) if key else 0,
+        camera_index=record.natural("camera_index") if record.has("camera_index") else -1,
+        camera=with_principal_point(camera, written, principal_point),
+        name=record.values["file_path"],
+        image=image,
+        mask=record.path_of("fg_mask_path"),
+    )
+    camera_id = str(record.values["camera_id"]) if record.has("camera_id") else None
+    where = record.where("").rstrip(".")
+    return Frame(view, written, camera_id, record.path_of("mesh_path"), record.path_of("flame_param_path"), where)
+
+
+def _timestep_key(values: dict[str, Any]) -> str | None:
+    """VHAP says timestep_index, the STGA authors' release says keyframe."""
+    return next((key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None)
+
+
+def _number(record: _Record, shared: _Record, key: str, otherwise: float) -> float:
+    source = record if record.has(key) else shared
+    return source.number(key) if source.has(key) else otherwise
+
+
+def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int]:
+    source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
+    if source is None:
+        if not image.is_file():
+            raise StgaError(f"{record.where('w')}: w and h are missing, and so is the image {image} to take them from")
+        from .images import image_size
+
+        return image_size(image)
+    width, height = source.number("w", low=0), source.number("h", low=0)
+    if width % 1 or height % 1 or width * height > MAX_PIXELS:
+        raise StgaError(f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}")
+    return int(width), int(height)
+
+
+def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
+    for source in (record, shared):
+        if source.has("fl_x"):
+            fl_x = source.number("fl_x", low=0)
+        elif source.has("camera_angle_x"):
+            fl_x = width / 2 / math.tan(source.number("camera_angle_x", low=0, high=math.pi) / 2)
+        else:
+            continue
+        if source.has("fl_y"):
+            return fl_x, source.number("fl_y", low=0)
+        if source.has("camera_angle_y") and not source.has("fl_x"):
+            return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=0, high=math.pi) / 2)
+        return fl_x, fl_x
+    raise StgaError(f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level")
+
+
+def _pose(record: _Record) -> np.ndarray:
+    where = record.where("transform_matrix")
+    try:
+        matrix = np.array(record.values["transform_matrix"], np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise StgaError(f"{where}: expected {MATRIX}") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
+    rotation = matrix[:3, :3]
+    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
+    if not orthonormal or np.linalg.det(rotation) < 0:
+        raise StgaError(f"{where}: expected a rotation without scale, shear or mirroring in its upper left 3x3 part")
+    return matrix
+
+
+def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
+    """Give cameras without an index one: that of the same camera elsewhere, or the next free number."""
+    known = {_camera_key(f): f.view.camera_index for f in frames if f.view.camera_index >= 0}
+    taken = set(known.values())
+    free = (number for number in itertools.count() if number not in taken)
+    numbered = []
+    for frame in frames:
+        if frame.view.camera_index < 0:
+            key = _camera_key(frame)
+            if key not in known:
+                known[key] = next(free)
+            frame = replace(frame, view=replace(frame.view, camera_index=known[key]))
+        numbered.append(frame)
+    return tuple(numbered)
+
+
+def _camera_key(frame: Frame) -> str | bytes:
+    """What tells cameras apart: their own name, else where they stand (a rig's cameras do not move)."""
+    # Adding zero turns −0 into 0, whose bytes differ.
+    return frame.camera_id or (np.round(frame.view.camera.world_to_camera, 6) + 0.0).tobytes()
+
+
+def _first_path(records: Iterable[_Record], key: str) -> Path | None:
+    return next((path for path in (record.path_of(key) for record in records) if path is not None), None)

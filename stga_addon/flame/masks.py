@@ -1,0 +1,33 @@
+"""FLAME's vertex masks as regions of triangles."""
+
+import numpy as np
+
+from .model import FlameModel
+
+# Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
+KEY_MASKS = {
+    "left_eye": ("left_eye_region", "left_eyeball"),
+    "right_eye": ("right_eye_region", "right_eyeball"),
+    "mouth": ("lips", "teeth"),
+    "nose": ("nose",),
+}
+
+
+def faces_within(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles (F, 3) whose three corners are all among `vertices` (ids)."""
+    return np.asarray(np.isin(faces, vertices).all(axis=1))
+
+
+def mask_faces(model: FlameModel) -> dict[str, np.ndarray]:
+    """Every vertex mask of the model as (F,) bool over its triangles."""
+    return {name: faces_within(model.faces, vertices) for name, vertices in model.masks.items()}
+
+
+def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
+    """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has is left out."""
+    regions = {}
+    for region, names in KEY_MASKS.items():
+        present = [model.masks[name] for name in names if name in model.masks]
+        if present:
+            regions[region] = faces_within(model.faces, np.concatenate(present))
+    return regions

@@ -1,0 +1,148 @@
+"""FLAME's head model: a template, its blend shapes, and a skeleton of five joints."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import read_npz
+from .unpickle import read_pickled_arrays
+
+JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
+POSE_FEATURES = 9 * (len(JOINTS) - 1)
+FULL_COMPONENTS, FULL_IDENTITY = 400, 300  # FLAME 2020 and 2023: 300 identity then 100 expression components
+MASK_FILE = "FLAME_masks.pkl"
+MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
+MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
+
+
+@dataclass(frozen=True)
+class FlameModel:
+    """FLAME's parameters as float64 arrays; V vertices, F triangles, K shape components, joints as in `JOINTS`.
+
+    v_template   (V, 3) metres
+    shapedirs    (V, 3, K): the first `n_identity` are identity, the others expression
+    posedirs     (V, 3, 36): correctives, linear in the entries of the rotations of joints 1 to 4 minus identity
+    j_regressor  (5, V): shaped vertices to joint positions
+    parents      (5,) int, -1 for the root
+    weights      (V, 5) skinning weights
+    faces        (F, 3) int32
+    masks        region name -> vertex ids
+    """
+
+    v_template: np.ndarray
+    shapedirs: np.ndarray
+    n_identity: int
+    posedirs: np.ndarray
+    j_regressor: np.ndarray
+    parents: np.ndarray
+    weights: np.ndarray
+    faces: np.ndarray
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def n_expression(self) -> int:
+        """Number of expression components."""
+        return int(self.shapedirs.shape[2]) - self.n_identity
+
+
+def read_flame(path: Path, masks: Path | None = None) -> FlameModel:
+    """Read a FLAME model from the published .pkl or from an .npz with the same keys.
+
+    Vertex masks come from `masks`, else from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
+    beside the model where there is one. Any sizes that agree with each other are accepted. Raises StgaError naming the
+    file and key that is missing, of the wrong shape or not finite, and any class a pickle has no business asking for.
+    """
+    path = Path(path)
+    in_npz = path.suffix.lower() == ".npz"
+    arrays = read_npz(path) if in_npz else read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
+    for key in MODEL_KEYS:
+        if key not in arrays:
+            raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
+    template = _floats(path, arrays, "v_template", (None, 3))
+    vertices = len(template)
+    shapedirs = _floats(path, arrays, "shapedirs", (vertices, 3, None))
+    return FlameModel(
+        v_template=template,
+        shapedirs=shapedirs,
+        n_identity=_identity_count(path, arrays, shapedirs.shape[2]),
+        posedirs=_floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES)),
+        j_regressor=_floats(path, arrays, "J_regressor", (len(JOINTS), vertices)),
+        parents=_parents(path, arrays),
+        weights=_floats(path, arrays, "weights", (vertices, len(JOINTS))),
+        faces=_faces(path, arrays, vertices),
+        masks=_masks(path, arrays, masks, vertices),
+    )
+
+
+def _check_shape(path: Path, key: str, array: np.ndarray, expected: tuple[int | None, ...]) -> None:
+    fits = array.ndim == len(expected) and all(
+        want is None or size == want for size, want in zip(array.shape, expected, strict=True)
+    )
+    if not fits or 0 in array.shape:
+        wanted = ", ".join("any" if size is None else str(size) for size in expected)
+        raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
+
+
+def _floats(path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tuple[int | None, ...]) -> np.ndarray:
+    array = arrays[key]
+    _check_shape(path, key, array, expected)
+    if array.dtype.kind not in "iuf":
+        raise StgaError(f"{path}: {key} holds {array.dtype}, expected numbers")
+    if not np.isfinite(array).all():
+        raise StgaError(f"{path}: {key} holds values that are not finite")
+    return np.ascontiguousarray(array, np.float64)
+
+
+def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
+        array = array.astype(np.int64)
+    if array.dtype.kind not in "iu":
+        raise StgaError(f"{path}: {key} holds {array.dtype}, expected whole numbers")
+    return array
+
+
+def _identity_count(path: Path, arrays: Mapping[str, np.ndarray], components: int) -> int:
+    if components == FULL_COMPONENTS:
+        return FULL_IDENTITY
+    if "n_identity" not in arrays:
+        return components * 3 // 4
+    count = _integers(path, "n_identity", arrays["n_identity"])
+    if count.size != 1 or not 0 <= int(count.reshape(())) <= components:
+        raise StgaError(f"{path}: n_identity is {count.tolist()}, expected one number from 0 to {components}")
+    return int(count.reshape(()))
+
+
+def _parents(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
+    parents: np.ndarray = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(np.int64)
+    parents[0] = -1  # the published files spell the root's parent as 2**32 - 1
+    if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
+        raise StgaError(f"{path}: kintree_table names the parents {parents.tolist()}, expected each before its child")
+    return parents
+
+
+def _faces(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> np.ndarray:
+    _check_shape(path, "f", arrays["f"], (None, 3))
+    faces = _integers(path, "f", arrays["f"]).astype(np.int64)
+    if faces.min() < 0 or faces.max() >= vertices:
+        raise StgaError(f"{path}: f names vertices {faces.min()} to {faces.max()}, expected 0 to {vertices - 1}")
+    return np.ascontiguousarray(faces, np.int32)
+
+
+def _masks(path: Path, arrays: Mapping[str, np.ndarray], given: Path | None, vertices: int) -> dict[str, np.ndarray]:
+    source = path
+    found = {key[len(MASK_PREFIX) :]: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
+    beside = path.with_name(MASK_FILE)
+    if given is not None or (not found and beside.is_file()):
+        source = Path(given) if given is not None else beside
+        found = read_pickled_arrays(source)
+    masks = {}
+    for name, ids in found.items():
+        flat = _integers(source, name, ids).astype(np.int64)
+        if flat.ndim != 1 or (flat.size and not 0 <= flat.min() <= flat.max() < vertices):
+            raise StgaError(f"{source}: mask {name} is not a list of vertex ids from 0 to {vertices - 1}")
+        masks[name] = np.unique(flat)
+    return masks

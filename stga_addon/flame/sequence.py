@@ -1,0 +1,162 @@
+"""A tracked FLAME sequence: per-timestep parameter files and the meshes they stand for."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import read_npz
+from .forward import FlameFrame, flame_forward, neutral_frame
+from .model import FlameModel
+from .teeth import TEETH_VERTICES
+
+ZERO_POSES = ("head", "all")
+FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
+COEFFICIENTS = ("expr", "shape")
+REQUIRED_FIELDS = ("expr", "rotation", "translation")
+
+
+@dataclass(frozen=True)
+class FlameSequence:
+    """One person's motion.
+
+    model          with the teeth already added where they are wanted
+    shape          (I,) identity coefficients
+    static_offset  (V, 3) metres or None
+    timesteps      ascending
+    frame          timestep -> its parameters; reads the file when called
+    """
+
+    model: FlameModel
+    shape: np.ndarray
+    static_offset: np.ndarray | None
+    timesteps: tuple[int, ...]
+    frame: Callable[[int], FlameFrame]
+
+
+def sequence_mesh(sequence: FlameSequence, timestep: int) -> np.ndarray:
+    """The tracked mesh of a timestep in world space: (V, 3) metres."""
+    return _mesh(sequence, sequence.frame(timestep))
+
+
+def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> np.ndarray:
+    """The mesh (V, 3) with the head's motion removed (STGA, selective training).
+
+    zero_pose "head" zeroes rotation, translation and neck, so that jaw and eyes count as expression; "all" zeroes
+    jaw and eyes too. Raises StgaError for any other value.
+    """
+    if zero_pose not in ZERO_POSES:
+        raise StgaError(f"zero_pose is {zero_pose!r}, expected one of {', '.join(ZERO_POSES)}")
+    zero = np.zeros(3)
+    frame = replace(sequence.frame(timestep), rotation=zero, translation=zero, neck_pose=zero)
+    if zero_pose == "all":
+        frame = replace(frame, jaw_pose=zero, eyes_pose=np.zeros(6))
+    return _mesh(sequence, frame)
+
+
+def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
+    """The canonical mesh (V, 3): expression, pose and translation zero, with the person's shape and static offset."""
+    return _mesh(sequence, neutral_frame(sequence.model))
+
+
+def _mesh(sequence: FlameSequence, frame: FlameFrame) -> np.ndarray:
+    return flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
+
+
+def read_frame(path: Path, model: FlameModel) -> FlameFrame:
+    """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without a leading 1.
+
+    Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression coefficients than the model has, and
+    offsets without the teeth's vertices, are filled up with zeros. Raises StgaError naming the file and the field.
+    """
+    return _frame(path, read_npz(path), model)
+
+
+def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
+    """Shape coefficients (I,) and static offset (V, 3) or None from a parameter file. Errors as in `read_frame`."""
+    return _identity(path, read_npz(path), model)
+
+
+def read_motion(path: Path, model: FlameModel) -> FlameSequence:
+    """Read a whole motion from one file: arrays with a leading time axis.
+
+    VHAP's `tracked_flame_params_*.npz` and the `flame_param.npz` of a GaussianAvatars avatar. Timesteps count from 0.
+    Raises StgaError naming the file and the field.
+    """
+    arrays = read_npz(path)
+    for name in REQUIRED_FIELDS:
+        if name not in arrays:
+            raise StgaError(f"{path}: has no {name}, which a FLAME motion needs")
+    if arrays["expr"].ndim != 2 or not len(arrays["expr"]):
+        raise StgaError(f"{path}: expr has shape {arrays['expr'].shape}, expected (timesteps, coefficients)")
+    count = len(arrays["expr"])
+    shape, static_offset = _identity(path, arrays, model)
+    moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
+    for name, array in moving.items():
+        if array.ndim < 2 or len(array) != count:
+            raise StgaError(f"{path}: {name} has shape {array.shape}, expected {count} timesteps first")
+
+    def frame(timestep: int) -> FlameFrame:
+        return _frame(path, {name: array[timestep] for name, array in moving.items()}, model)
+
+    for timestep in range(count):
+        frame(timestep)  # a wrong value in the middle is reported when the file is opened, not minutes later
+    return FlameSequence(model, shape, static_offset, tuple(range(count)), frame)
+
+
+def _frame(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameFrame:
+    for name in REQUIRED_FIELDS:
+        if name not in arrays:
+            raise StgaError(f"{path}: has no {name}, which a FLAME frame needs")
+    sizes = dict.fromkeys(FRAME_FIELDS, 3) | {"expr": model.n_expression, "eyes_pose": 6}
+    values = {name: _vector(path, arrays, name, size) for name, size in sizes.items()}
+    offset = _offset(path, arrays, "dynamic_offset", len(model.v_template))
+    return FlameFrame(**values, dynamic_offset=offset)
+
+
+def _identity(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
+    if "shape" not in arrays:
+        raise StgaError(f"{path}: has no shape, the person's identity coefficients")
+    return (
+        _vector(path, arrays, "shape", model.n_identity),
+        _offset(path, arrays, "static_offset", len(model.v_template)),
+    )
+
+
+def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "iuf":
+        raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
+    if not np.isfinite(array).all():
+        raise StgaError(f"{path}: {name} holds values that are not finite")
+    return array.astype(np.float64)
+
+
+def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) -> np.ndarray:
+    """(size,) float64 from (size,) or (1, size); absent fields are zero, shorter coefficient vectors padded."""
+    vector = np.zeros(size)
+    if name not in arrays:
+        return vector
+    array = _finite(path, name, arrays[name])
+    given = array[0] if array.ndim == 2 and len(array) == 1 else array
+    fits = given.ndim == 1 and (given.size == size or (name in COEFFICIENTS and given.size < size))
+    if not fits:
+        raise StgaError(f"{path}: {name} has shape {array.shape}, expected ({size},) or (1, {size})")
+    vector[: given.size] = given
+    return vector
+
+
+def _offset(path: Path, arrays: Mapping[str, np.ndarray], name: str, vertices: int) -> np.ndarray | None:
+    """(V, 3) float64 or None where it is absent or all zero; rows of the teeth are added or dropped to fit."""
+    if name not in arrays:
+        return None
+    array = _finite(path, name, arrays[name])
+    rows = array.shape[-2] if array.ndim >= 2 else 0
+    accepted = (vertices, vertices - TEETH_VERTICES, vertices + TEETH_VERTICES)
+    if array.ndim not in (2, 3) or rows not in accepted or array.size != rows * 3:
+        raise StgaError(f"{path}: {name} has shape {array.shape}, expected ({vertices}, 3) or (1, {vertices}, 3)")
+    offset = np.zeros((vertices, 3))
+    kept = min(rows, vertices)
+    offset[:kept] = array.reshape(rows, 3)[:kept]
+    return offset if offset.any() else None

@@ -1,0 +1,286 @@
+"""Arrays out of a pickle without running anything it asks for.
+
+FLAME's model files are Python 2 pickles of numpy arrays, scipy.sparse matrices and chumpy objects. A pickle may name
+any function and have it called, so every global a file asks for is answered with an inert stand-in defined here, and
+a global outside that short list is refused by name. numpy itself rebuilds nothing; neither scipy nor chumpy is needed.
+"""
+
+import io
+import math
+import pickle
+import pickletools
+import re
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+
+MAX_FILE_BYTES = 2 << 30
+MAX_DENSE_ELEMENTS = 1 << 28
+SPARSE_CLASS = re.compile(r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)")
+
+
+class _Stray(Exception):
+    """A pickled value that cannot become an array; the message completes 'is ...'."""
+
+
+class _Inert:
+    """What a pickle builds in place of an object: remembers its state, does nothing."""
+
+    source = "object"
+
+    def __new__(cls, *arguments: Any, **keywords: Any) -> "_Inert":
+        made = super().__new__(cls)
+        made.arguments = arguments
+        made.state = None
+        return made
+
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        pass
+
+    arguments: tuple[Any, ...]
+    state: Any
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _Array(_Inert):
+    source = "numpy.ndarray"
+
+
+class _Dtype(_Inert):
+    source = "numpy.dtype"
+
+
+class _Scalar(_Inert):
+    source = "numpy.scalar"
+
+
+class _Buffer(_Inert):
+    """An array of pickle protocol 5: arguments are buffer, dtype, shape, order."""
+
+    source = "numpy.frombuffer"
+
+
+class _Sparse(_Inert):
+    source = "scipy.sparse"
+    format = "csc"
+
+
+class _Chumpy(_Inert):
+    source = "chumpy"
+
+
+def _array_shell(kind: Any, shape: Any, dtype: Any) -> _Array:
+    # numpy's own reconstructor would allocate `shape` at once; the contents arrive with the state.
+    return _Array()
+
+
+def _reconstructor(kind: Any, base: Any, state: Any) -> _Inert:
+    if not (isinstance(kind, type) and issubclass(kind, _Inert)):
+        raise pickle.UnpicklingError("rebuilds an object that is not an array")
+    return kind()
+
+
+def _encode(text: str, encoding: str = "latin1") -> bytes:
+    if encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError(f"encodes bytes as {encoding}")
+    return text.encode("latin1")
+
+
+GLOBALS: dict[str, Callable[..., Any]] = {
+    "numpy.ndarray": _Array,
+    "numpy.dtype": _Dtype,
+    "_codecs.encode": _encode,
+    "collections.OrderedDict": OrderedDict,
+    **{f"{core}.multiarray._reconstruct": _array_shell for core in ("numpy.core", "numpy._core")},
+    **{f"{core}.multiarray.scalar": _Scalar for core in ("numpy.core", "numpy._core")},
+    **{f"{core}.numeric._frombuffer": _Buffer for core in ("numpy.core", "numpy._core")},
+    **{f"{module}._reconstructor": _reconstructor for module in ("copy_reg", "copyreg")},
+    **{f"{module}.object": _Inert for module in ("__builtin__", "builtins")},
+    **{f"{module}.set": set for module in ("__builtin__", "builtins")},
+}
+
+
+class _Refused(Exception):
+    """A global outside the list; the message is its name."""
+
+
+class _RestrictedUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        wanted = f"{module}.{name}"
+        if wanted in GLOBALS:
+            return GLOBALS[wanted]
+        if sparse := SPARSE_CLASS.fullmatch(wanted):
+            return type("_Sparse", (_Sparse,), {"source": wanted, "format": sparse["format"]})
+        if re.fullmatch(r"chumpy(\.\w+)*", module) and name.isidentifier():
+            return type("_Chumpy", (_Chumpy,), {"source": wanted})
+        raise _Refused(wanted)
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError("asks for objects outside the file")
+
+
+def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of a pickled dictionary, dense, by key; `names` limits which entries are looked at.
+
+    scipy.sparse matrices are densified and chumpy objects replaced by their value. Raises StgaError where the file is
+    missing, truncated, too large, no dictionary of arrays, or asks for any other class (named in the message).
+    """
+    loaded = _load(path)
+    if not isinstance(loaded, dict):
+        raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
+    arrays = {}
+    for key in names if names is not None else [name for name in loaded if isinstance(name, str)]:
+        if key in loaded:
+            try:
+                arrays[key] = _dense(loaded[key])
+            except _Stray as error:
+                raise StgaError(f"{path}: {key} is {error}, expected an array of numbers") from error
+    return arrays
+
+
+def _load(path: Path) -> Any:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise StgaError(f"{path}: is {path.stat().st_size} bytes, more than the {MAX_FILE_BYTES} allowed")
+        data = path.read_bytes()
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    try:
+        _check_memo(data)
+        return _RestrictedUnpickler(io.BytesIO(data), encoding="latin1").load()
+    except _Refused as error:
+        raise StgaError(f"{path}: asks for the class {error}, refused: only arrays are read") from error
+    except Exception as error:
+        # A damaged pickle can raise nearly anything from the opcodes it happens to spell.
+        reason = str(error) or type(error).__name__
+        raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
+
+
+def _check_memo(data: bytes) -> None:
+    """Refuse memo slots beyond the file's length: the C unpickler would allocate a table that large."""
+    for opcode, argument, _ in pickletools.genops(data):
+        if argument is not None and "PUT" in opcode.name and not 0 <= int(argument) <= len(data):
+            raise pickle.UnpicklingError(f"memo slot {argument} in a file of {len(data)} bytes")
+
+
+def _dense(value: Any) -> np.ndarray:
+    if isinstance(value, _Array):
+        return _array(value)
+    if isinstance(value, _Buffer):
+        return _from_buffer(value)
+    if isinstance(value, _Scalar) and len(value.arguments) == 2:
+        return _from_bytes(value.arguments[1], _dtype(value.arguments[0]), (), "C")
+    if isinstance(value, _Sparse):
+        return _sparse(value)
+    if isinstance(value, _Chumpy):
+        return _chumpy(value)
+    if isinstance(value, list | tuple | int | float):
+        try:
+            plain = np.asarray(value)
+        except (ValueError, OverflowError) as error:
+            raise _Stray("a ragged list") from error
+        if plain.dtype.kind in "biuf":
+            return plain
+    raise _Stray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
+
+
+def _array(value: _Array) -> np.ndarray:
+    state = value.state
+    if not isinstance(state, tuple) or len(state) < 4:
+        raise _Stray("an incomplete array")
+    shape, dtype, fortran, raw = state[-4:]
+    return _from_bytes(raw, _dtype(dtype), shape, "F" if fortran else "C")
+
+
+def _from_buffer(value: _Buffer) -> np.ndarray:
+    if len(value.arguments) != 4:
+        raise _Stray("an incomplete array")
+    raw, dtype, shape, order = value.arguments
+    return _from_bytes(raw, _dtype(dtype), shape, "F" if order == "F" else "C")
+
+
+def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.ndarray:
+    if isinstance(raw, str):  # Python 2 bytes, read as latin1
+        try:
+            raw = raw.encode("latin1")
+        except UnicodeEncodeError as error:
+            raise _Stray("an array of text") from error
+    if not isinstance(raw, bytes | bytearray):
+        raise _Stray("an array of objects")
+    if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise _Stray("an array without a shape")
+    if len(raw) != math.prod(shape) * dtype.itemsize:
+        raise _Stray(f"an array of shape {shape} with {len(raw)} bytes of data")
+    flat = np.frombuffer(raw, dtype).astype(dtype.newbyteorder("="))
+    return flat.reshape(shape[::-1]).T if order == "F" else flat.reshape(shape)
+
+
+def _dtype(value: Any) -> np.dtype[Any]:
+    code = value.arguments[0] if isinstance(value, _Dtype) and value.arguments else None
+    if not isinstance(code, str) or not re.fullmatch(r"[iuf][1248]|b1", code):
+        raise _Stray(f"an array of type {code}" if isinstance(code, str) else "an array of unknown type")
+    if code == "f1":
+        raise _Stray("an array of type f1")
+    order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
+    return np.dtype(code).newbyteorder(">" if order == ">" else "<")
+
+
+def _sparse(value: _Sparse) -> np.ndarray:
+    """Dense (rows, columns) matrix of a pickled compressed or coordinate matrix."""
+    state = value.state if isinstance(value.state, dict) else {}
+    shape = state.get("_shape", state.get("shape"))
+    if not isinstance(shape, tuple) or len(shape) != 2 or not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise _Stray("a sparse matrix without a shape")
+    if math.prod(shape) > MAX_DENSE_ELEMENTS:
+        raise _Stray(f"a sparse matrix of shape {shape}, too large to fill in")
+    data = _dense(state.get("data"))
+    rows, columns = _sparse_indices(value.format, state)
+    if not (data.shape == rows.shape == columns.shape):
+        raise _Stray("a sparse matrix whose indices do not match its data")
+    if len(data) and (min(rows.min(), columns.min()) < 0 or rows.max() >= shape[0] or columns.max() >= shape[1]):
+        raise _Stray("a sparse matrix with indices outside its shape")
+    dense = np.zeros(shape, np.float64)
+    np.add.at(dense, (rows, columns), data)  # a sparse matrix may hold an entry twice, meaning their sum
+    return dense
+
+
+def _sparse_indices(layout: str, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    if layout == "coo":
+        if "coords" in state and len(state["coords"]) == 2:
+            return _integers(state["coords"][0]), _integers(state["coords"][1])
+        return _integers(state.get("row")), _integers(state.get("col"))
+    inner, starts = _integers(state.get("indices")), _integers(state.get("indptr"))
+    counts = np.diff(starts)
+    if len(starts) == 0 or (counts < 0).any() or counts.sum() != len(inner):
+        raise _Stray("a sparse matrix whose index pointers do not match its indices")
+    outer = np.repeat(np.arange(len(counts)), counts)
+    return (inner, outer) if layout == "csc" else (outer, inner)
+
+
+def _integers(value: Any) -> np.ndarray:
+    array = _dense(value)
+    if array.dtype.kind not in "iu" or array.ndim != 1:
+        raise _Stray("a sparse matrix with broken indices")
+    return array.astype(np.int64)
+
+
+def _chumpy(value: _Chumpy) -> np.ndarray:
+    """The value of a chumpy leaf (`x`) or of a selection of a leaf's elements (`a`, `idxs`)."""
+    state = value.state if isinstance(value.state, dict) else {}
+    if "x" in state:
+        return _dense(state["x"])
+    if "a" in state and "idxs" in state:
+        source, chosen = _dense(state["a"]).ravel(), _dense(state["idxs"])
+        if chosen.dtype.kind not in "iu" or (chosen.size and not 0 <= chosen.min() <= chosen.max() < source.size):
+            raise _Stray(f"a {value.source} with indices outside its array")
+        picked: np.ndarray = source[chosen]
+        shape = state.get("preferred_shape")
+        return picked.reshape(shape) if isinstance(shape, tuple) and math.prod(shape) == picked.size else picked
+    raise _Stray(f"a {value.source}, whose value is not stored in the file")

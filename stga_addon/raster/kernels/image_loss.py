@@ -1,0 +1,163 @@
+"""(1 − w)·L1 + w·(1 − SSIM) and its gradient in one sweep over the rows of each rectangle of an image.
+
+SSIM: Gaussian window of 11 pixels, σ 1.5, zero padding, per channel, C1 = 0.01², C2 = 0.03² (Wang et al. 2004, as
+used by 3D Gaussian splatting). Rows of horizontally blurred values live in rings of eleven, so the intermediate
+maps never reach main memory.
+"""
+
+import numpy as np
+from numba import prange
+
+from . import inline_jit, parallel_jit
+
+RADIUS = 5
+REACH = 2 * RADIUS
+"""A pixel's gradient depends on image pixels up to this far away."""
+RING = 2 * RADIUS + 1
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+_window = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in (_window / _window.sum())[: RADIUS + 1])
+ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+
+
+@inline_jit
+def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
+    return (
+        W0 * (a[i0] + a[i10]) + W1 * (a[i1] + a[i9]) + W2 * (a[i2] + a[i8])
+        + W3 * (a[i3] + a[i7]) + W4 * (a[i4] + a[i6]) + W5 * a[i5]
+    )  # fmt: skip
+
+
+@inline_jit
+def _blur_row(source, offset, out, at, count):
+    """Horizontal blur of source[offset + RADIUS : …] to out[at : at + count]; the source row is padded by RADIUS."""
+    for x in range(np.uint64(count)):
+        i = np.uint64(offset) + x
+        one = np.uint64(1)
+        i1 = i + one
+        i2 = i1 + one
+        i3 = i2 + one
+        i4 = i3 + one
+        i5 = i4 + one
+        i6 = i5 + one
+        i7 = i6 + one
+        i8 = i7 + one
+        i9 = i8 + one
+        i10 = i9 + one
+        out[np.uint64(at) + x] = _blur(source, i, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10)
+
+
+@inline_jit
+def _blur_column(ring, plane, stride, row, out, at, count):
+    """Vertical blur of the ring's eleven rows around `row` to out[at : at + count]."""
+    base = plane * RING
+    r0 = np.uint64((base + (row - 5) % RING) * stride)
+    r1 = np.uint64((base + (row - 4) % RING) * stride)
+    r2 = np.uint64((base + (row - 3) % RING) * stride)
+    r3 = np.uint64((base + (row - 2) % RING) * stride)
+    r4 = np.uint64((base + (row - 1) % RING) * stride)
+    r5 = np.uint64((base + row % RING) * stride)
+    r6 = np.uint64((base + (row + 1) % RING) * stride)
+    r7 = np.uint64((base + (row + 2) % RING) * stride)
+    r8 = np.uint64((base + (row + 3) % RING) * stride)
+    r9 = np.uint64((base + (row + 4) % RING) * stride)
+    r10 = np.uint64((base + (row + 5) % RING) * stride)
+    for x in range(np.uint64(count)):
+        out[np.uint64(at) + x] = _blur(
+            ring, r0 + x, r1 + x, r2 + x, r3 + x, r4 + x, r5 + x, r6 + x, r7 + x, r8 + x, r9 + x, r10 + x
+        )
+
+
+@parallel_jit
+def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
+    """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
+
+    image (3, H, W) float32; target (3, H, W) uint8; the loss is the mean over all 3·H·W values, so `scale` is
+    1 / (3·H·W). Reads the image up to REACH pixels around a rectangle. Writes gradient (3, H, W) and, per rectangle,
+    sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
+    """
+    height, width = image.shape[1], image.shape[2]
+    for job in prange(len(rectangles) * 3):
+        r, c = job // 3, job % 3
+        x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
+        # Columns [left, right) hold everything that matters; each row buffer is padded by RADIUS zeros.
+        left, right = max(0, x0 - REACH), min(width, x1 + REACH)
+        span = right - left
+        stride = span + 2 * RADIUS
+        source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
+        first = np.zeros(4 * RING * stride, np.float32)
+        moments = np.zeros(4 * stride, np.float32)
+        slopes = np.zeros(3 * stride, np.float32)
+        second = np.zeros(3 * RING * stride, np.float32)
+        blurred = np.zeros(3 * stride, np.float32)
+        difference, similarity = 0.0, 0.0
+        for row in range(y0 - REACH, y1 + REACH):
+            # 1. horizontal blur of this row's four values
+            inside = 0 <= row < height
+            if inside:
+                for n in range(span):
+                    x = image[c, row, left + n]
+                    y = np.float32(target[c, row, left + n]) * np.float32(1 / 255)
+                    at = RADIUS + n
+                    source[at] = x
+                    source[stride + at] = y
+                    source[2 * stride + at] = x * x + y * y
+                    source[3 * stride + at] = x * y
+            for plane in range(4):
+                into = (plane * RING + row % RING) * stride
+                if inside:
+                    _blur_row(source, plane * stride, first, into, span)
+                else:
+                    first[into : into + span] = ZERO
+            # 2. SSIM of the row five above, and its slopes blurred horizontally
+            middle = row - RADIUS
+            if middle < y0 - RADIUS:
+                continue
+            inside = 0 <= middle < height
+            if inside:
+                for plane in range(4):
+                    _blur_column(first, plane, stride, middle, moments, plane * stride, span)
+                counted = y0 <= middle < y1
+                total = ZERO
+                for n in range(np.uint64(span)):
+                    mx, my = moments[n], moments[np.uint64(stride) + n]
+                    squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
+                    mxy, mm = mx * my, mx * mx + my * my
+                    a, b = TWO * mxy + C1, TWO * (product - mxy) + C2
+                    d, e = mm + C1, squares - mm + C2
+                    over = ONE / (d * e)
+                    ssim = a * b * over
+                    # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
+                    by_product = TWO * a * over
+                    by_squares = -ssim * d * over
+                    by_mean = TWO * my * (b - a) * over - TWO * mx * ssim * (e - d) * over
+                    slopes[np.uint64(RADIUS) + n] = by_mean
+                    slopes[np.uint64(stride + RADIUS) + n] = by_squares
+                    slopes[np.uint64(2 * stride + RADIUS) + n] = by_product
+                    held = (n + np.uint64(left) >= np.uint64(x0)) and (n + np.uint64(left) < np.uint64(x1))
+                    total += ssim if held else ZERO
+                if counted:
+                    similarity += total
+            for plane in range(3):
+                into = (plane * RING + middle % RING) * stride
+                if inside:
+                    _blur_row(slopes, plane * stride, second, into, span)
+                else:
+                    second[into : into + span] = ZERO
+            # 3. gradient of the row five above that
+            out = middle - RADIUS
+            if out < y0 or out >= y1 or out < 0 or out >= height:
+                continue
+            for plane in range(3):
+                _blur_column(second, plane, stride, out, blurred, plane * stride, span)
+            absolute = ZERO
+            for n in range(x0 - left, x1 - left):
+                x = image[c, out, left + n]
+                y = np.float32(target[c, out, left + n]) * np.float32(1 / 255)
+                sign = ONE if x > y else (-ONE if x < y else ZERO)
+                absolute += abs(x - y)
+                slope = blurred[n] + TWO * x * blurred[stride + n] + y * blurred[2 * stride + n]
+                gradient[c, out, left + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+            difference += absolute
+        sums[job, 0] = difference
+        sums[job, 1] = similarity

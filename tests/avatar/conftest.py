@@ -1,0 +1,45 @@
+"""A small mesh with splats on it."""
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.splats import Splats
+
+
+def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Splats:
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape).astype(np.float32)
+
+    return Splats(
+        xyz=normal(count, 3),
+        rotation=normal(count, 4) * 3,
+        log_scale=normal(count, 3) - 4,
+        opacity=normal(count),
+        sh=normal(count, (sh_degree + 1) ** 2, 3),
+        face=rng.integers(0, faces, count).astype(np.int32),
+        loose=rng.random(count) < 0.3,
+    )
+
+
+def random_mesh(seed: int, vertices: int = 20, faces: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and faces (F, 3) int32 of different corners: a soup of well-shaped triangles."""
+    rng = np.random.default_rng(seed)
+    corners = rng.permuted(np.tile(np.arange(vertices, dtype=np.int32), (faces, 1)), axis=1)[:, :3]
+    return rng.normal(size=(vertices, 3)) * 0.1, np.ascontiguousarray(corners)
+
+
+@pytest.fixture
+def avatar() -> Avatar:
+    neutral, faces = random_mesh(0)
+    return Avatar(
+        splats=random_splats(1, 50, len(faces)),
+        convention="stga",
+        neutral=neutral.astype(np.float32),
+        faces=faces,
+        settings={"lattice": 2, "rates": {"xyz": 1e-4}, "name": "Zoë", "steps": [1, 2, 3], "resume": None},
+        regions={"mouth": np.arange(30) < 4, "left eye": np.arange(30) % 5 == 0},
+        background=(1.0, 0.5, 0.0),
+    )

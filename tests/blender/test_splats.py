@@ -1,0 +1,265 @@
+"""Splat objects against the numpy embedding, on a head that shape keys animate."""
+
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world  # noqa: E402
+from stga_addon.avatar.file import Avatar  # noqa: E402
+from stga_addon.avatar.splats import Splats  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene import nodes  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.materials import DISPLAY_COLOR, OPACITY  # noqa: E402
+from stga_addon.scene.splats import evaluated_splats, set_input, show_avatar, show_world_splats  # noqa: E402
+
+FRAMES = (1, 5, 9)
+
+
+@pytest.fixture(autouse=True)
+def _empty_scene():
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Head-sized triangles (V, 3), (F, 3), a metre from the origin, each starting at a random one of its corners."""
+    rng = np.random.default_rng(0)
+    theta, phi = np.meshgrid(np.linspace(0.2, np.pi - 0.2, rings), np.linspace(0, 2 * np.pi, segments, endpoint=False))
+    ball = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(segments), np.arange(rings - 1), indexing="ij")
+    a, b = i * rings + j, (i + 1) % segments * rings + j
+    faces = np.concatenate([np.stack([a, b, b + 1], -1).reshape(-1, 3), np.stack([a, b + 1, a + 1], -1).reshape(-1, 3)])
+    turn = rng.integers(0, 3, len(faces))
+    faces = np.take_along_axis(faces, (np.arange(3) + turn[:, None]) % 3, axis=1)
+    return 0.1 * ball + [0.3, 1.0, 0.2], faces.astype(np.int32)
+
+
+def random_splats(faces: int, count: int, degree: int = 1, extent: float = 0.01) -> Splats:
+    rng = np.random.default_rng(1)
+    return Splats(
+        xyz=rng.normal(0, extent, (count, 3)).astype(np.float32),
+        rotation=(rng.normal(0, 1, (count, 4)) * 3).astype(np.float32),
+        log_scale=rng.normal(-7, 0.5, (count, 3)).astype(np.float32),
+        opacity=rng.normal(0, 2, count).astype(np.float32),
+        sh=rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)).astype(np.float32),
+        face=rng.integers(0, faces, count).astype(np.int32),
+        loose=np.zeros(count, bool),
+    )
+
+
+def animated_head(neutral: np.ndarray, faces: np.ndarray):
+    """Mesh object under a turned parent; two shape keys move it over FRAMES."""
+    rng = np.random.default_rng(2)
+    mesh = bpy.data.meshes.new("head")
+    mesh.from_pydata(neutral.tolist(), [], faces.tolist())
+    head = bpy.data.objects.new("head", mesh)
+    root = bpy.data.objects.new("root", None)
+    root.rotation_euler = (np.pi / 2, 0, 0.3)
+    head.parent = root
+    for thing in (head, root):
+        bpy.context.scene.collection.objects.link(thing)
+    head.shape_key_add(name="Basis")
+    for name, first in (("a", 0.0), ("b", 1.0)):
+        key = head.shape_key_add(name=name)
+        key.data.foreach_set("co", (neutral + rng.normal(0, 0.004, neutral.shape)).astype(np.float32).ravel())
+        for frame, value in zip(FRAMES, (first, 0.6, 1 - first), strict=True):
+            key.value = value
+            key.keyframe_insert("value", frame=frame)
+    return head
+
+
+def avatar_of(convention: str, count: int = 3000, **grid: int) -> Avatar:
+    neutral, faces = sphere(**grid)
+    extent = 0.01 if convention == "stga" else 0.8
+    splats = random_splats(len(faces), count, extent=extent)
+    return Avatar(splats, convention, neutral.astype(np.float32), faces)
+
+
+def same_rotation(a: np.ndarray, b: np.ndarray) -> float:
+    """Largest angle in radians between two sets of quaternions, whose signs mean nothing."""
+    a, b = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in (a, b))
+    sign = np.sign(np.sum(a * b, axis=-1, keepdims=True))
+    return float(2 * np.linalg.norm(a - sign * b, axis=-1).max())
+
+
+def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
+    """The evaluated splats against `to_world` on the evaluated head's vertices; returns the positions."""
+    frames = face_frames(evaluated_vertices(head), avatar.faces, avatar.neutral, avatar.convention)
+    expected = to_world(avatar.splats, frames)
+    xyz, rotation, scale = evaluated_splats(shown)
+    assert np.abs(xyz - expected.xyz).max() < 1e-5
+    assert same_rotation(rotation, expected.rotation) < 1e-3
+    np.testing.assert_allclose(scale, np.exp(expected.log_scale), rtol=2e-3)
+    return xyz
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_splats_follow_the_animated_head(convention, tmp_path):
+    """Catches wrong axes, a wrong first corner, a wrong unit, and trees that stop working once saved and reopened."""
+    avatar = avatar_of(convention)
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown = show_avatar(avatar, head)
+    at = {}
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        at[frame] = assert_follows(shown, head, avatar)
+    assert np.abs(at[1] - at[9]).max() > 1e-3, "the head did not move, so nothing was tested"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    shown, head = bpy.data.objects[shown_name(convention)], bpy.data.objects["head"]
+    for frame in reversed(FRAMES):
+        bpy.context.scene.frame_set(frame)
+        np.testing.assert_allclose(assert_follows(shown, head, avatar), at[frame], atol=1e-6)
+
+
+def shown_name(convention: str) -> str:
+    return "head splats"
+
+
+def test_splat_object_stands_where_the_head_stands():
+    """Catches a splat object that ignores the head's parent: the two would part as soon as the root turns."""
+    avatar = avatar_of("stga", 100)
+    head = animated_head(avatar.neutral, avatar.faces)
+    head.location = (0.1, 0.2, 0.3)
+    shown = show_avatar(avatar, head)
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(np.array(shown.matrix_world), np.array(head.matrix_world), atol=1e-6)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_triangles_without_area_stay_finite(convention):
+    """Catches divisions by zero: closed eyelids and mouths fold triangles to lines and points."""
+    avatar = avatar_of(convention)
+    flat = avatar.neutral.copy()
+    flat[avatar.faces[0]] = flat[avatar.faces[0, 0]]  # to a point
+    flat[avatar.faces[40, 2]] = flat[avatar.faces[40, 1]]  # to a line
+    for neutral, posed in ((avatar.neutral, flat), (flat, avatar.neutral)):
+        avatar = replace(avatar, neutral=neutral)
+        head = animated_head(posed, avatar.faces)
+        bpy.context.scene.frame_set(FRAMES[0])
+        head.shape_key_clear()
+        for values in evaluated_splats(show_avatar(avatar, head)):
+            assert np.isfinite(values).all()
+
+
+def test_attributes_hold_activated_values():
+    """Catches logits shown as opacities, log sigmas as sizes, and sRGB stored where Blender expects scene-linear."""
+    avatar = avatar_of("stga", 50)
+    splats = replace(avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32))
+    mesh = show_avatar(replace(avatar, splats=splats), animated_head(avatar.neutral, avatar.faces)).data
+    assert [item.value for item in mesh.attributes[OPACITY].data] == pytest.approx([0.5] * 50)
+    # sRGB middle grey is 21.4 % of white in linear light.
+    assert list(mesh.attributes[nodes.COLOR].data[7].color) == pytest.approx([0.21404, 0.21404, 0.21404, 1], abs=1e-4)
+    assert list(mesh.attributes[nodes.SCALE].data[3].vector) == pytest.approx(np.exp(splats.log_scale[3]), rel=1e-5)
+    assert [nodes.SH_REST.format(i) in mesh.attributes for i in range(4)] == [True, True, True, False]
+
+
+def test_display_inputs():
+    """Catches inputs that are not wired: threshold, percentage and ellipsoids must each change what is shown."""
+    avatar = avatar_of("stga", 2000)
+    shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    opacity = 1 / (1 + np.exp(-avatar.splats.opacity))
+    assert len(evaluated_splats(shown)[0]) == 2000
+    set_input(shown, nodes.OPACITY_THRESHOLD, 0.4)
+    assert len(evaluated_splats(shown)[0]) == (opacity >= 0.4).sum()
+    set_input(shown, nodes.OPACITY_THRESHOLD, 0.0)
+    set_input(shown, nodes.PERCENTAGE, 25.0)
+    assert 400 < len(evaluated_splats(shown)[0]) < 600
+    set_input(shown, nodes.PERCENTAGE, 100.0)
+    set_input(shown, nodes.ELLIPSOIDS, True)
+    with pytest.raises(StgaError, match="ellipsoids"):
+        evaluated_splats(shown)
+
+
+def test_ellipsoids_are_the_splats_own_shape():
+    """Catches ellipsoids in local instead of world rotation and scale, read from the instances' matrices."""
+    avatar = avatar_of("stga", 200)
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown = show_avatar(avatar, head)
+    set_input(shown, nodes.ELLIPSOIDS, True)
+    set_input(shown, nodes.SIZE, 2.0)
+    bpy.context.scene.frame_set(5)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    world = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance])
+    frames = face_frames(evaluated_vertices(head), avatar.faces, avatar.neutral)
+    expected = to_world(avatar.splats, frames)
+    to_object = np.linalg.inv(np.array(shown.matrix_world))
+    w, x, y, z = (expected.rotation / np.linalg.norm(expected.rotation, axis=-1, keepdims=True)).T.astype(np.float64)
+    axis_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+    local = to_object @ world
+    assert len(local) == 200
+    np.testing.assert_allclose(local[:, :3, 3], expected.xyz, atol=1e-5)
+    np.testing.assert_allclose(local[:, :3, 0], 2 * np.exp(expected.log_scale[:, :1]) * axis_x, atol=1e-5)
+
+
+def test_selection_greys_what_the_frame_freezes():
+    """Catches the colouring by another frame's selection, and by neighbours of selected triangles."""
+    avatar = avatar_of("stga", 1000)
+    head = animated_head(avatar.neutral, avatar.faces)
+    chosen = avatar.faces[:40]
+    head.vertex_groups.new(name="stga_5").add([int(v) for v in np.unique(chosen)], 1.0, "ADD")
+    selected = np.isin(avatar.faces, chosen).all(1)[avatar.splats.face]
+    shown = show_avatar(avatar, head)
+    set_input(shown, nodes.SHOW_SELECTION, True)
+
+    def grey() -> np.ndarray:
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        points = next(i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD")
+        color = np.empty(4 * len(points.points), np.float32)
+        points.attributes[DISPLAY_COLOR].data.foreach_get("color", color)
+        return np.isclose(color.reshape(-1, 4), nodes.FROZEN_GREY).all(1)
+
+    bpy.context.scene.frame_set(5)
+    assert 0 < selected.sum() < 1000
+    np.testing.assert_array_equal(grey(), ~selected)
+    bpy.context.scene.frame_set(6)
+    assert not grey().any()
+    bpy.context.scene.frame_set(5)
+    set_input(shown, nodes.SHOW_SELECTION, False)
+    assert not grey().any()
+
+
+def test_a_head_of_another_topology_is_refused():
+    """Catches an avatar that would be drawn scattered over a mesh it was not trained on."""
+    avatar = avatar_of("stga", 10)
+    head = animated_head(avatar.neutral, avatar.faces[::-1])
+    with pytest.raises(StgaError, match="trained on"):
+        show_avatar(avatar, head)
+
+
+def test_world_splats_stand_where_the_file_says():
+    """Catches a transform of splats that have no triangle."""
+    splats = random_splats(1, 500)
+    xyz, rotation, scale = evaluated_splats(show_world_splats(splats, "scan"))
+    np.testing.assert_allclose(xyz, splats.xyz, atol=1e-7)
+    assert same_rotation(rotation, splats.rotation) < 1e-3
+    np.testing.assert_allclose(scale, np.exp(splats.log_scale), rtol=1e-5)
+
+
+def test_a_frame_of_60000_splats_is_fast():
+    """Catches realised instances and fields that are computed once a splat: either costs 50 ms and more."""
+    avatar = avatar_of("stga", 60_000, rings=60, segments=84)
+    shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    took = []
+    for frame in range(1, 10):
+        start = perf_counter()
+        bpy.context.scene.frame_set(frame)
+        took.append(perf_counter() - start)
+    print(f"{np.median(took) * 1e3:.1f} ms a frame, {len(avatar.faces)} triangles")
+    assert len(evaluated_splats(shown)[0]) == 60_000
+    assert np.median(took) < 0.04
+
+
+def test_saved_file_does_not_hold_the_trees_twice(tmp_path: Path):
+    """Catches a new tree and new materials for every avatar that is shown."""
+    avatar = avatar_of("stga", 10)
+    head = animated_head(avatar.neutral, avatar.faces)
+    show_avatar(avatar, head)
+    show_avatar(avatar, head)
+    assert len(bpy.data.node_groups) == 1
+    assert len(bpy.data.materials) == 2

@@ -1,0 +1,267 @@
+"""Reading FLAME model files: every pickle dialect they come in, and everything that must be refused."""
+
+import io
+import os
+import pickle
+import struct
+import sys
+import types
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from stga_addon.errors import StgaError
+from stga_addon.flame.masks import key_regions, mask_faces
+from stga_addon.flame.model import read_flame
+from stga_addon.flame.unpickle import read_pickled_arrays
+
+from .conftest import random_arrays
+
+
+class _Python2Pickler(pickle._Pickler):  # type: ignore[name-defined,misc]
+    """Writes bytes and str as Python 2 did: as one kind of string, which a reader must decode as latin1."""
+
+    dispatch: ClassVar = dict(pickle._Pickler.dispatch)  # type: ignore[attr-defined]
+
+    def _save_string(self, value: bytes | str) -> None:
+        raw = value if isinstance(value, bytes) else value.encode("latin1")
+        self.write(b"T" + struct.pack("<i", len(raw)) + raw)
+        self.memoize(value)
+
+    dispatch[bytes] = dispatch[str] = _save_string
+
+    def save_global(self, obj: Any, name: str | None = None) -> None:
+        module = {"numpy._core.multiarray": "numpy.core.multiarray", "copyreg": "copy_reg", "builtins": "__builtin__"}
+        self.write(f"c{module.get(obj.__module__, obj.__module__)}\n{name or obj.__qualname__}\n".encode())
+        self.memoize(obj)
+
+    dispatch[type] = dispatch[types.FunctionType] = dispatch[types.BuiltinFunctionType] = save_global
+
+
+def _python2_pickle(value: Any) -> bytes:
+    out = io.BytesIO()
+    _Python2Pickler(out, protocol=2, fix_imports=False).dump(value)
+    return out.getvalue()
+
+
+@pytest.fixture
+def chumpy(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
+    """Classes that pickle under chumpy's names; the library itself imports on no current Python."""
+    made = {}
+    for module, name in (("chumpy.ch", "Ch"), ("chumpy.reordering", "Select"), ("chumpy.ch_ops", "add")):
+        made[name] = type(name, (), {"__module__": module})
+        monkeypatch.setitem(sys.modules, module, types.ModuleType(module))
+        setattr(sys.modules[module], name, made[name])
+    return made
+
+
+def _with(kind: type, **state: Any) -> Any:
+    made = kind()
+    made.__dict__.update(state)
+    return made
+
+
+def _assert_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    model = read_flame(path)
+    np.testing.assert_array_equal(model.v_template, arrays["v_template"])
+    np.testing.assert_array_equal(model.shapedirs, arrays["shapedirs"])
+    np.testing.assert_array_equal(model.posedirs, arrays["posedirs"])
+    np.testing.assert_allclose(model.j_regressor, arrays["J_regressor"], atol=0)
+    np.testing.assert_array_equal(model.weights, arrays["weights"])
+    np.testing.assert_array_equal(model.faces, arrays["f"])
+    assert model.parents.tolist() == [-1, 0, 1, 1, 1]
+    assert model.faces.dtype == np.int32
+    assert (model.n_identity, model.n_expression) == (9, 3)
+
+
+@pytest.mark.parametrize("layout", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.coo_matrix])
+def test_python2_pickle_with_chumpy_and_sparse(tmp_path: Path, chumpy: dict[str, type], layout: Any) -> None:
+    # Catches anything wrong in the dialect of the published files: latin1 strings, chumpy leaves, sparse regressor,
+    # Fortran order, big-endian data, and keys that are no arrays (which must not be looked at).
+    arrays = random_arrays()
+    stored: dict[str, Any] = dict(arrays)
+    stored["v_template"] = _with(chumpy["Ch"], x=arrays["v_template"], _dirty_vars={"x"})
+    stored["shapedirs"] = _with(chumpy["Ch"], x=np.asfortranarray(arrays["shapedirs"]))
+    flat = np.arange(arrays["posedirs"].size)[::-1]
+    stored["posedirs"] = _with(
+        chumpy["Select"],
+        a=_with(chumpy["Ch"], x=arrays["posedirs"].ravel()[::-1].copy()),
+        idxs=flat,
+        preferred_shape=arrays["posedirs"].shape,
+    )
+    stored["J_regressor"] = layout(arrays["J_regressor"])
+    stored["weights"] = arrays["weights"].astype(">f8")
+    stored["bs_style"] = "lbs"
+    stored["J"] = _with(chumpy["add"], a=1, b=2)
+    path = tmp_path / "generic_model.pkl"
+    data = _python2_pickle(stored)
+    assert b"copy_reg" in data or b"__builtin__" in data or b"chumpy.ch\nCh" in data
+    path.write_bytes(data)
+    _assert_model(path, arrays)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_every_pickle_protocol(tmp_path: Path, protocol: int) -> None:
+    # Catches a protocol whose way of storing arrays (text, codecs, buffers) is not understood.
+    arrays = random_arrays()
+    stored = dict(arrays, J_regressor=scipy.sparse.csc_matrix(arrays["J_regressor"]), n_identity=np.int64(9))
+    path = tmp_path / "model.pkl"
+    path.write_bytes(pickle.dumps(stored, protocol=protocol))
+    _assert_model(path, arrays)
+
+
+def test_numpy_2_module_names(tmp_path: Path) -> None:
+    # Catches a reader that knows only numpy 1's private module names.
+    arrays = random_arrays()
+    data = pickle.dumps(arrays, protocol=0)
+    path = tmp_path / "model.pkl"
+    for old, new in ((b"numpy.core.", b"numpy._core."), (b"numpy._core.", b"numpy.core.")):
+        path.write_bytes(data.replace(old, new))
+        _assert_model(path, arrays)
+
+
+def test_npz_with_masks_and_identity_count(tmp_path: Path) -> None:
+    # Catches npz models whose own masks or identity count are ignored.
+    arrays = random_arrays()
+    path = tmp_path / "model.npz"
+    corners = np.unique(arrays["f"][:20])
+    np.savez(path, **arrays, n_identity=5, **{"masks/nose": arrays["f"][3], "masks/lips": corners})
+    model = read_flame(path)
+    assert (model.n_identity, model.n_expression) == (5, 7)
+    regions = key_regions(model)
+    assert set(regions) == {"nose", "mouth"}
+    expected = [set(face) <= set(corners) for face in arrays["f"].tolist()]
+    assert regions["mouth"].tolist() == expected
+    assert mask_faces(model)["nose"][3]
+
+
+def test_mask_file_beside_the_model(tmp_path: Path) -> None:
+    # Catches masks that are not picked up, and eye regions that miss the eyeballs.
+    arrays = random_arrays()
+    path = tmp_path / "model.pkl"
+    path.write_bytes(pickle.dumps(arrays))
+    regions = {"left_eye_region": arrays["f"][0], "left_eyeball": arrays["f"][1], "right_eyeball": arrays["f"][2]}
+    (tmp_path / "FLAME_masks.pkl").write_bytes(_python2_pickle(regions))
+    keys = key_regions(read_flame(path))
+    assert keys["left_eye"][[0, 1]].all()
+    assert keys["right_eye"][2]
+    assert "mouth" not in keys
+
+
+def test_400_components_are_300_and_100(tmp_path: Path) -> None:
+    # Catches a wrong split of FLAME's published layout.
+    path = tmp_path / "model.npz"
+    np.savez(path, **random_arrays(vertices=10, components=400))
+    model = read_flame(path)
+    assert (model.n_identity, model.n_expression) == (300, 100)
+
+
+class _Attack:
+    def __init__(self, call: Any, *arguments: Any) -> None:
+        self.call, self.arguments = call, arguments
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return self.call, self.arguments
+
+
+@pytest.mark.parametrize(
+    ("attack", "name"),
+    [
+        (_Attack(os.system, "touch {}"), "posix.system"),
+        (_Attack(eval, "open('{}', 'w')"), "builtins.eval"),
+        (_Attack(getattr, "text", "format"), "builtins.getattr"),
+        (_Attack(np.load, "{}"), "numpy.load"),
+        (_Attack(scipy.sparse.load_npz, "{}"), "load_npz"),
+        (_Attack(pickle.loads, b"N."), "_pickle.loads"),
+        (_Attack(bytearray, 10**15), "builtins.bytearray"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_other_classes_are_refused_by_name(tmp_path: Path, attack: _Attack, name: str, protocol: int) -> None:
+    # Catches a pickle that gets anything executed: the witness file must not appear, and the class must be named.
+    witness = tmp_path / "witness"
+    attack.arguments = tuple(a.format(witness) if isinstance(a, str) else a for a in attack.arguments)
+    path = tmp_path / "model.pkl"
+    path.write_bytes(pickle.dumps(dict(random_arrays(), extra=attack), protocol=protocol, fix_imports=False))
+    with pytest.raises(StgaError, match=f"model.pkl.*{name.replace('.', '[.]')}"):
+        read_flame(path)
+    assert not witness.exists()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "not a readable pickle"),
+        (b"hello there", "not a readable pickle"),
+        (pickle.dumps([1, 2]), "expected a dictionary"),
+        (b"\x80\x02Nr\xff\xff\xff\x7f.", "memo slot"),  # would make the C unpickler allocate 16 GB
+        (b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(J\xff\xff\xff\x7ft", "not a readable"),
+        (b"\x80\x02ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR.", "not a readable"),
+        (b"\x80\x02P1\n.", "not a readable pickle"),
+    ],
+)
+def test_broken_pickles(tmp_path: Path, data: bytes, message: str) -> None:
+    # Catches tracebacks, hangs and allocations on damaged or hostile bytes.
+    path = tmp_path / "broken.pkl"
+    path.write_bytes(data)
+    with pytest.raises(StgaError, match=f"broken.pkl.*{message}"):
+        read_pickled_arrays(path)
+
+
+def test_truncated_and_flipped_bytes(tmp_path: Path) -> None:
+    # Catches any exception but StgaError, whatever the damage.
+    stored = dict(random_arrays(vertices=6), J_regressor=scipy.sparse.csc_matrix(np.eye(5, 6)))
+    data = pickle.dumps(stored, protocol=2)
+    rng = np.random.default_rng(0)
+    path = tmp_path / "model.pkl"
+    for trial in range(150):
+        damaged = bytearray(data)
+        for place in rng.integers(0, len(data), 3):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(bytes(damaged[: rng.integers(len(data))] if trial % 2 else damaged))
+        with suppress(StgaError):
+            read_flame(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("v_template", None, "has no v_template"),
+        ("kintree_table", None, "has no kintree_table"),
+        ("v_template", np.zeros((40, 2)), r"v_template has shape \(40, 2\), expected \(any, 3\)"),
+        ("shapedirs", np.zeros((39, 3, 12)), r"shapedirs has shape \(39, 3, 12\), expected \(40, 3, any\)"),
+        ("posedirs", np.zeros((40, 3, 27)), r"posedirs .*expected \(40, 3, 36\)"),
+        ("J_regressor", np.zeros((4, 40)), r"J_regressor .*expected \(5, 40\)"),
+        ("weights", np.full((40, 5), np.nan), "weights holds values that are not finite"),
+        ("weights", np.full((40, 5), "x"), "weights"),
+        ("f", np.full((3, 3), 40), "f names vertices 40 to 40, expected 0 to 39"),
+        ("f", np.full((3, 3), 0.5), "f holds float64, expected whole numbers"),
+        ("kintree_table", np.array([[0, 4, 1, 1, 1], range(5)]), "kintree_table names the parents"),
+        ("n_identity", np.array(13), "n_identity is 13, expected one number from 0 to 12"),
+        ("masks/nose", np.array([40]), "mask nose"),
+    ],
+)
+def test_malformed_models(tmp_path: Path, key: str, value: np.ndarray | None, message: str) -> None:
+    # Catches a wrong field that is accepted, or reported without its file and name; in both file formats.
+    arrays = random_arrays()
+    arrays.pop(key, None)
+    if value is not None:
+        arrays[key] = value
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(StgaError, match=f"bad.npz: .*{message}"):
+        read_flame(tmp_path / "bad.npz")
+    if not key.startswith("masks"):
+        (tmp_path / "bad.pkl").write_bytes(pickle.dumps(arrays))
+        with pytest.raises(StgaError, match=r"bad\.pkl: "):
+            read_flame(tmp_path / "bad.pkl")
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    for name in ("none.npz", "none.pkl"):
+        with pytest.raises(StgaError, match=name):
+            read_flame(tmp_path / name)

@@ -1,0 +1,188 @@
+"""Parameter files and the meshes they stand for."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.flame.forward import flame_forward
+from stga_addon.flame.model import FlameModel
+from stga_addon.flame.sequence import (
+    FlameSequence,
+    expression_mesh,
+    neutral_mesh,
+    read_frame,
+    read_identity,
+    read_motion,
+    sequence_mesh,
+)
+
+from .conftest import random_frame
+
+
+def _arrays(seed: int, model: FlameModel) -> dict[str, np.ndarray]:
+    """A timestep as VHAP writes it: float32 with a leading 1."""
+    frame = random_frame(seed, model.n_expression)
+    rng = np.random.default_rng(seed)
+    fields: dict[str, Any] = {
+        name: getattr(frame, name)[None]
+        for name in ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
+    }
+    fields["shape"] = rng.normal(size=model.n_identity)
+    fields["static_offset"] = rng.normal(0, 0.01, (1, len(model.v_template), 3))
+    return {name: value.astype(np.float32) for name, value in fields.items()}
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> Path:
+    np.savez(path, **arrays)
+    return path
+
+
+def test_a_frame_as_written(tmp_path: Path, tiny_flame: FlameModel) -> None:
+    # Catches a field read into another's place or a lost leading axis.
+    arrays = _arrays(1, tiny_flame)
+    path = _write(tmp_path / "00003.npz", arrays)
+    frame = read_frame(path, tiny_flame)
+    for name in ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose"):
+        np.testing.assert_array_equal(getattr(frame, name), arrays[name][0])
+    np.testing.assert_array_equal(frame.pose[3], arrays["eyes_pose"][0, :3])
+    shape, offset = read_identity(path, tiny_flame)
+    np.testing.assert_array_equal(shape, arrays["shape"])
+    assert offset is not None
+    np.testing.assert_array_equal(offset, arrays["static_offset"][0])
+    assert frame.dynamic_offset is None
+
+
+def test_missing_optional_and_shorter_vectors(tmp_path: Path, tiny_flame: FlameModel) -> None:
+    # Catches a loader that insists on what real exports leave out.
+    arrays = _arrays(2, tiny_flame)
+    sparse = {name: arrays[name] for name in ("rotation", "translation")}
+    path = _write(tmp_path / "a.npz", {**sparse, "expr": arrays["expr"][0, :2], "shape": arrays["shape"][:3]})
+    frame = read_frame(path, tiny_flame)
+    np.testing.assert_array_equal(frame.expr, [*arrays["expr"][0, :2], 0, 0])
+    assert not frame.jaw_pose.any()
+    assert not frame.eyes_pose.any()
+    shape, offset = read_identity(path, tiny_flame)
+    np.testing.assert_array_equal(shape, [*arrays["shape"][:3], 0, 0, 0, 0, 0])
+    assert offset is None
+
+
+@pytest.mark.parametrize("rows", [160, 280])
+def test_offsets_without_and_with_teeth(tmp_path: Path, tiny_flame: FlameModel, rows: int) -> None:
+    # Catches offsets of a mesh with 120 teeth vertices more or fewer being refused or shifted.
+    model = replace(tiny_flame, v_template=np.zeros((280 if rows == 160 else 160, 3)))
+    given = np.random.default_rng(3).normal(size=(1, rows, 3))
+    _, offset = read_identity(_write(tmp_path / "a.npz", {"shape": np.zeros(8), "static_offset": given}), model)
+    assert offset is not None
+    np.testing.assert_array_equal(offset[:160], given[0, :160])
+    assert not offset[160:].any()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("expr", None, "has no expr"),
+        ("translation", None, "has no translation"),
+        ("shape", None, "has no shape"),
+        ("jaw_pose", np.zeros((1, 4)), r"jaw_pose has shape \(1, 4\), expected \(3,\)"),
+        ("expr", np.zeros((1, 5)), r"expr has shape \(1, 5\), expected \(4,\)"),
+        ("expr", np.zeros((2, 4)), r"expr has shape \(2, 4\)"),
+        ("rotation", np.array(0.0), "rotation has shape"),
+        ("eyes_pose", np.full((1, 6), np.inf), "eyes_pose holds values that are not finite"),
+        ("static_offset", np.zeros((1, 39, 3)), r"static_offset has shape \(1, 39, 3\), expected \(40, 3\)"),
+        ("static_offset", np.zeros((2, 40, 3)), "static_offset has shape"),
+        ("shape", np.array(["a"] * 8), "shape holds"),
+    ],
+)
+def test_malformed_frames(
+    tmp_path: Path, tiny_flame: FlameModel, field: str, value: np.ndarray | None, message: str
+) -> None:
+    # Catches a wrong field that is accepted or reported without its name.
+    arrays: dict[str, Any] = _arrays(4, tiny_flame)
+    arrays.pop(field)
+    if value is not None:
+        arrays[field] = value
+    path = _write(tmp_path / "bad.npz", arrays)
+    with pytest.raises(StgaError, match=f"bad.npz: {message}"):
+        read_frame(path, tiny_flame) and read_identity(path, tiny_flame)
+
+
+def test_truncated_frame(tmp_path: Path, tiny_flame: FlameModel) -> None:
+    path = _write(tmp_path / "cut.npz", _arrays(5, tiny_flame))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(StgaError, match=r"cut\.npz"):
+        read_frame(path, tiny_flame)
+
+
+def _sequence(model: FlameModel) -> FlameSequence:
+    rng = np.random.default_rng(6)
+    frames = {3: random_frame(30, 4), 7: random_frame(70, 4)}
+    return FlameSequence(model, rng.normal(size=8), rng.normal(0, 0.01, (40, 3)), (3, 7), frames.__getitem__)
+
+
+def test_meshes_of_a_sequence(tiny_flame: FlameModel) -> None:
+    # Catches which parameters count as head motion and which as expression.
+    sequence = _sequence(tiny_flame)
+    frame, zero = sequence.frame(7), np.zeros(3)
+
+    def mesh(**changed: Any) -> np.ndarray:
+        return flame_forward(tiny_flame, sequence.shape, replace(frame, **changed), sequence.static_offset)
+
+    still = {"rotation": zero, "translation": zero, "neck_pose": zero}
+    np.testing.assert_array_equal(sequence_mesh(sequence, 7), mesh())
+    np.testing.assert_array_equal(expression_mesh(sequence, 7, "head"), mesh(**still))
+    calm = {**still, "jaw_pose": zero, "eyes_pose": np.zeros(6)}
+    np.testing.assert_array_equal(expression_mesh(sequence, 7, "all"), mesh(**calm))
+    np.testing.assert_array_equal(neutral_mesh(sequence), mesh(**calm, expr=np.zeros(4)))
+    rest = tiny_flame.v_template + tiny_flame.shapedirs[:, :, :8] @ sequence.shape + sequence.static_offset
+    np.testing.assert_allclose(neutral_mesh(sequence), rest, atol=1e-14)
+    with pytest.raises(StgaError, match="zero_pose"):
+        expression_mesh(sequence, 7, "neck")
+
+
+def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
+    # Catches frames of a motion read from the wrong row, for VHAP's (shape (I,)) and GaussianAvatars' files alike.
+    frames = [_arrays(seed, tiny_flame) for seed in (10, 11, 12)]
+    moving = {name: np.concatenate([f[name] for f in frames]) for name in frames[0] if frames[0][name].shape[0] == 1}
+    offset = frames[0]["static_offset"]
+    moving.update(shape=frames[0]["shape"], static_offset=offset[0], dynamic_offset=np.zeros((3, 40, 3)))
+    moving["dynamic_offset"][2] = 0.01
+    motion = read_motion(_write(tmp_path / "flame_param.npz", moving), tiny_flame)
+    assert motion.timesteps == (0, 1, 2)
+    for timestep, arrays in enumerate(frames):
+        single = read_frame(_write(tmp_path / f"{timestep}.npz", {**arrays}), tiny_flame)
+        added = np.full((40, 3), 0.01) if timestep == 2 else None
+        expected = flame_forward(tiny_flame, frames[0]["shape"], replace(single, dynamic_offset=added), offset[0])
+        np.testing.assert_allclose(sequence_mesh(motion, timestep), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("jaw_pose", np.zeros((2, 3)), r"jaw_pose has shape \(2, 3\), expected 3 timesteps first"),
+        ("expr", np.zeros(4), "expr has shape"),
+        ("rotation", np.full((3, 3), np.nan), "rotation holds values that are not finite"),
+        ("eyes_pose", np.zeros((3, 5)), "eyes_pose has shape"),
+        ("shape", None, "has no shape"),
+    ],
+)
+def test_malformed_motions(
+    tmp_path: Path, tiny_flame: FlameModel, field: str, value: np.ndarray | None, message: str
+) -> None:
+    # Catches a motion whose arrays disagree about its length, found only when that frame is drawn.
+    motion: dict[str, Any] = {
+        "expr": np.zeros((3, 4)),
+        "rotation": np.zeros((3, 3)),
+        "translation": np.zeros((3, 3)),
+        "shape": np.zeros(8),
+        "jaw_pose": np.zeros((3, 3)),
+        "eyes_pose": np.zeros((3, 6)),
+    }
+    motion.pop(field)
+    if value is not None:
+        motion[field] = value
+    with pytest.raises(StgaError, match=f"motion.npz: {message}"):
+        read_motion(_write(tmp_path / "motion.npz", motion), tiny_flame)

@@ -1,0 +1,292 @@
+"""The CPU kernels against the float64 reference: images, and gradients under random cotangents."""
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from stga_addon.avatar.embedding import WORLD, face_frames
+from stga_addon.capture.camera import Camera
+from stga_addon.raster import reference
+from stga_addon.raster.render import Parameters, camera_frames, render, render_backward, render_forward
+
+NAMES = Parameters._fields
+# Kernels compute in float32 with a polynomial exp; a pixel sums up to a hundred terms below 1.
+IMAGE_TOLERANCE = 1e-5
+# Depth is that sum times distances of a few metres.
+DEPTH_TOLERANCE = 4e-5
+# Gradients: largest error over the largest gradient of that quantity in the scene.
+# Colour is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the inverse 2D
+# covariance, whose float32 conditioning worsens with the splats' anisotropy.
+GRADIENT_TOLERANCE = {"sh": 1e-5, "opacity": 2e-5, "xyz": 2e-5, "rotation": 2e-5, "log_scale": 5e-5}
+
+
+@dataclass(frozen=True)
+class Scene:
+    splats: dict[str, np.ndarray]
+    camera: Camera
+    degree: int = 3
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    """(4, 4) world to camera: any rotation, the world's origin four metres ahead."""
+    axes, upper = np.linalg.qr(rng.normal(size=(3, 3)))
+    axes *= np.sign(np.diag(upper))
+    axes[0] *= np.linalg.det(axes)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes, [0.1, -0.2, 4.0]
+    return pose
+
+
+def cloud(
+    seed: int,
+    count: int = 60,
+    size: tuple[int, int] = (50, 37),
+    degree: int = 3,
+    spread: float = 0.8,
+    log_scale: float = -2.0,
+    logit: float = 0.0,
+    zoom: float = 1.0,
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> Scene:
+    """`count` random splats around the origin; the image is wide enough to hold most of them at zoom 1."""
+    rng = np.random.default_rng(seed)
+    width, height = size
+    focal = zoom * 1.5 * max(width, height)
+    splats = {
+        "xyz": rng.normal(size=(count, 3)) * spread,
+        "rotation": rng.normal(size=(count, 4)) * rng.uniform(0.2, 5, (count, 1)),
+        "log_scale": rng.normal(size=(count, 3)) * 0.5 + log_scale,
+        "opacity": rng.normal(size=count) * 1.5 + logit,
+        "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.4,
+    }
+    camera = Camera(width, height, focal, focal * 1.1, width / 2 + shift[0], height / 2 + shift[1], random_pose(rng))
+    return Scene({name: value.astype(np.float32) for name, value in splats.items()}, camera, degree)
+
+
+SCENES = {
+    "plain": cloud(1),
+    "degree 2": cloud(2, degree=2),
+    "degree 1": cloud(3, degree=1),
+    "degree 0": cloud(4, degree=0),
+    "lower degree than stored": replace(cloud(5), degree=1),
+    "one pixel": cloud(6, size=(1, 1), log_scale=-0.5),
+    "one row": cloud(7, size=(33, 1)),
+    "one column": cloud(8, size=(1, 50)),
+    "exact tiles": cloud(9, size=(32, 16)),
+    "one more than a tile": cloud(10, size=(17, 33)),
+    "off centre": cloud(11, shift=(13.3, -9.1)),
+    "around the camera": cloud(12, spread=4.0),
+    "mostly off screen": cloud(13, spread=1.5, zoom=2.0, log_scale=-1.0),
+    "covering everything": cloud(14, count=12, log_scale=0.7, logit=-2.0),
+    "opaque layers": cloud(15, count=100, log_scale=-1.0, logit=6.0),
+    "smaller than a pixel": cloud(16, log_scale=-7.0, logit=3.0),
+    "needles": replace(cloud(17), splats=cloud(17).splats | {"log_scale": np.tile(np.float32([-1, -4, -5]), (60, 1))}),
+    "faint": cloud(18, logit=-4.0),
+    "dark": replace(cloud(19), splats=cloud(19).splats | {"sh": cloud(19).splats["sh"] - 0.5}),
+    "single": cloud(20, count=1, spread=0.0, log_scale=-1.0, logit=2.0),
+}
+
+
+def reference_gradients(scene: Scene, cotangents: list[torch.Tensor]) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
+    images = reference.render(*tensors, scene.camera, sh_degree=scene.degree)
+    return finish(images, cotangents, tensors)
+
+
+def kernel_gradients(scene: Scene, cotangents: list[torch.Tensor]) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+    tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
+    images = render(Parameters(*tensors), scene.camera, degree=scene.degree)
+    return finish(images, cotangents, tensors)
+
+
+def finish(images, cotangents, tensors) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+    loss = sum((image * v.to(image.dtype)).sum() for image, v in zip(images, cotangents, strict=True))
+    gradients = torch.autograd.grad(loss, tensors)
+    return [image.detach().numpy() for image in images], dict(zip(NAMES, (g.numpy() for g in gradients), strict=True))
+
+
+def random_cotangents(camera: Camera, seed: int = 0) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shape = (camera.height, camera.width)
+    return [torch.randn(s, generator=generator, dtype=torch.float64) for s in ((3, *shape), shape, shape)]
+
+
+def assert_images_agree(images: list[np.ndarray], expected: list[np.ndarray]) -> None:
+    tolerances = (IMAGE_TOLERANCE, IMAGE_TOLERANCE, DEPTH_TOLERANCE)
+    for name, image, want, tolerance in zip(("rgb", "alpha", "depth"), images, expected, tolerances, strict=True):
+        assert image.shape == want.shape, name
+        assert np.abs(image - want).max() < tolerance, f"{name}: {np.abs(image - want).max():.2e}"
+
+
+def assert_gradients_agree(gradients: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    for name, want in expected.items():
+        largest = np.abs(want).max()
+        error = np.abs(gradients[name] - want).max() / max(largest, 1e-6)
+        assert error < GRADIENT_TOLERANCE[name], f"{name}: {error:.2e} of {largest:.2e}"
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_image_and_gradients_are_the_references(name):
+    """Catches any error in projection, harmonics, tile bounds, blending or their derivatives, one scene a trap."""
+    scene = SCENES[name]
+    cotangents = random_cotangents(scene.camera)
+    images, gradients = kernel_gradients(scene, cotangents)
+    expected_images, expected_gradients = reference_gradients(scene, cotangents)
+    assert any(image.any() for image in expected_images), "the scene shows nothing"
+    assert_images_agree(images, expected_images)
+    assert_gradients_agree(gradients, expected_gradients)
+
+
+@pytest.mark.parametrize("quantity", [0, 1, 2])
+def test_each_image_alone_has_the_references_gradient(quantity):
+    """Catches colour, alpha and depth gradients that are only right in sum, or one that is dropped."""
+    scene = SCENES["plain"]
+    cotangents = [v * (i == quantity) for i, v in enumerate(random_cotangents(scene.camera, 1))]
+    _, gradients = kernel_gradients(scene, cotangents)
+    _, expected = reference_gradients(scene, cotangents)
+    assert np.abs(expected["xyz"]).max() > 0
+    assert_gradients_agree(gradients, expected)
+
+
+def embed(local: list[torch.Tensor], frames, face: np.ndarray) -> list[torch.Tensor]:
+    """World-space splats in torch, so that autograd carries the reference's gradient to the local parameters."""
+    xyz, rotation, log_scale, opacity, sh = local
+    origin, matrix, q, scale = (
+        torch.from_numpy(a[face]) for a in (frames.origin, frames.rotation, frames.quaternion, frames.scale)
+    )
+    w, x, y, z = q.unbind(-1)
+    left = torch.stack(
+        [torch.stack(row, -1) for row in ((w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w))], dim=-2
+    )
+    placed = scale[:, None] * torch.einsum("nij,nj->ni", matrix, xyz) + origin
+    turned = torch.einsum("nij,nj->ni", left, rotation)
+    return [placed, turned, log_scale + scale.log()[:, None], opacity, sh]
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_embedded_splats_render_and_train_in_their_frames(convention):
+    """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on triangles."""
+    scene = SCENES["plain"]
+    rng = np.random.default_rng(30)
+    vertices, faces = rng.normal(size=(12, 3)) * 0.6, rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
+    neutral = vertices + rng.normal(size=vertices.shape) * 0.2
+    frames = face_frames(vertices, faces, neutral, convention)
+    face = rng.integers(0, len(faces), len(scene.splats["xyz"])).astype(np.int32)
+    scene.splats["xyz"] *= 0.3
+    cotangents = random_cotangents(scene.camera, 2)
+
+    tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
+    images, gradients = finish(render(Parameters(*tensors), scene.camera, frames, face), cotangents, tensors)
+    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
+    expected_images = reference.render(*embed(tensors, frames, face), scene.camera)
+    expected_images, expected = finish(expected_images, cotangents, tensors)
+    assert_images_agree(images, expected_images)
+    assert_gradients_agree(gradients, expected)
+
+
+def raw_gradients(scene: Scene, focus: np.ndarray | None, reach: int = 0, fill: float = 0.0):
+    """Forward and backward through the array door; untouched rows keep `fill`."""
+    splats = Parameters(*(scene.splats[name] for name in NAMES))
+    face = np.zeros(len(splats.xyz), np.int32)
+    seen = camera_frames(WORLD, scene.camera)
+    rendering = render_forward(splats, face, seen, scene.degree, focus, reach)
+    v_image, v_alpha, _ = (v.float().numpy() for v in random_cotangents(scene.camera, 3))
+    gradients = Parameters(*(np.full_like(a, fill) for a in splats))
+    rows = render_backward(rendering, splats, face, seen, v_image, -v_alpha, gradients, focus)
+    return rendering, gradients, rows
+
+
+def test_focused_rendering_gives_selected_rows_the_full_images_gradient():
+    """Catches a local iteration whose restricted tiles change the gradient of a selected splat."""
+    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
+    focus = np.zeros(80, bool)
+    focus[[3, 17, 40]] = True
+    full, expected, _ = raw_gradients(scene, None)
+    part, gradients, rows = raw_gradients(scene, focus, reach=10)
+    assert 0 < len(part.tiles) < len(full.tiles)
+    assert set(rows) <= {3, 17, 40}
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(gradients, name)[focus], getattr(expected, name)[focus], err_msg=name)
+
+
+def test_rows_out_of_focus_are_not_written():
+    """Catches a backward pass that touches, or zeroes, the gradient rows of frozen splats."""
+    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
+    focus = np.arange(80) % 7 == 0
+    _, gradients, rows = raw_gradients(scene, focus, fill=123.0)
+    assert 0 < len(rows) <= focus.sum()
+    for name in NAMES:
+        assert (getattr(gradients, name)[~focus] == 123).all(), name
+        assert (getattr(gradients, name)[rows] != 123).any(), name
+
+
+def test_focused_image_is_the_full_image_within_reach():
+    """Catches tiles left out within the reach of SSIM's windows around a selected splat."""
+    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
+    focus = np.arange(80) == 17
+    full, part = raw_gradients(scene, None)[0], raw_gradients(scene, focus, reach=10)[0]
+    tensors = [torch.from_numpy(scene.splats[name]).double()[focus] for name in NAMES]
+    touched = reference.render(*tensors, scene.camera)[1].numpy() > 0
+    ys, xs = np.nonzero(touched)
+    near = np.zeros_like(touched)
+    for y, x in zip(ys, xs, strict=True):
+        near[max(0, y - 10) : y + 11, max(0, x - 10) : x + 11] = True
+    assert touched.any()
+    assert not near.all()
+    np.testing.assert_array_equal(part.image[:, near], full.image[:, near])
+    np.testing.assert_array_equal(part.transmittance[near], full.transmittance[near])
+
+
+def test_results_do_not_depend_on_threads():
+    """Catches races, and sums whose order depends on scheduling: a resumed run must equal an unbroken one."""
+    scene, threads = SCENES["opaque layers"], numba.get_num_threads()
+    many = [kernel_gradients(scene, random_cotangents(scene.camera)) for _ in range(2)]
+    numba.set_num_threads(1)
+    try:
+        single = kernel_gradients(scene, random_cotangents(scene.camera))
+    finally:
+        numba.set_num_threads(threads)
+    for images, gradients in many:
+        for got, want in zip(images, single[0], strict=True):
+            np.testing.assert_array_equal(got, want)
+        for name in NAMES:
+            np.testing.assert_array_equal(gradients[name], single[1][name], err_msg=name)
+
+
+@pytest.mark.parametrize(("count", "behind"), [(0, False), (5, True)])
+def test_nothing_in_view_is_black_and_has_no_gradient(count, behind):
+    """Catches empty pair lists, and splats mirrored through the camera."""
+    scene = cloud(22, count=count, spread=0.2)
+    if behind:
+        scene.camera.world_to_camera[2, 3] = -4
+    images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
+    for array in (*images, *gradients.values()):
+        assert not array.any()
+
+
+def test_splats_below_one_255th_are_invisible():
+    """Catches a cut that differs from the reference's where the whole splat lies under it."""
+    scene = cloud(23)
+    scene.splats["opacity"][:] = np.log(0.0039 / (1 - 0.0039))
+    images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
+    for array in (*images, *gradients.values()):
+        assert not array.any()
+
+
+def test_extreme_parameters_stay_finite():
+    """Catches overflow and 0/0 in float32: what one broken splat must never do is poison the image or the others."""
+    scene = cloud(24, count=40)
+    splats = scene.splats
+    splats["log_scale"][0:4] = [[-60, -60, -60], [40, 40, 40], [40, -60, -60], [-60, -60, 5]]
+    splats["opacity"][4:6] = [90, -90]
+    splats["rotation"][6:9] = [[0, 0, 0, 0], [1e-20, 0, 0, 0], [1e18, 1e18, 0, 0]]
+    splats["sh"][9:11] = np.array([1e6, -1e6])[:, None, None]
+    splats["xyz"][11:14] = [[1e8, 0, 0], [0, 1e8, 1e8], -scene.camera.world_to_camera[:3, :3].T @ [0.1, -0.2, 3.98]]
+    images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
+    for image in images:
+        assert np.isfinite(image).all()
+    for name, gradient in gradients.items():
+        assert np.isfinite(gradient).all(), f"{name} rows {np.unique(np.argwhere(~np.isfinite(gradient))[:, 0])}"
