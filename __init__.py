@@ -7,15 +7,17 @@ _registered = ExitStack()
 
 def register() -> None:
     """Register everything or nothing. Nothing is imported before Blender asks: this file also lies beside the tests."""
-    from . import operators, ui
+    from . import operators
     from .operators import command_line
+    from .ui import panel, preferences, properties
 
     with ExitStack() as done:
-        for part in (operators, ui, command_line):
+        for part in (properties, preferences, operators, panel, command_line):
             part.register()
             done.callback(part.unregister)
-        _registered.push(done.pop_all().__exit__)
+        _registered.enter_context(done.pop_all())
 
 
 def unregister() -> None:
+    """Undo `register`, last first."""
     _registered.close()

@@ -14,6 +14,9 @@ from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
 from .kernels.project import project_backward, project_forward
 
 
+BLACK = np.zeros(3, np.float32)
+
+
 class Parameters(NamedTuple):
     """What is trained of N splats, in the raw form of `Splats`: numpy float32 arrays, or torch tensors in `render`."""
 
@@ -40,7 +43,7 @@ class CameraFrames:
 class Rendering:
     """An image and what its backward pass needs.
 
-    image (3, H, W) float32 premultiplied on black; transmittance (H, W) = 1 − alpha.
+    image (3, H, W) float32 over the background; transmittance (H, W) = 1 − alpha.
     With restricted tiles, pixels of other tiles are undefined.
     visible (M,) int32: the splats that reach a tile.
     """
@@ -58,12 +61,25 @@ class Rendering:
     pair_splat: np.ndarray
     pair_slot: np.ndarray
     tiles: np.ndarray
+    background: np.ndarray
     degree: int
     depth_as_colour: bool
 
-    def over(self, background: np.ndarray) -> np.ndarray:
-        """The image (3, H, W) composited over a background colour (3,)."""
-        return np.asarray(self.image + background[:, None, None] * self.transmittance)
+
+class Scratch:
+    """Buffers that live on between iterations: fresh large arrays cost more page faults than the work in them."""
+
+    def __init__(self) -> None:
+        self._buffers: dict[str, np.ndarray] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+        """An uninitialised array; the same memory whenever the same name is taken again."""
+        size = int(np.prod(shape))
+        buffer = self._buffers.get(name)
+        if buffer is None or len(buffer) < size:
+            # An eighth to spare, so that a count that creeps upwards does not allocate every time.
+            buffer = self._buffers[name] = np.empty(size + size // 8, dtype)
+        return buffer[:size].reshape(shape)
 
 
 def camera_frames(frames: FaceFrames, camera: Camera) -> CameraFrames:
@@ -84,30 +100,35 @@ def render_forward(
     face: np.ndarray,
     seen: CameraFrames,
     degree: int,
+    background: np.ndarray = BLACK,
     focus: np.ndarray | None = None,
     reach: int = 0,
     depth_as_colour: bool = False,
+    scratch: "Scratch | None" = None,
 ) -> Rendering:
-    """Render N embedded splats.
+    """Render N embedded splats over a background colour (3,).
 
     splats: numpy arrays as in `Splats`; face (N,) int32; degree: spherical harmonics used.
     focus (N,) bool: render only the tiles these splats touch and those at most `reach` pixels away, which is all
     that can influence their gradient; None renders everything.
     depth_as_colour: the first channel blends camera depth, the others are zero.
+    scratch: buffers to reuse; the rendering is then valid until the next one with the same scratch.
     """
     n, camera = len(splats.xyz), seen.camera
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    projected, depth = np.empty((n, PROJECTED), np.float32), np.empty(n, np.float32)
-    extent, rect = np.empty((n, 2), np.float32), np.empty((n, 4), np.int32)
+    take = (scratch or Scratch()).take
+    tiles_x, tiles_y = _tile_grid(camera)
+    projected, depth = take("projected", (n, PROJECTED)), take("depth", (n,))
+    extent, rect = take("extent", (n, 2)), take("rect", (n, 4), np.int32)
     project_forward(
         *splats, degree, face, seen.origin, seen.matrix, seen.to_world, seen.lens, seen.size, depth_as_colour,
         projected, depth, extent, rect,
     )  # fmt: skip
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
     order = depth_order(depth, visible)
-    slot_start, slot_count = np.zeros(n, np.int32), np.zeros(n, np.int32)
+    slot_start, slot_count = take("slot_start", (n,), np.int32), take("slot_count", (n,), np.int32)
     start = count_pairs(rect, order, tiles_x, tiles_y, slot_start, slot_count)
-    pair_splat, pair_slot = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
+    pair_splat = take("pair_splat", (start[-1],), np.int32)
+    pair_slot = take("pair_slot", (start[-1],), np.int32)
     bands = max(1, min(tiles_y, numba.get_num_threads()))
     fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, bands, pair_splat, pair_slot)
 
@@ -115,13 +136,14 @@ def render_forward(
     if focus is not None:
         tiles = tiles[_near(touched_tiles(rect, focus, tiles_x, tiles_y), reach).ravel()]
     tiles = _deal(tiles, numba.get_num_threads())
-    image = np.empty((3, camera.height, camera.width), np.float32)
-    transmittance = np.empty((camera.height, camera.width), np.float32)
-    last = np.empty((camera.height, camera.width), np.int32)
-    blend_forward(tiles, tiles_x, start, pair_splat, projected, extent[:, 1], image, transmittance, last)
+    image = take("image", (3, camera.height, camera.width))
+    transmittance = take("transmittance", (camera.height, camera.width))
+    last = take("last", (camera.height, camera.width), np.int32)
+    background = np.asarray(background, np.float32)
+    blend_forward(tiles, tiles_x, start, pair_splat, projected, extent[:, 1], background, image, transmittance, last)
     return Rendering(
         image, transmittance, visible, projected, extent, rect, last, slot_start, slot_count, start, pair_splat,
-        pair_slot, tiles, degree, depth_as_colour,
+        pair_slot, tiles, background, degree, depth_as_colour,
     )  # fmt: skip
 
 
@@ -131,35 +153,42 @@ def render_backward(
     face: np.ndarray,
     seen: CameraFrames,
     v_image: np.ndarray,
-    v_transmittance: np.ndarray,
     gradients: Parameters,
+    v_transmittance: np.ndarray | None = None,
     focus: np.ndarray | None = None,
     add: bool = False,
-) -> np.ndarray:
+    scratch: "Scratch | None" = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
-    v_image (3, H, W), v_transmittance (H, W). focus (N,) bool: splats that need one; None means all.
-    Overwrites (or adds to) those rows of `gradients` that belong to a visible, wanted splat and leaves all others
-    as they are. Returns the indices (M,) int32 of the rows written.
+    v_image (3, H, W); v_transmittance (H, W), zero if None. focus (N,) bool: splats that need a gradient; None
+    means all. Overwrites (or adds to) those rows of `gradients` that belong to a visible, wanted splat and leaves
+    all others as they are.
+    Returns the rows written (M,) int32, and screen (N,): for those rows, the length of the gradient with respect to
+    the projected centre in units of half the image.
     """
-    camera, n = seen.camera, len(splats.xyz)
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    n, take = len(splats.xyz), (scratch or Scratch()).take
+    tiles_x, tiles_y = _tile_grid(seen.camera)
     tiles, rows = rendering.tiles, rendering.visible
     wanted = np.ones(n, bool) if focus is None else focus
     if focus is not None:
         tiles = tiles[touched_tiles(rendering.rect, focus, tiles_x, tiles_y).ravel()[tiles]]
         rows = rows[focus[rows]]
-    pair_gradients = np.empty((len(rendering.pair_slot), PROJECTED), np.float32)
+    pair_gradients = take("pair_gradients", (len(rendering.pair_slot), PROJECTED))
+    screen = take("screen", (n,))
+    if v_transmittance is None:
+        v_transmittance = np.broadcast_to(np.float32(0), rendering.transmittance.shape)
     blend_backward(
         tiles, tiles_x, rendering.start, rendering.pair_splat, rendering.pair_slot, wanted, rendering.projected,
-        rendering.extent[:, 1], rendering.transmittance, rendering.last, v_image, -v_transmittance, pair_gradients,
+        rendering.extent[:, 1], rendering.background, rendering.transmittance, rendering.last, v_image,
+        np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
         splats.xyz, splats.rotation, splats.log_scale, splats.sh, rendering.degree, face, seen.origin, seen.matrix,
         seen.to_world, seen.lens, seen.size, rendering.depth_as_colour, rendering.projected, rows,
-        rendering.slot_start, rendering.slot_count, pair_gradients, add, *gradients,
+        rendering.slot_start, rendering.slot_count, pair_gradients, add, *gradients, screen,
     )  # fmt: skip
-    return rows
+    return rows, screen
 
 
 def touched_tiles(rect: np.ndarray, focus: np.ndarray, tiles_x: int, tiles_y: int) -> np.ndarray:
@@ -169,6 +198,10 @@ def touched_tiles(rect: np.ndarray, focus: np.ndarray, tiles_x: int, tiles_y: in
     for y, x, sign in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
         np.add.at(corners, (y, x), sign)
     return np.asarray(corners.cumsum(0).cumsum(1)[:-1, :-1] > 0)
+
+
+def _tile_grid(camera: Camera) -> tuple[int, int]:
+    return -(-camera.width // TILE), -(-camera.height // TILE)
 
 
 def _near(tiles: np.ndarray, reach: int) -> np.ndarray:
@@ -215,6 +248,6 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:  # type: ignore[override]
         seen, face, splats, rendering = ctx.saved
         gradients = Parameters(*(np.zeros_like(a) for a in splats))
-        cotangents = (v.contiguous().numpy() for v in (v_image, v_transmittance))
-        render_backward(rendering, splats, face, seen, *cotangents, gradients)
+        v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
+        render_backward(rendering, splats, face, seen, v_rgb, gradients, v_t)
         return None, None, None, None, *(torch.from_numpy(g) for g in gradients)

@@ -63,6 +63,8 @@ def add_driver(
     255 characters with arithmetic only are evaluated without Python, so they run where scripts are not trusted.
     """
     curve = owner.driver_add(data_path, index)
+    # A new driver comes with keyframes at 0 and 1, to which results closer than 1e-4 would snap.
+    curve.keyframe_points.clear()
     driver = curve.driver
     driver.type = "SCRIPTED"
     for name, (source, source_path) in variables.items():

@@ -22,6 +22,22 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None) -> Any:
 
     head: a mesh object with the avatar's triangles, in their order. Raises StgaError where it has others.
     """
+    check_head(avatar, head)
+    shown = _splat_object(name or f"{head.name} splats", avatar.splats, head.users_collection[0])
+    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
+    _attribute(shown.data, nodes.FACE, "INT", "value", avatar.splats.face, np.int32)
+    _attribute(shown.data, nodes.NEUTRAL_AREA, "FLOAT", "value", area)
+    _add_modifier(shown, avatar.convention)
+    set_input(shown, nodes.HEAD, head)
+    # A sibling of the head: the two object spaces are the same, so are the numbers in them.
+    shown.parent = head.parent
+    shown.matrix_parent_inverse = head.matrix_parent_inverse
+    shown.matrix_basis = head.matrix_basis
+    return shown
+
+
+def check_head(avatar: Avatar, head: Any) -> None:
+    """Raise StgaError unless `head` is a mesh object with the avatar's triangles, in their order."""
     if head is None or head.type != "MESH":
         raise StgaError("head: a mesh object that carries the avatar is expected")
     faces = np.empty(len(head.data.loops), np.int32)
@@ -31,17 +47,6 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None) -> Any:
             f"head {head.name}: the avatar was trained on {len(avatar.faces)} triangles of another mesh, "
             f"this one has {len(head.data.polygons)} faces in its own order"
         )
-    shown = _splat_object(name or f"{head.name} splats", avatar.splats, head.users_collection[0])
-    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
-    _attribute(shown.data, nodes.FACE, "INT", "value", avatar.splats.face, np.int32)
-    _attribute(shown.data, nodes.NEUTRAL_AREA, "FLOAT", "value", area)
-    modifier = _add_modifier(shown, avatar.convention)
-    set_input(shown, nodes.HEAD, head, modifier)
-    # A sibling of the head: the two object spaces are the same, so are the numbers in them.
-    shown.parent = head.parent
-    shown.matrix_parent_inverse = head.matrix_parent_inverse
-    shown.matrix_basis = head.matrix_basis
-    return shown
 
 
 def show_world_splats(splats: Splats, name: str) -> Any:
@@ -59,16 +64,16 @@ def splat_modifier(shown: Any) -> Any:
     raise StgaError(f"{getattr(shown, 'name', None)}: is not an object that shows splats")
 
 
-def set_input(shown: Any, name: str, value: Any, modifier: Any = None) -> None:
+def set_input(shown: Any, name: str, value: Any) -> None:
     """Set an input of a splat object's modifier by its name, `nodes.ELLIPSOIDS` for one."""
-    modifier = modifier or splat_modifier(shown)
+    modifier = splat_modifier(shown)
     set_modifier_input(modifier, input_identifier(modifier, name), value)
 
 
-def input_identifier(modifier: Any, name: str) -> str:
-    """Identifier ("Socket_2") of the modifier's input that a person sees as `name`."""
+def input_identifier(modifier: Any, name: str) -> str | None:
+    """Identifier ("Socket_2") of the modifier's input that a person sees as `name`; None where it has no such input."""
     items = modifier.node_group.interface.items_tree
-    return str(next(item.identifier for item in items if item.in_out == "INPUT" and item.name == name))
+    return next((item.identifier for item in items if item.in_out == "INPUT" and item.name == name), None)
 
 
 def evaluated_splats(shown: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,10 +117,8 @@ def _splat_object(name: str, splats: Splats, collection: Any) -> Any:
     return shown
 
 
-def _add_modifier(shown: Any, convention: str | None) -> Any:
-    modifier = shown.modifiers.new("STGA Splats", "NODES")
-    modifier.node_group = nodes.splat_tree(convention)
-    return modifier
+def _add_modifier(shown: Any, convention: str | None) -> None:
+    shown.modifiers.new("STGA Splats", "NODES").node_group = nodes.splat_tree(convention)
 
 
 def _base_color(dc: np.ndarray) -> np.ndarray:

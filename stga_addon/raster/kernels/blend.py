@@ -52,12 +52,12 @@ def _row_range(mean_y, extent_y, top):
 
 
 @parallel_jit
-def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, image, transmittance, last):
+def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last):
     """Render the listed tiles.
 
     tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int32 into the pair
     list; pair_splat (P,) int32 front to back in each tile; projected (N, 9); extent_y (N,) pixels.
-    Writes image (3, H, W) premultiplied on black, transmittance (H, W) (1 − alpha, kept because the backward
+    background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept because the backward
     needs its small values exactly), and last (H, W) int32: one past the last contributing pair of the tile,
     counted from the tile's start.
     """
@@ -108,22 +108,22 @@ def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, image,
         for row in range(min(TILE, height - top)):
             for column in range(min(TILE, width - left)):
                 p = np.uint64(row * TILE + column)
-                image[0, top + row, left + column] = s[SUM_RED + p]
-                image[1, top + row, left + column] = s[SUM_GREEN + p]
-                image[2, top + row, left + column] = s[SUM_BLUE + p]
+                image[0, top + row, left + column] = s[SUM_RED + p] + s[p] * background[0]
+                image[1, top + row, left + column] = s[SUM_GREEN + p] + s[p] * background[1]
+                image[2, top + row, left + column] = s[SUM_BLUE + p] + s[p] * background[2]
                 transmittance[top + row, left + column] = s[p]
                 last[top + row, left + column] = np.int32(s[LAST + p])
 
 
 @parallel_jit
 def blend_backward(
-    tiles, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, transmittance, last, v_image, v_alpha, grads
+    tiles, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last, v_image, v_transmittance, grads
 ):
     """Gradient of every wanted (tile, splat) pair of the listed tiles.
 
     wanted (N,) bool: splats whose gradient is needed. pair_slot (P,) int32: where a pair's gradient goes in
     grads (P, 9), with the columns of `projected`; written once each, so the sum per splat is deterministic.
-    v_image (3, H, W) and v_alpha (H, W): gradients of the premultiplied image and of alpha.
+    v_image (3, H, W) and v_transmittance (H, W): gradients of the composited image and of the transmittance.
     """
     height, width = last.shape
     for k in prange(len(tiles)):
@@ -141,10 +141,10 @@ def blend_backward(
                 p, y, x = np.uint64(row * TILE + column), top + row, left + column
                 t = transmittance[y, x]
                 s[p] = t
-                s[BEHIND + p] = -t * v_alpha[y, x]
-                s[V_RED + p] = v_image[0, y, x]
-                s[V_GREEN + p] = v_image[1, y, x]
-                s[V_BLUE + p] = v_image[2, y, x]
+                vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
+                behind = background[0] * vr + background[1] * vg + background[2] * vb
+                s[BEHIND + p] = t * (behind + v_transmittance[y, x])
+                s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
                 s[LAST + p] = np.float32(last[y, x])
                 deepest = max(deepest, last[y, x])
         begin = start[tile]

@@ -190,12 +190,13 @@ def _tan_limits(fx, fy, cx, cy, width, height):
 def project_backward(
     xyz, rotation, log_scale, sh, degree, face, origin, matrix, to_world, lens, size, depth_as_colour,
     projected, visible, slot_start, slot_count, grads, add,
-    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh,
+    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, screen,
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of v_* (or add it); the counterpart of `project_forward`.
 
     visible (M,) int32: the splats to differentiate. slot_start, slot_count (N,) int32: where their pairs' gradients
-    lie in grads (P, 9).
+    lie in grads (P, 9). screen (N,): length of the gradient with respect to the projected centre in units of half the
+    image (what density control asks for), written for each listed splat.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
@@ -216,6 +217,8 @@ def project_backward(
             for slot in range(slot_start[i], slot_start[i] + slot_count[i]):
                 for c in range(PROJECTED):
                     g[c] += grads[slot, c]
+            half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]
+            screen[i] = math.sqrt(half_x * half_x + half_y * half_y)
             f = face[i]
             lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
             c00, c01, c02 = matrix[f, 0, 0], matrix[f, 0, 1], matrix[f, 0, 2]

@@ -1,0 +1,91 @@
+"""Avatar → files for other viewers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..stga_addon.avatar.embedding import face_frames, to_world
+from ..stga_addon.avatar.file import Avatar, read_avatar
+from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
+from ..stga_addon.avatar.ply import write_ply
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene.compat import evaluated_vertices
+from ..stga_addon.scene.splats import check_head
+from . import ids
+from .common import capture_of, file_path, head_of, needs_head, reporting, settings
+
+
+class Export(bpy.types.Operator):
+    """Export a trained avatar, posed as the head in the scene, for viewers of Gaussian splats"""
+
+    bl_idname = ids.EXPORT
+    bl_label = "Export Avatar"
+    bl_options = {"REGISTER"}
+
+    filepath: bpy.props.StringProperty(
+        name="File or Folder", description="A file for one PLY, a folder for the other formats", subtype="FILE_PATH"
+    )
+    avatar: bpy.props.StringProperty(
+        name="Avatar", description="Avatar file (.npz); empty: the one shown", subtype="FILE_PATH"
+    )
+    format: bpy.props.EnumProperty(
+        name="Format",
+        items=(
+            ("ply", "PLY", "The current frame in world space, for every 3D Gaussian Splatting viewer"),
+            ("ply-sequence", "PLY Sequence", "One world-space PLY for every frame of the scene"),
+            ("gaussian-avatars", "GaussianAvatars", "point_cloud.ply and flame_param.npz; captures tracked with FLAME"),
+        ),
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_head(cls, context)
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head = head_of(context)
+        path = file_path(self.filepath, "export")
+        source = file_path(self.avatar or settings(context).avatar, "avatar")
+        avatar = read_avatar(source)
+        check_head(avatar, head)
+        if self.format == "gaussian-avatars":
+            _export_gaussian_avatars(path, avatar, head)
+        elif self.format == "ply":
+            write_ply(path if path.suffix else path.with_suffix(".ply"), _posed(avatar, head))
+        else:
+            for frame in _each_frame(context):
+                write_ply(path / f"{frame:05d}.ply", _posed(avatar, head))
+        self.report({"INFO"}, f"Exported {len(avatar.splats)} splats to {path}")
+        return {"FINISHED"}
+
+
+def _posed(avatar: Avatar, head: Any) -> Any:
+    frames = face_frames(evaluated_vertices(head), avatar.faces, avatar.neutral, avatar.convention)
+    return to_world(avatar.splats, frames)
+
+
+def _export_gaussian_avatars(folder: Path, avatar: Avatar, head: Any) -> None:
+    sequence = capture_of(head).flame
+    if sequence is None:
+        raise StgaError(f"{head.name}: was not tracked with FLAME, which the gaussian-avatars format stores")
+    write_gaussian_avatars(folder, avatar, sequence)
+
+
+def _each_frame(context: Any) -> Iterator[int]:
+    """Set every frame of the scene in turn, with progress at the cursor; returns to the frame it started from."""
+    scene, before = context.scene, context.scene.frame_current
+    context.window_manager.progress_begin(scene.frame_start, scene.frame_end + 1)
+    try:
+        for frame in range(scene.frame_start, scene.frame_end + 1):
+            scene.frame_set(frame)
+            yield frame
+            context.window_manager.progress_update(frame)
+    finally:
+        context.window_manager.progress_end()
+        scene.frame_set(before)

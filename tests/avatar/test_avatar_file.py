@@ -1,0 +1,153 @@
+"""The avatar's own file: what goes in comes out, and nothing else is let in."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.errors import StgaError
+
+SPLAT_FIELDS = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "loose")
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def test_round_trip_is_exact(tmp_path, avatar):
+    """Catches a field that is dropped, reordered or changes its type."""
+    write_avatar(tmp_path / "a.npz", avatar)
+    back = read_avatar(tmp_path / "a.npz")
+    for name in SPLAT_FIELDS:
+        have, want = getattr(back.splats, name), getattr(avatar.splats, name)
+        assert have.dtype == want.dtype, name
+        np.testing.assert_array_equal(have, want, err_msg=name)
+    for name in ("neutral", "faces"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(avatar, name), err_msg=name)
+    assert (back.convention, back.settings, back.background) == ("stga", avatar.settings, (1.0, 0.5, 0.0))
+    assert list(back.regions) == ["mouth", "left eye"]
+    for name, mask in avatar.regions.items():
+        np.testing.assert_array_equal(back.regions[name], mask)
+
+
+def test_avatar_without_regions_or_splats_round_trips(tmp_path, avatar):
+    """Catches special cases of nothing."""
+    empty = replace(avatar, regions={}, settings={}, splats=avatar.splats.rows(np.arange(0)))
+    write_avatar(tmp_path / "a.npz", empty)
+    back = read_avatar(tmp_path / "a.npz")
+    assert (len(back.splats), back.regions, back.settings) == (0, {}, {})
+
+
+def with_splats(avatar: Avatar, **changes) -> Avatar:
+    return replace(avatar, splats=replace(avatar.splats, **changes))
+
+
+def spoiled(array: np.ndarray, value: float) -> np.ndarray:
+    array = array.copy()
+    array.flat[3] = value
+    return array
+
+
+BROKEN = {
+    "convention": lambda a: replace(a, convention="flame"),
+    "neutral": lambda a: replace(a, neutral=spoiled(a.neutral, np.nan)),
+    "neutral is float64": lambda a: replace(a, neutral=a.neutral.astype(np.float64)),
+    "faces is": lambda a: replace(a, faces=a.faces[:, :2]),
+    "faces refers": lambda a: replace(a, faces=spoiled(a.faces, 20)),
+    "faces refers to -1": lambda a: replace(a, faces=spoiled(a.faces, -1)),
+    "xyz": lambda a: with_splats(a, xyz=spoiled(a.splats.xyz, np.inf)),
+    "rotation": lambda a: with_splats(a, rotation=a.splats.rotation[:-1]),
+    "opacity": lambda a: with_splats(a, opacity=a.splats.opacity[:, None]),
+    "sh has 5": lambda a: with_splats(a, sh=a.splats.sh[:, :5]),
+    "sh is": lambda a: with_splats(a, sh=a.splats.sh[:, :, 0]),
+    "face refers": lambda a: with_splats(a, face=spoiled(a.splats.face, 30)),
+    "face is int64": lambda a: with_splats(a, face=a.splats.face.astype(np.int64)),
+    "loose": lambda a: with_splats(a, loose=a.splats.loose.astype(np.uint8)),
+    "region 'mouth'": lambda a: replace(a, regions={"mouth": np.zeros(30, np.int8)}),
+    "background": lambda a: replace(a, background=(1.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("complaint", BROKEN)
+def test_avatars_that_do_not_fit_together_are_not_written(tmp_path, avatar, complaint):
+    """Catches a file that would only fail when it is opened, and a half-written one."""
+    with pytest.raises(StgaError, match=rf"a\.npz: .*{complaint}"):
+        write_avatar(tmp_path / "a.npz", BROKEN[complaint](avatar))
+    assert not list(tmp_path.iterdir())
+
+
+def rewritten(path, avatar: Avatar, fields: dict | None = None, **arrays) -> None:
+    """An avatar file with some of its arrays or header fields exchanged (None: taken out)."""
+    write_avatar(path, avatar)
+    with np.load(path) as data:
+        content = dict(data)
+    if fields is not None:
+        header = json.loads(content["header"].tobytes()) | fields
+        content["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    content = {name: array for name, array in (content | arrays).items() if array is not None}
+    np.savez(path, **content)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"xyz": None}, "'xyz'"),
+        ({"region_faces": None}, "'region_faces'"),
+        ({"region_faces": np.zeros((1, 30), bool)}, "region_faces"),
+        ({"region_faces": np.zeros((2, 29), bool)}, "region 'mouth'"),
+        ({"xyz": np.float32(0)}, "xyz"),
+        ({"neutral": np.zeros((0, 3), np.float32)}, "faces refers"),
+        ({"header": None}, "no header"),
+        ({"header": np.zeros(3, np.uint8)}, "JSON"),
+        ({"header": np.frombuffer(b"[" * 100000, np.uint8)}, "JSON"),
+        ({"header": np.frombuffer(b"[1]", np.uint8)}, "not an avatar file"),
+    ],
+)
+def test_wrong_arrays_are_named(tmp_path, avatar, change, complaint):
+    """Catches readers that trust an array because it has the right name."""
+    rewritten(tmp_path / "a.npz", avatar, **change)
+    with pytest.raises(StgaError, match=rf"a\.npz: .*{complaint}"):
+        read_avatar(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"format": "other"}, "not an avatar file"),
+        ({"version": 2}, "version 2"),
+        ({"convention": None}, "'convention'"),
+        ({"convention": "flame"}, "convention is 'flame'"),
+        ({"settings": []}, "'settings'"),
+        ({"regions": [1, 2]}, "'regions'"),
+        ({"background": ["a", 1, 1]}, "background"),
+        ({"background": [float("nan"), 1, 1]}, "background"),
+    ],
+)
+def test_wrong_header_fields_are_named(tmp_path, avatar, fields, complaint):
+    """Catches a header of another version or type that surfaces later as something else."""
+    rewritten(tmp_path / "a.npz", avatar, fields)
+    with pytest.raises(StgaError, match=rf"a\.npz: .*{complaint}"):
+        read_avatar(tmp_path / "a.npz")
+
+
+def test_pickled_arrays_are_refused(tmp_path, avatar):
+    """Catches object arrays, whose loading would run code."""
+    rewritten(tmp_path / "a.npz", avatar, xyz=np.array([{}], object))
+    with pytest.raises(StgaError, match=r"a\.npz"):
+        read_avatar(tmp_path / "a.npz")
+
+
+@FUZZ
+@given(data=st.data())
+def test_damaged_files_never_crash(tmp_path, avatar, data):
+    """Catches any exception but StgaError after truncation and flipped bytes."""
+    write_avatar(tmp_path / "a.npz", avatar)
+    content = bytearray((tmp_path / "a.npz").read_bytes())
+    for _ in range(data.draw(st.integers(0, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    (tmp_path / "b.npz").write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    try:
+        read_avatar(tmp_path / "b.npz")
+    except StgaError:
+        return
