@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -22,7 +22,7 @@ class Export(bpy.types.Operator):
 
     bl_idname = ids.EXPORT
     bl_label = "Export Avatar"
-    bl_options = {"REGISTER"}
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filepath: bpy.props.StringProperty(
         name="File or Folder", description="A file for one PLY, a folder for the other formats", subtype="FILE_PATH"

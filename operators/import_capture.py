@@ -1,12 +1,12 @@
 """Capture folder → head and cameras."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.cameras import import_cameras
+from ..stga_addon.scene.cameras import configure_scene, import_cameras
 from ..stga_addon.scene.head import import_head
 from ..stga_addon.scene.hierarchy import capture_root
 from . import ids
@@ -18,7 +18,7 @@ class ImportCapture(bpy.types.Operator):
 
     bl_idname = ids.IMPORT_CAPTURE
     bl_label = "Import Capture"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     directory: bpy.props.StringProperty(
         name="Capture", description="Folder that holds the capture's transforms files or meshes", subtype="DIR_PATH"
@@ -38,6 +38,12 @@ class ImportCapture(bpy.types.Operator):
             ("centre", "Image Centre", "cx and cy are ignored, as GaussianAvatars does"),
         ),
     )
+    set_up_scene: bpy.props.BoolProperty(
+        name="Set Up Scene",
+        description="Give the scene the capture's resolution, its first camera and the Standard view "
+        "transform, in which the splats' colours are trained",
+        default=True,
+    )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
 
     def invoke(self, context: Any, event: Any) -> set[str]:
@@ -51,16 +57,20 @@ class ImportCapture(bpy.types.Operator):
         flame = file_path(model, "FLAME model") if model else None
         capture = open_capture(folder, flame=flame, principal_point=self.principal_point)
         head = import_head(capture, warn=self._warn)
-        import_cameras(capture, capture_root(capture.root))
+        cameras = import_cameras(capture, capture_root(capture.root), warn=self._warn)
         head[tags.FLAME_MODEL] = str(flame) if flame else ""
         head[tags.PRINCIPAL_POINT] = self.principal_point
         settings(context).head = head
-        context.scene.frame_start, context.scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
-        context.scene.frame_set(capture.timesteps[0])
+        scene = context.scene
+        scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
+        scene.frame_set(capture.timesteps[0])
+        if self.set_up_scene and cameras:
+            configure_scene(scene, capture, cameras[0], warn=self._warn)
         for sentence in capture.warnings:
             self._warn(sentence)
-        cameras = {view.camera_index for views in capture.views.values() for view in views}
-        self.report({"INFO"}, f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras")
+        self.report(
+            {"INFO"}, f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
+        )
         return {"FINISHED"}
 
     def _warn(self, sentence: str) -> None:

@@ -1,7 +1,7 @@
 """World-space 3D Gaussian Splatting PLY → splats."""
 
 from math import radians
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -19,7 +19,7 @@ class ImportPly(bpy.types.Operator):
 
     bl_idname = ids.IMPORT_PLY
     bl_label = "Import Gaussian Splats"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(name="File", description="3D Gaussian Splatting PLY", subtype="FILE_PATH")
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})

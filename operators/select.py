@@ -1,6 +1,6 @@
 """Tracked head → one vertex group a frame."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -15,7 +15,7 @@ class Select(bpy.types.Operator):
 
     bl_idname = ids.SELECT
     bl_label = "Select Moving Triangles"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     threshold: bpy.props.FloatProperty(
         name="Threshold",

@@ -1,6 +1,6 @@
 """Avatar file → splats that follow the head."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -16,7 +16,7 @@ class ShowAvatar(bpy.types.Operator):
 
     bl_idname = ids.SHOW_AVATAR
     bl_label = "Show Avatar"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(name="Avatar", description="Avatar file (.npz)", subtype="FILE_PATH")
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
@@ -47,7 +47,7 @@ class StandardView(bpy.types.Operator):
 
     bl_idname = ids.STANDARD_VIEW
     bl_label = "Use Standard View Transform"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     def execute(self, context: Any) -> set[str]:
         context.scene.view_settings.view_transform = "Standard"

@@ -64,7 +64,8 @@ def read_npz(path: Path, max_bytes: int = 4 << 30) -> dict[str, np.ndarray]:
             return {name: data[name] for name in data.files}
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, MemoryError) as error:
+        # RuntimeError: encrypted entries and unknown compression; MemoryError: an array header that promises too much.
         raise StgaError(f"{path}: is not a readable npz file ({error})") from error
 
 

@@ -32,6 +32,7 @@ class Settings(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         default="//stga_run",
     )
+    minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
     avatar: bpy.props.StringProperty(name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH")
 
 

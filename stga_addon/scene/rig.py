@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..flame.forward import FlameFrame, axis_angle_matrices, joint_positions, shaped_vertices
+from ..flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ..flame.model import JOINTS, FlameModel
 from ..flame.sequence import FlameSequence
 from . import compat, tags
@@ -30,7 +30,7 @@ ROTATION_MINUS_IDENTITY = (
     ("x*y+w*z", "-x*x-z*z", "y*z-w*x"),
     ("x*z-w*y", "y*z+w*x", "-x*x-y*y"),
 )
-# Names of a driver's variables: the terms of a sum, few enough that the expression stays under Blender's 255 characters.
+# Names of a driver's variables: one a term, few enough that the expression stays under Blender's 255 characters.
 TERMS = "abcdfghijklmnopqrs"
 
 
@@ -41,11 +41,12 @@ def add_rig(
     warn: Warn = log_warning,
     all_expressions: bool = False,
 ) -> Any:
-    """Rig and animate `head`, the mesh object of the sequence's neutral mesh (its "Basis"); returns the armature object.
+    """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature object.
 
-    frames: the sequence's frames, one a timestep. Expression keys `expr_000`… are made for the components the sequence
-    uses, or for all. The evaluated mesh equals `flame_forward` within 1e-5 m. Vertex offsets that change by frame have
-    no rig: they become one shape key a timestep, which `warn` is told, as it is of coefficients beyond ±10.
+    head has its "Basis" shape key; frames: the sequence's frames, one a timestep. Expression keys `expr_000`… are made
+    for the components the sequence uses, or for all. The evaluated mesh equals `flame_forward` within 1e-5 m. Vertex
+    offsets that change by frame have no rig: they become one shape key a timestep, which `warn` is told, as it is of
+    coefficients beyond ±10.
     """
     model = sequence.model
     basis = shaped_vertices(model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset)
@@ -83,7 +84,7 @@ def _place_armature(head: Any, joints: np.ndarray, parents: np.ndarray, moving: 
 
 def _armature(name: str, joints: np.ndarray, parents: np.ndarray, moving: Sequence[bool]) -> Any:
     armature = bpy.data.armatures.new(name)
-    editing = bpy.data.objects.new(name, armature)  # edit bones exist in edit mode only, and that needs a visible object
+    editing = bpy.data.objects.new(name, armature)  # edit mode needs an object that is surely visible
     layer = bpy.context.view_layer
     active = layer.objects.active
     if active is not None and active.mode != "OBJECT":
@@ -207,7 +208,7 @@ def _animate_bones(rig: Any, timesteps: Sequence[int], frames: Sequence[FlameFra
     for joint, name in enumerate(JOINTS):
         quaternions = _continuous_quaternions(poses[:, joint])
         for element in range(4):
-            compat.write_curve(curves, _rotation_path(name, element)[:-3], element, numbers, quaternions[:, element])
+            compat.write_curve(curves, _rotation_path(name), element, numbers, quaternions[:, element])
 
 
 def _continuous_quaternions(axis_angles: np.ndarray) -> np.ndarray:
@@ -294,12 +295,12 @@ def _offset_property(bone: str) -> str:
     return f"stga_{bone}_offset"
 
 
-def _rotation_path(bone: str, element: int) -> str:
-    return f'pose.bones["{bone}"].rotation_quaternion[{element}]'
+def _rotation_path(bone: str) -> str:
+    return f'pose.bones["{bone}"].rotation_quaternion'
 
 
 def _rotation_of(rig: Any, bone: str) -> dict[str, tuple[Any, str]]:
-    return {letter: (rig, _rotation_path(bone, element)) for element, letter in enumerate(QUATERNION)}
+    return {letter: (rig, f"{_rotation_path(bone)}[{element}]") for element, letter in enumerate(QUATERNION)}
 
 
 def _value_path(key: str) -> str:

@@ -27,7 +27,7 @@ SELECTED_WEIGHT = 0.5
 
 
 def group_name(timestep: int) -> str:
-    """Name of the vertex group that holds a timestep's selection; unpadded, so that nodes can build it from the frame."""
+    """Vertex group that holds a timestep's selection; unpadded, so that nodes can build the name from the frame."""
     return f"{GROUP_PREFIX}{timestep}"
 
 

@@ -1,6 +1,7 @@
 """The avatar's own file: what goes in comes out, and nothing else is let in."""
 
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -134,6 +135,30 @@ def test_wrong_header_fields_are_named(tmp_path, avatar, fields, complaint):
 def test_pickled_arrays_are_refused(tmp_path, avatar):
     """Catches object arrays, whose loading would run code."""
     rewritten(tmp_path / "a.npz", avatar, xyz=np.array([{}], object))
+    with pytest.raises(StgaError, match=r"a\.npz"):
+        read_avatar(tmp_path / "a.npz")
+
+
+def test_an_array_larger_than_memory_is_refused(tmp_path, avatar):
+    """Catches a MemoryError on the word of one array's header."""
+    write_avatar(tmp_path / "a.npz", avatar)
+    with np.load(tmp_path / "a.npz") as data:
+        content = dict(data)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for name, array in content.items():
+            with archive.open(f"{name}.npy", "w") as out:
+                huge = {"descr": "<f4", "fortran_order": False, "shape": (10**15, 3)}
+                np.lib.format.write_array_header_1_0(out, huge) if name == "xyz" else np.save(out, array)
+    with pytest.raises(StgaError, match=r"a\.npz"):
+        read_avatar(tmp_path / "a.npz")
+
+
+def test_an_encrypted_archive_is_refused(tmp_path, avatar):
+    """Catches zipfile's RuntimeError where an entry says that it needs a password."""
+    write_avatar(tmp_path / "a.npz", avatar)
+    content = bytearray((tmp_path / "a.npz").read_bytes())
+    content[content.rindex(b"PK\x01\x02") + 8] |= 1
+    (tmp_path / "a.npz").write_bytes(content)
     with pytest.raises(StgaError, match=r"a\.npz"):
         read_avatar(tmp_path / "a.npz")
 

@@ -72,7 +72,7 @@ def _blur_column(ring, plane, stride, row, out, at, count):
 def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
-    image (3, H, W) float32; target (3, H, W) uint8; the loss is the mean over all 3·H·W values, so `scale` is
+    image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
     1 / (3·H·W). Reads the image up to REACH pixels around a rectangle. Writes gradient (3, H, W) and, per rectangle,
     sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
     """
@@ -84,6 +84,7 @@ def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
         left, right = max(0, x0 - REACH), min(width, x1 + REACH)
         span = right - left
         stride = span + 2 * RADIUS
+        wanted = np.zeros(RING * stride, np.float32)  # the target's last rows, as floats
         source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
         first = np.zeros(4 * RING * stride, np.float32)
         moments = np.zeros(4 * stride, np.float32)
@@ -95,14 +96,15 @@ def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
             # 1. horizontal blur of this row's four values
             inside = 0 <= row < height
             if inside:
+                keep = (row % RING) * stride
                 for n in range(span):
-                    x = image[c, row, left + n]
-                    y = np.float32(target[c, row, left + n]) * np.float32(1 / 255)
-                    at = RADIUS + n
-                    source[at] = x
-                    source[stride + at] = y
-                    source[2 * stride + at] = x * x + y * y
-                    source[3 * stride + at] = x * y
+                    wanted[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
+                for n in range(np.uint64(span)):
+                    x, y = image[c, row, np.uint64(left) + n], wanted[np.uint64(keep) + n]
+                    source[np.uint64(RADIUS) + n] = x
+                    source[np.uint64(stride + RADIUS) + n] = y
+                    source[np.uint64(2 * stride + RADIUS) + n] = x * x + y * y
+                    source[np.uint64(3 * stride + RADIUS) + n] = x * y
             for plane in range(4):
                 into = (plane * RING + row % RING) * stride
                 if inside:
@@ -151,13 +153,13 @@ def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
             for plane in range(3):
                 _blur_column(second, plane, stride, out, blurred, plane * stride, span)
             absolute = ZERO
-            for n in range(x0 - left, x1 - left):
-                x = image[c, out, left + n]
-                y = np.float32(target[c, out, left + n]) * np.float32(1 / 255)
+            keep = (out % RING) * stride
+            for n in range(np.uint64(x0 - left), np.uint64(x1 - left)):
+                x, y = image[c, out, np.uint64(left) + n], wanted[np.uint64(keep) + n]
                 sign = ONE if x > y else (-ONE if x < y else ZERO)
                 absolute += abs(x - y)
-                slope = blurred[n] + TWO * x * blurred[stride + n] + y * blurred[2 * stride + n]
-                gradient[c, out, left + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+                slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
+                gradient[c, out, np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
             difference += absolute
         sums[job, 0] = difference
         sums[job, 1] = similarity

@@ -1,0 +1,64 @@
+"""Per-row work of training: Adam on listed rows only, and the scale limit."""
+
+import math
+
+import numpy as np
+from numba import prange
+
+from . import jit, parallel_jit
+
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+CHUNK = 256
+
+
+@parallel_jit
+def adam_rows(rows, parameter, gradient, first, second, steps, rate, beta1, beta2, epsilon):
+    """One Adam step on the listed rows (M,) of parameter (N, D), with each row's own step count for bias correction.
+
+    steps (N,) int32 count this step already. Rows that are not listed are not touched: neither parameter nor
+    moments. A row whose gradient is not finite keeps its values.
+    """
+    width = parameter.shape[1]
+    log1, log2 = math.log(beta1), math.log(beta2)
+    for block in prange((len(rows) + CHUNK - 1) // CHUNK):
+        for n in range(block * CHUNK, min(len(rows), (block + 1) * CHUNK)):
+            i = rows[n]
+            sound = ZERO
+            for c in range(width):
+                sound += gradient[i, c] * ZERO
+            if not sound == ZERO:
+                continue
+            count = np.float64(steps[i])
+            correct1 = np.float32(1.0 / (1.0 - math.exp(count * log1)))
+            correct2 = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
+            for c in range(width):
+                g = gradient[i, c]
+                m = beta1 * first[i, c] + (ONE - beta1) * g
+                v = beta2 * second[i, c] + (ONE - beta2) * g * g
+                first[i, c], second[i, c] = m, v
+                parameter[i, c] -= rate * m * correct1 / (math.sqrt(v) * correct2 + epsilon)
+
+
+@jit
+def scale_limit(rows, log_scale, face, loose, limit, weight, gradient):
+    """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
+
+    limit (F,) per triangle, in the unit of the splats' local scale. Loose splats have no limit. Returns the norm.
+    """
+    total = 0.0
+    for n in range(len(rows)):
+        i = rows[n]
+        if not loose[i]:
+            for c in range(3):
+                over = max(ZERO, math.exp(log_scale[i, c]) - limit[face[i]])
+                total += over * over
+    norm = math.sqrt(total)
+    if norm > 0.0:
+        factor = np.float32(weight / norm)
+        for n in range(len(rows)):
+            i = rows[n]
+            if not loose[i]:
+                for c in range(3):
+                    scale = math.exp(log_scale[i, c])
+                    gradient[i, c] += factor * max(ZERO, scale - limit[face[i]]) * scale
+    return norm

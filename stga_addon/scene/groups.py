@@ -1,0 +1,85 @@
+"""The per-frame selection as vertex groups, which an artist can see, paint and scrub through.
+
+A vertex group holds vertices and a selection holds triangles: a triangle counts as selected when all three of its
+vertices are in the group. Writing a selection and reading it back therefore keeps every selected triangle and adds
+those that selected ones enclose on all three corners (`closure` says which).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from . import tags
+
+
+def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: the triangles (F, 3) whose three vertices all belong to a selected triangle (F,) bool."""
+    touched = np.zeros(int(faces.max(initial=-1)) + 1, bool)
+    touched[faces[selected]] = True
+    return np.asarray(touched[faces].all(1))
+
+
+def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
+    """Replace the head's selection groups: one vertex group `stga_<timestep>` a timestep, weight 1 on its vertices.
+
+    selection: timestep -> (F,) bool. A timestep that selects nothing gets no group. Other vertex groups stay. Raises
+    StgaError where the head is in edit mode or a selection does not have one entry a triangle.
+    """
+    if head.mode == "EDIT":
+        raise StgaError(f"{head.name}: is in edit mode, leave it before the selection is written")
+    faces = _faces(head.data)
+    for timestep, selected in selection.items():
+        if selected.shape != (len(faces),):
+            raise StgaError(
+                f"{head.name}: the selection of timestep {timestep} has shape {selected.shape},"
+                f" expected ({len(faces)},), one entry a triangle"
+            )
+    for group in reversed(list(head.vertex_groups)):  # the last first: removal renumbers those behind
+        if tags.group_timestep(group.name) is not None:
+            head.vertex_groups.remove(group)
+    for timestep in sorted(selection):
+        vertices = np.unique(faces[selection[timestep]])
+        if len(vertices):
+            head.vertex_groups.new(name=tags.group_name(timestep)).add(vertices.tolist(), 1.0, "REPLACE")
+
+
+def read_selection(head: Any) -> dict[int, np.ndarray]:
+    """timestep -> (F,) bool of every timestep of the head, from its selection groups as they are painted now.
+
+    A triangle is selected where each of its vertices has a weight of at least 0.5 in the timestep's group; a timestep
+    without a group selects nothing.
+    """
+    head.update_from_editmode()
+    mesh = head.data
+    timesteps = {group.index: tags.group_timestep(group.name) for group in head.vertex_groups}
+    columns = {index: timestep for index, timestep in timesteps.items() if timestep is not None}
+    painted = _painted(mesh, len(head.vertex_groups), list(columns))
+    faces = _faces(mesh)
+    known = {int(timestep) for timestep in head.get(tags.TIMESTEPS, ())} | set(columns.values())
+    selection = {timestep: np.zeros(len(faces), bool) for timestep in sorted(known)}
+    for row, timestep in zip(painted, columns.values(), strict=True):
+        selection[timestep] = row[faces].all(1)
+    return selection
+
+
+def _painted(mesh: Any, groups: int, wanted: list[int]) -> np.ndarray:
+    """(len(wanted), V) bool: which vertices have the weight of a selected one in the groups of these indices."""
+    row_of = np.full(groups, -1)
+    row_of[wanted] = np.arange(len(wanted))
+    painted = np.zeros((len(wanted), len(mesh.vertices)), bool)
+    for vertex in mesh.vertices:
+        members = vertex.groups
+        indices, weights = np.empty(len(members), np.int32), np.empty(len(members), np.float32)
+        members.foreach_get("group", indices)
+        members.foreach_get("weight", weights)
+        rows = row_of[indices[weights >= tags.SELECTED_WEIGHT]]
+        painted[rows[rows >= 0], vertex.index] = True
+    return painted
+
+
+def _faces(mesh: Any) -> np.ndarray:
+    corners = np.empty(len(mesh.loops), np.int32)
+    mesh.loops.foreach_get("vertex_index", corners)
+    return corners.reshape(-1, 3)

@@ -1,0 +1,139 @@
+"""Everything that can be set about a training run, with its default and where it comes from."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..errors import StgaError
+from ..selection import SelectionOptions
+
+STRATEGIES = ("selective", "global", "gaussian-avatars")
+SCHEDULES = ("default", "paper")
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates at the start; each decays exponentially to `position_end` or `end` of itself.
+
+    Positions in local units (metres of the neutral mesh), scales as logarithms, opacity as logit.
+    """
+
+    xyz: float = 2e-4
+    rotation: float = 5e-3
+    log_scale: float = 2e-2
+    opacity: float = 5e-2
+    sh: float = 2e-2
+    sh_rest: float = 1e-3
+    position_end: float = 0.05
+    end: float = 0.2
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One training run.
+
+    strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
+                   ones; "gaussian-avatars" is global training with that method's binding, losses and rates
+    seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two
+    seed           fixes the order of views and every random choice
+    lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA, embedding)
+    convention     embedding convention
+    views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the paper's batches)
+    global_every, global_unit   a global iteration after every so many local iterations, or "frame" visits
+    warm_up        share of the budget trained globally before the first local iteration
+    selection      which triangles a frame trains
+    ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
+    scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit in units of sqrt(2·triangle area)
+    stray_every, stray_limit    every so many iterations, a splat farther than this many sqrt(2·area) from its
+                   triangle's origin is put back onto it; 0 never
+    sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
+    seeds          add hull seeds for what the mesh does not cover
+    density_every  iterations between density control, 0 never; it works during `density_span` of the budget
+    growth         most splats that density control may add, as a share of the initial number
+    coarse         share of the budget trained at half resolution first
+    background     colour behind the head
+    """
+
+    strategy: str = "selective"
+    seconds: float | None = None
+    iterations: int | None = None
+    seed: int = 0
+    lattice: int = 2
+    convention: str = "stga"
+    views_per_visit: int = 1
+    global_every: int = 2
+    global_unit: str = "iteration"
+    warm_up: float = 0.3
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    rates: Rates = field(default_factory=Rates)
+    ssim_weight: float = 0.2
+    scale_weight: float = 1.0
+    scale_limit: float = 4.0
+    stray_every: int = 200
+    stray_limit: float = 6.0
+    sh_degree: int = 3
+    sh_steps: tuple[float, ...] = (0.3, 0.5, 0.7)
+    seeds: bool = True
+    density_every: int = 200
+    density_span: tuple[float, float] = (0.1, 0.6)
+    growth: float = 0.25
+    coarse: float = 0.0
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+PAPER = {
+    "views_per_visit": 0,
+    "global_every": 20,
+    "warm_up": 0.0,
+    "scale_limit": 1.0,
+    "stray_limit": 1.0,
+    "lattice": 4,
+    "seeds": False,
+    "selection": SelectionOptions(threshold=0.01),
+}
+"""The paper's letter, where it differs from the defaults, which are what measured best (docs/results.md)."""
+
+GAUSSIAN_AVATARS = {
+    "convention": "gaussian_avatars",
+    "lattice": 0,
+    "rates": Rates(xyz=5e-3, log_scale=1.7e-2, rotation=1e-3, opacity=5e-2, sh=2.5e-3, sh_rest=1.25e-4, position_end=0.01, end=1.0),
+    "scale_limit": 0.6,
+    "stray_every": 0,
+    "seeds": False,
+    "growth": 8.0,
+}
+"""GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and released settings)."""
+
+
+def make_settings(strategy: str = "selective", schedule: str = "default", **changes: Any) -> Settings:
+    """Settings of a strategy and schedule with `changes` on top. Raises StgaError naming an impossible value."""
+    if strategy not in STRATEGIES:
+        raise StgaError(f"--strategy: '{strategy}' is not one of {', '.join(STRATEGIES)}")
+    if schedule not in SCHEDULES:
+        raise StgaError(f"--schedule: '{schedule}' is not one of {', '.join(SCHEDULES)}")
+    base: dict[str, Any] = {}
+    if schedule == "paper":
+        base.update(PAPER)
+    if strategy == "gaussian-avatars":
+        base.update(GAUSSIAN_AVATARS)
+    settings = Settings(**{**base, "strategy": strategy, **changes})
+    if (settings.seconds is None) == (settings.iterations is None):
+        raise StgaError("give a budget in wall time (--budget) or in iterations (--iterations), one of the two")
+    if not (settings.seconds or settings.iterations or 0) > 0:
+        raise StgaError("the budget must be more than nothing")
+    return settings
+
+
+def to_json(settings: Settings) -> dict[str, Any]:
+    """Plain values, for the run folder and the avatar file; `from_json` reads them back."""
+    return dataclasses.asdict(settings)
+
+
+def from_json(values: dict[str, Any]) -> Settings:
+    """Settings from `to_json`. Raises TypeError or KeyError where a field is unknown or missing."""
+    values = dict(values)
+    values["selection"] = SelectionOptions(**{**values["selection"], "regions": tuple(values["selection"]["regions"])})
+    values["rates"] = Rates(**values["rates"])
+    for name in ("sh_steps", "density_span", "background"):
+        values[name] = tuple(values[name])
+    return Settings(**values)

@@ -1,0 +1,95 @@
+"""What training changes: the splats, their optimiser moments and what density control has gathered."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from ..avatar.splats import Splats
+from ..raster.render import Parameters
+
+
+@dataclass
+class TrainState:
+    """N splats in training, torch tensors on one device, all with N rows.
+
+    parameters, gradients, first, second  as in `Splats`: values, last gradient, Adam's two moments
+    steps    (N,) int32: how often Adam stepped the row
+    face     (N,) int32 and loose (N,) bool, as in `Splats`
+    pull     (N,) sum of the screen-space gradient lengths since the last density control, and
+    seen     (N,) float32: how many were summed
+    """
+
+    parameters: Parameters
+    gradients: Parameters
+    first: Parameters
+    second: Parameters
+    steps: torch.Tensor
+    face: torch.Tensor
+    loose: torch.Tensor
+    pull: torch.Tensor
+    seen: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def arrays(self) -> Parameters:
+        """The parameters as numpy arrays that share their memory."""
+        return Parameters(*(t.numpy() for t in self.parameters))
+
+    def splats(self) -> Splats:
+        """A copy of the splats as they are now."""
+        return Splats(*(t.numpy().copy() for t in self.parameters), self.face.numpy().copy(), self.loose.numpy().copy())
+
+
+def new_state(splats: Splats) -> TrainState:
+    """Fresh optimiser moments around a copy of the splats."""
+    values = [torch.from_numpy(getattr(splats, name).astype(np.float32)) for name in Parameters._fields]
+    n = len(splats)
+    return TrainState(
+        Parameters(*values),
+        *(Parameters(*(torch.zeros_like(v) for v in values)) for _ in range(3)),
+        torch.zeros(n, dtype=torch.int32),
+        torch.from_numpy(splats.face.astype(np.int32)),
+        torch.from_numpy(splats.loose.astype(bool)),
+        torch.zeros(n),
+        torch.zeros(n),
+    )
+
+
+def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
+    """The rows marked in `keep` (N,) bool, with everything that belongs to them."""
+    return _map(lambda tensors: tensors[0][keep], state)
+
+
+def join(state: TrainState, other: TrainState) -> TrainState:
+    """All rows of both, in order."""
+    return _map(lambda tensors: torch.cat(tensors), state, other)
+
+
+def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
+    """Every tensor under a flat name such as "first/xyz"; the inverse of `state_of`."""
+    flat = {}
+    for f in fields(state):
+        value = getattr(state, f.name)
+        if isinstance(value, torch.Tensor):
+            flat[f.name] = value
+        else:
+            flat.update({f"{f.name}/{name}": tensor for name, tensor in value._asdict().items()})
+    return flat
+
+
+def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
+    """Rebuild a state from `tensors_of`. Raises KeyError with the name of a missing tensor."""
+    values = []
+    for f in fields(TrainState):
+        if f.name in tensors:
+            values.append(tensors[f.name])
+        else:
+            values.append(Parameters(*(tensors[f"{f.name}/{name}"] for name in Parameters._fields)))
+    return TrainState(*values)
+
+
+def _map(function, *states: TrainState) -> TrainState:  # type: ignore[no-untyped-def]
+    flat = [tensors_of(s) for s in states]
+    return state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})

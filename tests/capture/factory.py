@@ -1,0 +1,186 @@
+"""Tiny captures written to disk by the tests: a ball of 10 cm seen by cameras around it."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+WIDTH, HEIGHT, FOCAL = 40, 60, 200.0
+CX, CY = 19.0, 36.0  # OpenCV; the files hold HEIGHT − CY
+RADIUS = 0.1
+SPLITS = ("train", "val", "test")
+
+
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    """(162, 3) vertices and (320, 3) triangles."""
+    sphere = trimesh.creation.icosphere(2, RADIUS)
+    return np.array(sphere.vertices), np.array(sphere.faces)
+
+
+def pose(camera: int) -> np.ndarray:
+    """Camera-to-world, OpenGL axes, one metre from the ball and looking at it."""
+    angle = 0.4 * camera - 0.5
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    matrix[:3, 3] = matrix[:3, 2]
+    return matrix
+
+
+def silhouette() -> np.ndarray:
+    """(HEIGHT, WIDTH) bool: which pixels' rays meet the ball; the same from every camera."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    sine = np.hypot(columns - CX, rows - CY) / np.sqrt((columns - CX) ** 2 + (rows - CY) ** 2 + FOCAL**2)
+    return sine < RADIUS
+
+
+def picture(timestep: int, camera: int) -> np.ndarray:
+    """(HEIGHT, WIDTH, 3) uint8 on white, of a colour that only this view has."""
+    return np.where(silhouette()[..., None], [10 * timestep, 10 * camera, 128], 255).astype(np.uint8)
+
+
+def moved(timestep: int, vertices: np.ndarray) -> np.ndarray:
+    """The ball's lower part stretched by 1 mm a timestep."""
+    return vertices - np.where(vertices[:, 1:2] < -0.06, [[0.0, 0.001 * timestep, 0.0]], 0.0)
+
+
+def frame(timestep: int, camera: int, **more: Any) -> dict[str, Any]:
+    name = f"{timestep:05d}_{camera:02d}.png"
+    return {
+        "timestep_index": timestep,
+        "camera_index": camera,
+        "camera_id": f"cam{camera}",
+        "file_path": f"images/{name}",
+        "fg_mask_path": f"fg_masks/{name}",
+        "transform_matrix": pose(camera).tolist(),
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": CX,
+        "cy": HEIGHT - CY,
+        "w": WIDTH,
+        "h": HEIGHT,
+        **more,
+    }
+
+
+def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -> None:
+    for folder in ("images", "fg_masks"):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    for timestep in timesteps:
+        for camera in cameras:
+            name = f"{timestep:05d}_{camera:02d}.png"
+            Image.fromarray(picture(timestep, camera)).save(root / "images" / name)
+            Image.fromarray(silhouette().astype(np.uint8) * 255).save(root / "fg_masks" / name)
+
+
+def write_splits(root: Path, frames: list[dict[str, Any]], **shared: Any) -> None:
+    """The last camera is `val`, the last timestep `test`, all else `train`."""
+    last_camera, last_timestep = max(f["camera_index"] for f in frames), max(f["timestep_index"] for f in frames)
+    splits: dict[str, list[dict[str, Any]]] = {name: [] for name in SPLITS}
+    for entry in frames:
+        late = entry["timestep_index"] == last_timestep
+        splits["test" if late else "val" if entry["camera_index"] == last_camera else "train"].append(entry)
+    for name, entries in splits.items():
+        (root / f"transforms_{name}.json").write_text(json.dumps({**shared, "frames": entries}))
+
+
+def write_mesh_capture(
+    root: Path, timesteps: Sequence[int] = (0, 1, 3), cameras: Sequence[int] = (0, 1, 2), suffix: str = ".obj"
+) -> Path:
+    """Layout "mesh" with a canonical mesh and one region, `mouth`."""
+    write_images(root, timesteps, cameras)
+    (root / "meshes").mkdir()
+    vertices, faces = ball()
+    write_mesh(root / f"meshes/neutral{suffix}", vertices, faces)
+    for timestep in timesteps:
+        write_mesh(root / f"meshes/{timestep:05d}{suffix}", moved(timestep, vertices), faces)
+    (root / "regions.json").write_text(json.dumps({"mouth": np.flatnonzero(vertices[:, 1] < -0.06).tolist()}))
+    frames = [frame(t, c, mesh_path=f"meshes/{t:05d}{suffix}") for t in timesteps for c in cameras]
+    write_splits(root, frames, canonical_mesh_path=f"meshes/neutral{suffix}", regions_path="regions.json")
+    return root
+
+
+def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    if path.suffix == ".obj":
+        points = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in vertices)
+        path.write_text(points + "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1))
+    else:
+        trimesh.Trimesh(vertices, faces, process=False).export(path)
+
+
+def write_flame_model(path: Path, seed: int = 0) -> Path:
+    """A model file in FLAME's format with the ball as template, four identity and two expression components."""
+    random = np.random.default_rng(seed)
+    vertices, faces = ball()
+    weights = random.random((len(vertices), 5))
+    regressor = random.random((5, len(vertices)))
+    np.savez(
+        path,
+        v_template=vertices,
+        shapedirs=0.002 * random.normal(size=(len(vertices), 3, 6)),
+        n_identity=4,
+        posedirs=0.0005 * random.normal(size=(len(vertices), 3, 36)),
+        J_regressor=regressor / regressor.sum(1, keepdims=True),
+        kintree_table=np.array([[-1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
+        weights=weights / weights.sum(1, keepdims=True),
+        f=faces,
+        **{"masks/nose": np.flatnonzero(vertices[:, 2] > 0.07), "masks/lips": np.flatnonzero(vertices[:, 1] < -0.06)},
+    )
+    return path
+
+
+def flame_parameters(timestep: int) -> dict[str, np.ndarray]:
+    """One timestep's file as VHAP writes it, with a leading 1."""
+    random = np.random.default_rng(100 + timestep)
+    vertices = len(ball()[0])
+    return {
+        "shape": np.full(4, 0.3, np.float32),
+        "expr": random.normal(size=(1, 2)).astype(np.float32),
+        "rotation": np.array([[0, 0.05 * timestep, 0]], np.float32),
+        "neck_pose": np.zeros((1, 3), np.float32),
+        "jaw_pose": np.array([[0.02 * timestep, 0, 0]], np.float32),
+        "eyes_pose": np.zeros((1, 6), np.float32),
+        "translation": np.array([[0.001 * timestep, 0, 0]], np.float32),
+        "static_offset": np.full((1, vertices, 3), 0.0005, np.float32),
+    }
+
+
+def write_flame_capture(
+    root: Path, timesteps: Sequence[int] = (0, 1, 3), cameras: Sequence[int] = (0, 1, 2)
+) -> tuple[Path, Path]:
+    """Layout "flame": the capture's folder and the model's file."""
+    write_images(root, timesteps, cameras)
+    (root / "flame_param").mkdir()
+    for timestep in timesteps:
+        np.savez(root / f"flame_param/{timestep:05d}.npz", **flame_parameters(timestep))
+    np.savez(root / "canonical_flame_param.npz", **flame_parameters(timesteps[0]))
+    write_splits(root, [frame(t, c, flame_param_path=f"flame_param/{t:05d}.npz") for t in timesteps for c in cameras])
+    return root, write_flame_model(root / "model.npz")
+
+
+def write_release(root: Path, timesteps: Sequence[int] = (0, 1), cameras: Sequence[int] = (0, 1)) -> Path:
+    """The layout of the STGA authors' release; the first timestep trains triangles 0, 2 and 5, others name none."""
+    write_images(root, timesteps, cameras)
+    (root / "meshes").mkdir()
+    (root / "training_faces").mkdir()
+    vertices, faces = ball()
+    for timestep in timesteps:
+        corners = moved(timestep, vertices)[faces]
+        document = {"triangles": [{"Vertices": triangle.tolist()} for triangle in corners]}
+        (root / f"meshes/mesh_{timestep:04d}.json").write_text(json.dumps(document))
+    np.save(root / "training_faces" / f"{timesteps[0]:04d}.npy", np.array([0, 2, 5]))
+    frames = [frame(t, c, keyframe=t) for t in timesteps for c in cameras]
+    for entry in frames:
+        del entry["timestep_index"]
+    (root / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    return root
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a JSON file in place."""
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))

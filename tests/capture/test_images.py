@@ -1,0 +1,163 @@
+"""Images and masks: every kind of file a studio hands over, and every way one can be broken."""
+
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.capture.camera import camera_from_gl
+from stga_addon.capture.images import area_mean, image_size, read_image, read_mask, read_view
+from stga_addon.capture.model import View
+from stga_addon.errors import StgaError
+
+WIDTH, HEIGHT = 7, 5
+RANDOM = np.random.default_rng(3)
+COLOUR = RANDOM.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+GREY = RANDOM.integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+ALPHA = RANDOM.integers(0, 255, (HEIGHT, WIDTH), np.uint8)
+
+
+def view_of(image: Path, mask: Path | None = None) -> View:
+    camera = camera_from_gl(np.eye(4), WIDTH, HEIGHT, 10, 10, WIDTH / 2, HEIGHT / 2)
+    return View(0, 0, camera, image.name, image, mask)
+
+
+def saved(path: Path, pixels: np.ndarray) -> Path:
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+def test_plain_colour(tmp_path: Path) -> None:
+    """Catches swapped channels or a transposed image."""
+    image = read_image(view_of(saved(tmp_path / "x.png", COLOUR)))
+    np.testing.assert_array_equal(image, COLOUR)
+    assert image.dtype == np.uint8
+
+
+@pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (10, 200, 90)])
+def test_transparency_is_laid_over_the_background(tmp_path: Path, background: tuple[int, int, int]) -> None:
+    """Catches premultiplied mixing and integer overflow, against the same in floating point; alpha is the mask."""
+    view = view_of(saved(tmp_path / "x.png", np.dstack([COLOUR, ALPHA])))
+    share = ALPHA[..., None] / 255
+    expected = np.round(COLOUR * share + np.array(background) * (1 - share))
+    np.testing.assert_allclose(read_image(view, background), expected, atol=0.51)
+    np.testing.assert_array_equal(read_mask(view), ALPHA)
+
+
+def test_grey_and_palette(tmp_path: Path) -> None:
+    """Catches grey, black-and-white, grey with alpha and palette images read with a missing channel axis."""
+    np.testing.assert_array_equal(read_image(view_of(saved(tmp_path / "l.png", GREY))), np.dstack([GREY] * 3))
+    bits = GREY > 127
+    np.testing.assert_array_equal(read_image(view_of(saved(tmp_path / "1.png", bits)))[..., 0], bits * 255)
+    la = saved(tmp_path / "la.png", np.dstack([GREY, np.where(bits, 255, 0).astype(np.uint8)]))
+    np.testing.assert_array_equal(read_image(view_of(la))[..., 1], np.where(bits, GREY, 255))
+    few = (COLOUR // 128) * 255
+    Image.fromarray(few).quantize(8).save(tmp_path / "p.png")
+    np.testing.assert_array_equal(read_image(view_of(tmp_path / "p.png")), few)
+    Image.fromarray(COLOUR).save(tmp_path / "t.png", transparency=tuple(map(int, COLOUR[2, 3])))
+    np.testing.assert_array_equal(read_image(view_of(tmp_path / "t.png"))[2, 3], [255, 255, 255])
+
+
+def test_sixteen_bits(tmp_path: Path) -> None:
+    """Catches 16-bit grey cut off at 255, which turns nearly everything white."""
+    wide = RANDOM.integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16)
+    saved(tmp_path / "x.png", wide)
+    image = read_image(view_of(tmp_path / "x.png"))
+    np.testing.assert_allclose(image[..., 0], wide / 257, atol=0.51)
+
+
+def test_masks(tmp_path: Path) -> None:
+    """Catches a mask read as anything but grey, and a mask invented where there is none."""
+    image = saved(tmp_path / "x.png", COLOUR)
+    assert read_mask(view_of(image)) is None
+    grey = read_mask(view_of(image, saved(tmp_path / "m.png", GREY)))
+    np.testing.assert_array_equal(grey, GREY)
+    coloured = read_mask(view_of(image, saved(tmp_path / "c.png", np.dstack([GREY] * 3))))
+    np.testing.assert_array_equal(coloured, GREY)
+
+
+def test_size_mismatch_names_both(tmp_path: Path) -> None:
+    """Catches an image that is resized in silence, or broadcast later on."""
+    wrong = saved(tmp_path / "wrong.png", COLOUR[:-1])
+    with pytest.raises(
+        StgaError, match=r"wrong\.png: the image has 7 x 4 pixels, but the camera of wrong\.png has 7 x"
+    ):
+        read_image(view_of(wrong))
+    right = saved(tmp_path / "right.png", COLOUR)
+    with pytest.raises(StgaError, match=r"wrong\.png: the mask has 7 x 4 pixels, but the image .*right\.png .* 7 x 5"):
+        read_mask(view_of(right, wrong))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.6, 0.95])
+def test_truncated_images(tmp_path: Path, suffix: str, kept: float) -> None:
+    """Catches a download that broke off being read as a half-grey image."""
+    path = tmp_path / f"x{suffix}"
+    big = RANDOM.integers(0, 256, (64, 64, 3), np.uint8)
+    saved(path, big)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    view = view_of(path)
+    view = replace(view, camera=replace(view.camera, width=64, height=64))
+    with pytest.raises(StgaError, match=rf"x\{suffix}: is not a readable image"):
+        read_image(view)
+
+
+def test_missing_and_foreign_images(tmp_path: Path) -> None:
+    """Catches a missing image, a text file, and a format that Pillow would run Ghostscript for."""
+    with pytest.raises(StgaError, match=r"none\.png: does not exist"):
+        read_image(view_of(tmp_path / "none.png"))
+    for text in (b"hello", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 7 5\n%%EndComments\n"):
+        (tmp_path / "x.png").write_bytes(text)
+        with pytest.raises(StgaError, match=r"x\.png: is not a readable image"):
+            read_image(view_of(tmp_path / "x.png"))
+    with pytest.raises(StgaError, match="is not a readable image"):
+        read_image(view_of(tmp_path))
+
+
+def test_decompression_bomb(tmp_path: Path) -> None:
+    """Catches a tiny file that claims gigapixels and would fill the memory."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+    header = (60000).to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    with pytest.raises(StgaError, match=r"bomb\.png: "):
+        read_image(view_of(tmp_path / "bomb.png"))
+    with pytest.raises(StgaError, match=r"bomb\.png: "):
+        image_size(tmp_path / "bomb.png")
+
+
+@pytest.mark.parametrize(("height", "width"), [(5, 7), (3, 4), (2, 7), (1, 1), (4, 5)])
+def test_area_mean_against_overlaps(height: int, width: int) -> None:
+    """Catches point sampling and edges counted twice, against every overlap added up one by one."""
+
+    def overlaps(old: int, new: int) -> np.ndarray:
+        step = old / new
+        return np.array(
+            [[max(0, min((j + 1) * step, i + 1) - max(j * step, i)) / step for i in range(old)] for j in range(new)]
+        )
+
+    expected = np.einsum("yh,xw,hwc->yxc", overlaps(HEIGHT, height), overlaps(WIDTH, width), COLOUR.astype(float))
+    np.testing.assert_allclose(area_mean(COLOUR, height, width), expected, atol=0.5 + 1e-9)
+    np.testing.assert_allclose(area_mean(GREY, height, width).mean(), GREY.mean(), atol=0.51)
+
+
+def test_scaled_view(tmp_path: Path) -> None:
+    """Catches an image and a camera scaled to different sizes, and a focal length left behind."""
+    view = view_of(saved(tmp_path / "x.png", COLOUR), saved(tmp_path / "m.png", GREY))
+    small, image, mask = read_view(view, 0.5)
+    assert mask is not None
+    assert image.shape == (small.camera.height, small.camera.width, 3)
+    assert mask.shape == image.shape[:2]
+    assert small.camera.fl_x == pytest.approx(10 * small.camera.width / WIDTH)
+    same, image, mask = read_view(view)
+    assert same is view
+    np.testing.assert_array_equal(image, COLOUR)
+    with pytest.raises(ValueError, match="scale"):
+        read_view(view, 1.5)

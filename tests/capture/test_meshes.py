@@ -1,0 +1,208 @@
+"""Tracked meshes: the readers, constant topology, regions and the rigid fit."""
+
+import json
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from stga_addon.capture.meshes import CACHE_BYTES, read_mesh, read_regions, remembered, tracked_meshes
+from stga_addon.capture.rigid import weighted_procrustes, without_head_motion
+from stga_addon.errors import StgaError
+
+from . import factory
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+def test_order_is_kept(tmp_path: Path, suffix: str) -> None:
+    """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused vertex."""
+    vertices, faces = factory.ball()
+    vertices = np.concatenate([vertices[:1], [[1.0, 2.0, 3.0]], vertices])
+    path = tmp_path / f"mesh{suffix}"
+    factory.write_mesh(path, vertices, faces + 2)
+    read, triangles = read_mesh(path)
+    np.testing.assert_allclose(read, vertices, atol=1e-7)
+    np.testing.assert_array_equal(triangles, faces + 2)
+    assert (read.dtype, triangles.dtype) == (np.float64, np.int32)
+
+
+def test_stl_is_a_soup_in_order(tmp_path: Path) -> None:
+    """Catches STL triangles welded by position, which would join lips and eyelids that merely touch."""
+    vertices, faces = factory.ball()
+    factory.write_mesh(tmp_path / "mesh.stl", vertices, faces)
+    read, triangles = read_mesh(tmp_path / "mesh.stl")
+    np.testing.assert_allclose(read[triangles], vertices[faces], atol=1e-7)
+    assert len(read) == 3 * len(faces)
+
+
+def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
+    """Catches an error of the OBJ parser, against trimesh on a real tracked mesh, and parsing slower than 100 ms."""
+    path = shared_data / "studio_head/meshes/00003.obj"
+    reference = trimesh.load(path, process=False, maintain_order=True)
+    seconds = []
+    for _ in range(3):
+        start = perf_counter()
+        vertices, faces = read_mesh(path)
+        seconds.append(perf_counter() - start)
+    np.testing.assert_array_equal(vertices, reference.vertices)
+    np.testing.assert_array_equal(faces, reference.faces)
+    assert min(seconds) < 0.1
+
+
+def test_obj_dialects(tmp_path: Path) -> None:
+    """Catches what exporters really write: colours, texture corners, several materials and objects, quads,
+    negative indices, Windows line ends, continued lines. trimesh would regroup the triangles by material.
+    """
+    lines = ["mtllib x.mtl", "o a", *(f"v {i} {i * i} 0 1 0 0" for i in range(5)), "vt 0 0", "vn 0 0 1", "usemtl b"]
+    lines += ["f 4/1 2/1 1/1", "usemtl a", "f 1//1 2//1 3//1 4//1", "o b", "f -1 -2\\", " -3", "f 1/1/1 3/1/1 5/1/1"]
+    path = tmp_path / "x.obj"
+    path.write_bytes("\r\n".join(lines).encode())
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices, [[i, i * i, 0] for i in range(5)])
+    np.testing.assert_array_equal(faces, [[3, 1, 0], [0, 1, 2], [0, 2, 3], [4, 3, 2], [0, 2, 4]])
+
+
+OK = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "hello",
+        OK,
+        "f 1 2 3\n",
+        OK + "f 1 2\n",
+        OK + "f 1 2 4\n",
+        OK + "f 0 1 2\n",
+        OK + "f 1 2 -4\n",
+        OK + "f a b c\n",
+        OK + "f 1 2 99999999999999999999\n",
+        "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
+        "v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 x\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 inf\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    ],
+)
+def test_malformed_obj(tmp_path: Path, text: str) -> None:
+    """Catches a broken OBJ that loads, or ends in a traceback."""
+    path = tmp_path / "x.obj"
+    path.write_text(text)
+    with pytest.raises(StgaError, match=r"x\.obj: "):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
+def test_truncated_mesh(tmp_path: Path, suffix: str, kept: float) -> None:
+    """Catches a download that broke off: trimesh itself reads half an STL as an empty mesh."""
+    path = tmp_path / f"x{suffix}"
+    factory.write_mesh(path, *factory.ball())
+    data = path.read_bytes()
+    # An OBJ cut at the end of a line is a valid mesh; cut inside of a face it is not.
+    end = data.rindex(b"\nf ") + 4 if suffix == ".obj" and kept else int(len(data) * kept)
+    path.write_bytes(data[:end])
+    with pytest.raises(StgaError, match=rf"x\{suffix}: "):
+        read_mesh(path)
+
+
+def test_missing_and_unknown_meshes(tmp_path: Path) -> None:
+    """Catches a missing file or a foreign format ending in a traceback."""
+    with pytest.raises(StgaError, match=r"none\.ply: cannot be read"):
+        read_mesh(tmp_path / "none.ply")
+    with pytest.raises(StgaError, match=r"x\.fbx: is not a mesh; expected one of \.obj"):
+        read_mesh(tmp_path / "x.fbx")
+
+
+def test_topology_must_not_change(tmp_path: Path) -> None:
+    """Catches splats bound to triangles that are other ones in a later frame; the error names the file."""
+    vertices, faces = factory.ball()
+    swapped = faces.copy()
+    swapped[[7, 8]] = swapped[[8, 7]]
+    files = {0: tmp_path / "0.obj", 1: tmp_path / "1.obj", 2: tmp_path / "2.obj"}
+    for path, triangles in zip(files.values(), (faces, faces[:-1], swapped), strict=True):
+        factory.write_mesh(path, vertices, triangles)
+    mesh = tracked_meshes(files, faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh)
+    np.testing.assert_allclose(mesh(0), vertices, atol=1e-9)
+    with pytest.raises(StgaError, match=r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"):
+        mesh(1)
+    with pytest.raises(StgaError, match=r"2\.obj: triangle 7 joins vertices"):
+        mesh(2)
+    with pytest.raises(StgaError, match="timestep 9 has no tracked mesh; the capture has 0 to 2"):
+        mesh(9)
+
+
+def test_meshes_are_kept_within_bounds() -> None:
+    """Catches a mesh parsed again at each visit, a cache that grows with the sequence, or a shared array changed."""
+    calls: list[int] = []
+
+    def read(timestep: int) -> np.ndarray:
+        calls.append(timestep)
+        return np.full((4, 3), float(timestep))
+
+    vertices = CACHE_BYTES // 24 // 3  # three fit
+    mesh = remembered(read, vertices)
+    assert [mesh(t)[0, 0] for t in (0, 1, 2, 0, 1, 2)] == [0, 1, 2, 0, 1, 2]
+    assert calls == [0, 1, 2]
+    mesh(3)
+    mesh(0)
+    assert calls == [0, 1, 2, 3, 0]
+    with pytest.raises(ValueError, match="read-only"):
+        mesh(0)[0] = 1
+
+
+@pytest.mark.parametrize(
+    "document", ["[]", "{", '{"mouth": 3}', '{"mouth": ["a"]}', '{"mouth": [-1]}', '{"mouth": [4]}', '{"mouth": [1.5]}']
+)
+def test_malformed_regions(tmp_path: Path, document: str) -> None:
+    """Catches a regions file whose indices are no vertices of the mesh."""
+    path = tmp_path / "regions.json"
+    path.write_text(document)
+    with pytest.raises(StgaError, match=r"regions\.json: "):
+        read_regions(path, np.array([[0, 1, 2], [1, 2, 3]]), 4)
+
+
+def test_region_holds_triangles_with_all_corners_in_it(tmp_path: Path) -> None:
+    """Catches a region that takes triangles with one or two corners in it."""
+    path = tmp_path / "regions.json"
+    path.write_text(json.dumps({"nose": [2, 1, 0], "none": []}))
+    regions = read_regions(path, np.array([[0, 1, 2], [1, 2, 3]]), 4)
+    assert regions["nose"].tolist() == [True, False]
+    assert regions["none"].tolist() == [False, False]
+
+
+def test_procrustes_as_scipy_has_it() -> None:
+    """Catches a reflection, a transposed rotation or ignored weights, against scipy's align_vectors."""
+    random = np.random.default_rng(1)
+    source, target, weights = random.normal(size=(30, 3)), random.normal(size=(30, 3)), random.random(30)
+    rotation, translation = weighted_procrustes(source, target, weights)
+    centres = np.average(source, 0, weights), np.average(target, 0, weights)
+    expected = Rotation.align_vectors(target - centres[1], source - centres[0], weights)[0].as_matrix()
+    np.testing.assert_allclose(rotation, expected, atol=1e-9)
+    np.testing.assert_allclose(rotation @ centres[0] + translation, centres[1], atol=1e-12)
+
+
+def test_moving_jaw_does_not_drag_the_head() -> None:
+    """Catches a plain least-squares fit: with 40 % of the vertices turned down by 2 cm it tilts the skull by mm."""
+    random = np.random.default_rng(2)
+    neutral = random.normal(size=(2000, 3)) * 0.08
+    jaw = neutral[:, 1] < np.quantile(neutral[:, 1], 0.4)
+    opened = neutral - np.where(jaw[:, None], [[0.0, 0.02, 0.005]], 0.0)
+    rotation = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_matrix()
+    fitted = without_head_motion(opened @ rotation.T + [0.1, 0.2, -0.3], neutral)
+    np.testing.assert_allclose(fitted, opened, atol=1e-5)
+    plain = weighted_procrustes(opened, neutral, np.ones(len(neutral)))
+    assert np.abs(opened @ plain[0].T + plain[1] - opened).max() > 1e-3
+
+
+def test_pure_head_motion_vanishes() -> None:
+    """Catches a fit that stops early, or divides by a residual of zero."""
+    neutral, _ = factory.ball()
+    rotation = Rotation.from_rotvec([0, np.pi, 0]).as_matrix()
+    moved = neutral @ rotation.T + [1, 2, 3]
+    np.testing.assert_allclose(without_head_motion(moved, neutral), neutral, atol=1e-9)
+    np.testing.assert_allclose(without_head_motion(neutral, neutral), neutral, atol=1e-12)

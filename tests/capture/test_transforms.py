@@ -1,0 +1,220 @@
+"""Cameras, frames and paths of the transforms files."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.principal_point import project
+from stga_addon.capture.transforms import Frame, inside, read_splits, read_transforms
+from stga_addon.errors import StgaError
+
+from . import factory
+
+
+def read_one(folder: Path, entry: dict[str, Any], principal_point: str = "vhap", **shared: Any) -> Frame:
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**shared, "frames": [entry]}))
+    return read_transforms(path, principal_point)[0]
+
+
+def test_projection_is_that_of_an_opengl_camera(tmp_path: Path) -> None:
+    """Catches a wrong axis flip, an inverted pose or a swapped principal point, by the textbook OpenGL formula."""
+    camera = read_one(tmp_path, factory.frame(0, 2)).view.camera
+    points = np.random.default_rng(0).normal(scale=0.1, size=(50, 3))
+    x, y, z, _ = np.linalg.inv(factory.pose(2)) @ np.c_[points, np.ones(50)].T
+    u, v = factory.CX + factory.FOCAL * x / -z, factory.CY - factory.FOCAL * y / -z
+    pixels, depth = project(points, camera)
+    np.testing.assert_allclose(pixels, np.c_[u, v], atol=1e-9)
+    np.testing.assert_allclose(depth, -z, atol=1e-12)
+    np.testing.assert_allclose(camera.camera_to_world_gl, factory.pose(2), atol=1e-12)
+
+
+def test_own_intrinsics_win(tmp_path: Path) -> None:
+    """Catches a reader that trusts the top level, which real exports get wrong."""
+    wrong = {"fl_x": 7.0, "fl_y": 7.0, "cx": 1.0, "cy": 1.0, "w": 8, "h": 8, "camera_angle_x": 1.0}
+    camera = read_one(tmp_path, factory.frame(0, 0), **wrong).view.camera
+    found = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
+    assert found == (factory.WIDTH, factory.HEIGHT, factory.FOCAL, factory.FOCAL, factory.CX, factory.CY)
+
+
+def test_shared_intrinsics_and_field_of_view(tmp_path: Path) -> None:
+    """Catches a lost fallback: values at the top level only, and camera_angle_x in place of a focal length.
+
+    A frame's own angle wins over a focal length at the top.
+    """
+    entry = {key: factory.frame(0, 0)[key] for key in ("file_path", "transform_matrix")}
+    angle = 2 * math.atan(20 / 200)
+    shared = {"w": 40, "h": 60, "camera_angle_x": angle}
+    camera = read_one(tmp_path, entry, **shared).view.camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (40, 60, 20, 30)
+    assert camera.fl_x == pytest.approx(200)
+    assert camera.fl_y == pytest.approx(200)
+    own = {**entry, "camera_angle_x": 2 * math.atan(20 / 300), "camera_angle_y": 2 * math.atan(30 / 150)}
+    camera = read_one(tmp_path, own, **shared, fl_x=5.0).view.camera
+    assert (camera.fl_x, camera.fl_y) == (pytest.approx(300), pytest.approx(150))
+
+
+@pytest.mark.parametrize(
+    ("convention", "expected"),
+    [("vhap", (19.0, 36.0)), ("opencv", (19.0, 24.0)), ("centre", (20.0, 30.0))],
+)
+def test_principal_point(tmp_path: Path, convention: str, expected: tuple[float, float]) -> None:
+    """Catches a convention mixed up: the file holds cx 19 and cy 24 of a 40 x 60 image."""
+    camera = read_one(tmp_path, factory.frame(0, 0), convention).view.camera
+    assert (camera.cx, camera.cy) == expected
+
+
+def test_cameras_are_numbered_alike_in_all_splits(tmp_path: Path) -> None:
+    """Catches the held-out camera of `val` taking the number of a training camera when camera_index is missing."""
+    write = factory.write_mesh_capture(tmp_path / "capture")
+    for keep_id in (True, False):
+        for split in factory.SPLITS:
+
+            def strip(document: dict[str, Any], keep_id: bool = keep_id) -> None:
+                for entry in document["frames"]:
+                    entry.pop("camera_index", None)
+                    if not keep_id:
+                        entry.pop("camera_id", None)
+
+            factory.edit(write / f"transforms_{split}.json", strip)
+        splits = read_splits(write).splits
+        where = {name: {f.view.camera_index for f in frames} for name, frames in splits.items()}
+        assert where == {"train": {0, 1}, "val": {2}, "test": {0, 1, 2}}
+
+
+def test_single_file_is_all_training(tmp_path: Path) -> None:
+    """Catches frames lost, or split by guesswork, where a capture has transforms.json alone."""
+    frames = [factory.frame(0, camera) for camera in range(3)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    splits = read_splits(tmp_path).splits
+    assert {name: len(frames) for name, frames in splits.items()} == {"train": 3, "val": 0, "test": 0}
+
+
+def test_static_capture_without_timesteps(tmp_path: Path) -> None:
+    """Catches a plain NeRF transforms file (no timestep, no size but the image's, no suffix) being refused."""
+    factory.write_images(tmp_path, [0], [0])
+    entry = {"file_path": "images/00000_00", "transform_matrix": factory.pose(0).tolist()}
+    frame = read_one(tmp_path, entry, camera_angle_x=0.5)
+    assert (frame.view.timestep, frame.view.camera_index) == (0, 0)
+    assert (frame.view.camera.width, frame.view.camera.height) == (factory.WIDTH, factory.HEIGHT)
+    assert frame.view.name == "images/00000_00"
+    assert frame.view.image == tmp_path / "images/00000_00.png"
+
+
+def test_union_paths_stay_beside_the_capture(tmp_path: Path) -> None:
+    """Catches union sets (`../<sequence>/images`) being refused, or resolved from the working directory."""
+    root = tmp_path / "union"
+    assert inside(root, "../seq_01/images/1.png", "x") == tmp_path / "seq_01/images/1.png"
+    assert inside(root, "images/../../seq_01\\1.png", "x") == tmp_path / "seq_01/1.png"
+    assert inside(root, "./images//1.png", "x") == root / "images/1.png"
+    assert inside(root, "..foo/1.png", "x") == root / "..foo/1.png"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../../secret.png",
+        "images/../../../secret.png",
+        "../seq/../../secret.png",
+        "..\\..\\secret.png",
+        "/etc/passwd",
+        "\\\\server\\share\\x.png",
+        "C:\\x.png",
+        "C:x.png",
+        "images/C:/x.png",
+        "..",
+        "",
+        "a\0b",
+    ],
+)
+@pytest.mark.parametrize("field", ["file_path", "fg_mask_path", "mesh_path", "flame_param_path"])
+def test_paths_that_leave_are_refused(tmp_path: Path, path: str, field: str) -> None:
+    """Catches path traversal: a downloaded capture must not read files elsewhere, on any operating system."""
+    with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.{field}: "):
+        read_one(tmp_path, {**factory.frame(0, 0), field: path})
+
+
+@pytest.mark.parametrize("field", ["canonical_mesh_path", "regions_path"])
+def test_top_level_paths_that_leave_are_refused(tmp_path: Path, field: str) -> None:
+    """Catches the same traversal through the fields beside the frames."""
+    (tmp_path / "transforms.json").write_text(json.dumps({field: "../../x.obj", "frames": []}))
+    with pytest.raises(StgaError, match=rf"transforms\.json: {field}: "):
+        read_splits(tmp_path)
+
+
+SKEWED = np.eye(4)
+SKEWED[0, 1] = 0.01
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
+MALFORMED: list[tuple[str, Any]] = [
+    ("file_path", None),
+    ("file_path", 3),
+    ("timestep_index", -1),
+    ("timestep_index", 1.5),
+    ("timestep_index", True),
+    ("timestep_index", "3"),
+    ("camera_index", [1]),
+    ("fl_x", 0),
+    ("fl_x", float("nan")),
+    ("fl_x", "200"),
+    ("fl_y", -3.0),
+    ("cx", float("inf")),
+    ("cy", {}),
+    ("w", 0),
+    ("w", 40.5),
+    ("w", 10**9),
+    ("h", True),
+    ("fg_mask_path", 7),
+    ("mesh_path", ["a.obj"]),
+    ("transform_matrix", None),
+    ("transform_matrix", np.eye(3).tolist()),
+    ("transform_matrix", [[1, 0], [0]]),
+    ("transform_matrix", [["a"] * 4] * 4),
+    ("transform_matrix", np.full((4, 4), np.nan).tolist()),
+    ("transform_matrix", (2 * np.eye(4)).tolist()),
+    ("transform_matrix", SKEWED.tolist()),
+    ("transform_matrix", MIRRORED.tolist()),
+    ("transform_matrix", np.zeros((4, 4)).tolist()),
+]
+
+
+@pytest.mark.parametrize(("field", "value"), MALFORMED)
+def test_malformed_fields(tmp_path: Path, field: str, value: Any) -> None:
+    """Catches a wrong value that passes, or ends in a traceback, instead of an error that names file and field."""
+    named = "w" if field == "h" and value is True else field
+    with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.({named}|{field}): "):
+        read_one(tmp_path, {**factory.frame(0, 0), field: value})
+
+
+@pytest.mark.parametrize(
+    "document", ["", "[]", "3", "{", '{"frames": {}}', '{"frames": [3]}', '{"frame": []}', "[" * 100000]
+)
+def test_malformed_documents(tmp_path: Path, document: str) -> None:
+    """Catches a transforms file that is no object with frames ending in a traceback."""
+    (tmp_path / "transforms.json").write_text(document)
+    with pytest.raises(StgaError, match=r"transforms\.json: "):
+        read_splits(tmp_path)
+
+
+def test_missing_intrinsics_name_the_field(tmp_path: Path) -> None:
+    """Catches a frame without focal length, or without size and image, read as zeros."""
+    entry = factory.frame(0, 0)
+    del entry["fl_x"]
+    with pytest.raises(StgaError, match=r"frames\[0\]\.fl_x: is missing"):
+        read_one(tmp_path, entry)
+    entry = factory.frame(0, 0)
+    del entry["w"]
+    with pytest.raises(StgaError, match=r"frames\[0\]\.w: .*missing"):
+        read_one(tmp_path, entry)
+
+
+def test_a_timestep_missing_among_others(tmp_path: Path) -> None:
+    """Catches a frame that silently becomes timestep 0."""
+    frames = [factory.frame(4, 0), factory.frame(4, 1)]
+    del frames[1]["timestep_index"]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(StgaError, match=r"frames\[1\]\.timestep_index: is missing"):
+        read_splits(tmp_path)

@@ -1,0 +1,120 @@
+"""Selection: regions by their mean offset, other triangles by their own, and whose word is last."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.model import Capture
+from stga_addon.selection import SelectionOptions, select_capture, select_faces
+
+THRESHOLD = 0.01
+COUNT = 8
+FACES = np.arange(3 * COUNT).reshape(COUNT, 3)  # separate triangles, so that each can be moved alone
+NEUTRAL = np.random.default_rng(0).normal(size=(3 * COUNT, 3))
+
+
+def moved(offsets: dict[int, float]) -> np.ndarray:
+    """The neutral mesh with some triangles shifted by so many metres, each in its own direction."""
+    mesh, rng = NEUTRAL.copy(), np.random.default_rng(1)
+    for face, distance in offsets.items():
+        direction = rng.normal(size=3)
+        mesh[FACES[face]] += distance * direction / np.linalg.norm(direction)
+    return mesh
+
+
+def region(*faces: int) -> np.ndarray:
+    return np.isin(np.arange(COUNT), faces)
+
+
+def selected(offsets: dict[int, float], **regions: np.ndarray) -> list[int]:
+    return np.flatnonzero(select_faces(moved(offsets), NEUTRAL, FACES, regions, THRESHOLD)).tolist()
+
+
+def test_triangles_outside_regions_go_by_their_own_offset():
+    """Catches a mean taken over everything, and a threshold that is not strict enough or too strict."""
+    assert selected({1: 0.011, 2: 0.0099, 5: 0.5}) == [1, 5]
+    assert selected({}) == []
+
+
+def test_region_goes_by_its_mean_offset():
+    """Catches the maximum, or a per-triangle rule, inside a region: 0.021 over two of them is 0.0105 on average."""
+    assert selected({0: 0.021}, mouth=region(0, 1)) == [0, 1]
+    assert selected({0: 0.019}, mouth=region(0, 1)) == []
+
+
+def test_large_offset_inside_an_unmoved_region_is_not_selected():
+    """Catches the own-distance rule leaking into key regions, whose mean decides alone."""
+    assert selected({0: 0.03, 7: 0.03}, mouth=region(0, 1, 2, 3)) == [7]
+
+
+def test_mean_is_of_distances_not_of_vectors():
+    """Catches opposite movements, as of the two lips, that cancel each other."""
+    mesh = NEUTRAL.copy()
+    mesh[FACES[0], 1] += 0.02
+    mesh[FACES[1], 1] -= 0.02
+    chosen = select_faces(mesh, NEUTRAL, FACES, {"mouth": region(0, 1)}, THRESHOLD)
+    assert np.flatnonzero(chosen).tolist() == [0, 1]
+
+
+def test_offset_is_that_of_the_centre():
+    """Catches vertex distances: a triangle that turns about its centre has not moved."""
+    mesh = NEUTRAL.copy()
+    corners = mesh[FACES[2]]
+    mesh[FACES[2]] = np.roll(corners, 1, axis=0)
+    assert not select_faces(mesh, NEUTRAL, FACES, {}, THRESHOLD).any()
+
+
+def test_triangle_of_two_regions_is_selected_by_either():
+    """Catches a later region that unselects what an earlier one selected."""
+    for names in (("nose", "mouth"), ("mouth", "nose")):
+        regions = dict.fromkeys(names, region(4)) | {"mouth": region(0, 4), "nose": region(3, 4, 5, 6)}
+        assert selected({0: 0.03}, **regions) == [0, 4]
+
+
+def test_empty_region_selects_nothing():
+    """Catches the mean of nothing, which is NaN and a warning."""
+    with np.errstate(all="raise"):
+        assert selected({1: 0.02}, mouth=region()) == [1]
+
+
+def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]) -> Capture:
+    def expression_mesh(timestep: int, zero_pose: str) -> np.ndarray:
+        asked.append((timestep, zero_pose))
+        return moved({timestep: 0.03})
+
+    return Capture(
+        root=Path(),
+        layout="test",
+        faces=FACES,
+        neutral=NEUTRAL,
+        views={},
+        timesteps=(1, 4, 6),
+        regions={"mouth": region(1, 2), "ears": region(3, 4, 5)},
+        mesh=lambda timestep: pytest.fail("selection must not look at the mesh with head motion"),
+        expression_mesh=expression_mesh,
+        given_selection=given_selection,
+    )
+
+
+def test_every_timestep_is_selected_from_its_expression_mesh():
+    """Catches regions that the options do not name, and the wrong zero pose: "ears" is no key region here."""
+    asked, reported = [], []
+    options = SelectionOptions(threshold=THRESHOLD, zero_pose="all")
+    chosen = select_capture(capture({}, asked), options, reported.append)
+    assert {timestep: np.flatnonzero(mask).tolist() for timestep, mask in chosen.items()} == {1: [1, 2], 4: [4], 6: [6]}
+    assert asked == [(1, "all"), (4, "all"), (6, "all")]
+    assert reported == [1, 4, 6]
+
+
+def test_selection_that_came_with_the_capture_wins():
+    """Catches the rule overriding the authors' own training faces, an empty choice included."""
+    asked: list[tuple[int, str]] = []
+    given = {4: region(0, 7), 6: region()}
+    chosen = select_capture(capture(given, asked), SelectionOptions(threshold=THRESHOLD))
+    assert {timestep: np.flatnonzero(mask).tolist() for timestep, mask in chosen.items()} == {
+        1: [1, 2],
+        4: [0, 7],
+        6: [],
+    }
+    assert asked == [(1, "head")]
