@@ -11,7 +11,7 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
 from ..stga_addon.avatar.ply import write_ply
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.compat import evaluated_vertices
+from ..stga_addon.scene.compat import PATH_OPTIONS, evaluated_vertices
 from ..stga_addon.scene.splats import check_head
 from . import ids
 from .common import capture_of, file_path, head_of, needs_head, reporting, settings
@@ -25,13 +25,17 @@ class Export(bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filepath: bpy.props.StringProperty(
-        name="File or Folder", description="A file for one PLY, a folder for the other formats", subtype="FILE_PATH"
+        name="File or Folder",
+        description="A file for one PLY, a folder for the other formats",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS,
     )
     avatar: bpy.props.StringProperty(
-        name="Avatar", description="Avatar file (.npz); empty: the one shown", subtype="FILE_PATH"
+        name="Avatar", description="Avatar file (.npz); empty: the one shown", subtype="FILE_PATH", options=PATH_OPTIONS
     )
     format: bpy.props.EnumProperty(
         name="Format",
+        description="What the files are for",
         items=(
             ("ply", "PLY", "The current frame in world space, for every 3D Gaussian Splatting viewer"),
             ("ply-sequence", "PLY Sequence", "One world-space PLY for every frame of the scene"),

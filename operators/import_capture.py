@@ -7,6 +7,7 @@ import bpy
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import configure_scene, import_cameras
+from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.head import import_head
 from ..stga_addon.scene.hierarchy import capture_root
 from . import ids
@@ -21,13 +22,17 @@ class ImportCapture(bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     directory: bpy.props.StringProperty(
-        name="Capture", description="Folder that holds the capture's transforms files or meshes", subtype="DIR_PATH"
+        name="Capture",
+        description="Folder that holds the capture's transforms files or meshes",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS,
     )
     flame: bpy.props.StringProperty(
         name="FLAME Model",
         description="Your own FLAME model file (.pkl or .npz), for captures tracked with FLAME; "
         "empty: the one in the preferences",
         subtype="FILE_PATH",
+        options=PATH_OPTIONS,
     )
     principal_point: bpy.props.EnumProperty(
         name="Principal Point",

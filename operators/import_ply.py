@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.avatar.ply import read_ply
+from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.splats import show_world_splats
 from . import ids
 from .common import file_path, reporting, settings
@@ -21,7 +22,9 @@ class ImportPly(bpy.types.Operator):
     bl_label = "Import Gaussian Splats"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(name="File", description="3D Gaussian Splatting PLY", subtype="FILE_PATH")
+    filepath: bpy.props.StringProperty(
+        name="File", description="3D Gaussian Splatting PLY", subtype="FILE_PATH", options=PATH_OPTIONS
+    )
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
     up: bpy.props.EnumProperty(
         name="Up",

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.materials import view_transform_hint
 from ..stga_addon.scene.splats import show_avatar
 from . import ids
@@ -18,7 +19,9 @@ class ShowAvatar(bpy.types.Operator):
     bl_label = "Show Avatar"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(name="Avatar", description="Avatar file (.npz)", subtype="FILE_PATH")
+    filepath: bpy.props.StringProperty(
+        name="Avatar", description="Avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
+    )
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
 
     @classmethod

@@ -8,6 +8,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.groups import read_selection
 from . import ids
 from .common import capture_of, file_path, head_of, needs_head, reporting, settings
@@ -23,7 +24,10 @@ class Train(bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     directory: bpy.props.StringProperty(
-        name="Run Folder", description="Where the avatar and its checkpoints are written", subtype="DIR_PATH"
+        name="Run Folder",
+        description="Where the avatar and its checkpoints are written",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS,
     )
     minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
     iterations: bpy.props.IntProperty(
@@ -31,6 +35,7 @@ class Train(bpy.types.Operator):
     )
     strategy: bpy.props.EnumProperty(
         name="Strategy",
+        description="Which splats an iteration trains",
         items=(
             ("selective", "Selective", "Local iterations on what each frame selects, global ones in between"),
             ("global", "Global", "Every iteration trains all splats"),

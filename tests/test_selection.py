@@ -97,12 +97,16 @@ def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]
     )
 
 
+def numbers(chosen: dict[int, np.ndarray]) -> dict[int, list[int]]:
+    return {timestep: np.flatnonzero(mask).tolist() for timestep, mask in chosen.items()}
+
+
 def test_every_timestep_is_selected_from_its_expression_mesh():
     """Catches regions that the options do not name, and the wrong zero pose: "ears" is no key region here."""
     asked, reported = [], []
     options = SelectionOptions(threshold=THRESHOLD, zero_pose="all")
     chosen = select_capture(capture({}, asked), options, reported.append)
-    assert {timestep: np.flatnonzero(mask).tolist() for timestep, mask in chosen.items()} == {1: [1, 2], 4: [4], 6: [6]}
+    assert numbers(chosen) == {1: [1, 2], 4: [4], 6: [6]}
     assert asked == [(1, "all"), (4, "all"), (6, "all")]
     assert reported == [1, 4, 6]
 
@@ -112,7 +116,7 @@ def test_selection_that_came_with_the_capture_wins():
     asked: list[tuple[int, str]] = []
     given = {4: region(0, 7), 6: region()}
     chosen = select_capture(capture(given, asked), SelectionOptions(threshold=THRESHOLD))
-    assert {timestep: np.flatnonzero(mask).tolist() for timestep, mask in chosen.items()} == {
+    assert numbers(chosen) == {
         1: [1, 2],
         4: [0, 7],
         6: [],

@@ -5,6 +5,7 @@ from typing import Any
 import bpy
 
 from ..operators.common import register_classes, unregister_classes
+from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -15,6 +16,7 @@ class Preferences(bpy.types.AddonPreferences):
         description="Your own FLAME model file (.pkl or .npz), from flame.is.tue.mpg.de; "
         "needed for captures tracked with FLAME, and never part of this add-on",
         subtype="FILE_PATH",
+        options=PATH_OPTIONS,
     )
 
     def draw(self, context: Any) -> None:

@@ -7,6 +7,7 @@ import bpy
 from ..operators import ids
 from ..operators.common import register_classes, unregister_classes
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
 def _is_head(self: Any, thing: Any) -> bool:
@@ -30,10 +31,13 @@ class Settings(bpy.types.PropertyGroup):
         name="Run Folder",
         description="Where training writes the avatar and its checkpoints",
         subtype="DIR_PATH",
+        options=PATH_OPTIONS,
         default="//stga_run",
     )
     minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
-    avatar: bpy.props.StringProperty(name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH")
+    avatar: bpy.props.StringProperty(
+        name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
+    )
 
 
 def register() -> None:

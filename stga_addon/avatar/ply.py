@@ -140,15 +140,15 @@ class _Header:
 
 def _read_header(path: Path, file: BinaryIO) -> _Header:
     start = file.read(MAX_HEADER_BYTES)
-    end = start.find(b"end_header")
-    newline = start.find(b"\n", end)
+    end = start.find(b"\nend_header")
+    newline = start.find(b"\n", end + 1)
     if not start.startswith(b"ply") or end < 0 or newline < 0:
         raise StgaError(f"{path}: is not a PLY file (no complete header)")
     order = ""
     elements: _Elements = {}
     properties: dict[str, str] = {}
     try:
-        for line in start[:end].decode("ascii").splitlines():
+        for line in start[:end].decode("latin-1").split("\n"):
             match line.split():
                 case ["format", name, _]:
                     order = _BYTE_ORDERS[name]

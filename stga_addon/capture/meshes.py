@@ -108,8 +108,10 @@ def _indices(path: Path, name: str, value: Any, vertices: int) -> np.ndarray:
 
 
 def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
+    try:
+        import trimesh
+    except ImportError as error:
+        raise StgaError(f"{path}: reading {file_type.upper()} needs the Python package trimesh") from error
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)

@@ -1,6 +1,7 @@
 """Does the tracked mesh fall into the masks under the chosen meaning of cx and cy?"""
 
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -15,8 +16,11 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
     """A sentence where another convention puts notably more of the mesh into the masks, else None.
 
     Looks at a few views with masks, and at none where the conventions agree. Only what falls outside a mask tells:
-    hair and shoulders lie inside the mask and outside the mesh. Raises StgaError where a mask cannot be read.
+    hair and shoulders lie inside the mask and outside the mesh. Without Pillow, as in a bare Blender, no mask can be
+    looked at. Raises StgaError where one cannot be read.
     """
+    if find_spec("PIL") is None:
+        return None
     apart = [frame for frame in frames if _conventions_differ(frame)]
     spread = np.linspace(0, len(apart) - 1, min(VIEWS, len(apart))).astype(int)
     outside = [_shares_outside(apart[index], mesh) for index in dict.fromkeys(spread.tolist())]

@@ -48,6 +48,7 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
         root.users_collection[0].objects.link(thing)
         thing.parent = root
     else:
+        leave_edit_mode()
         old_data, old_action = thing.data, _action(thing)
         thing.animation_data_clear()
         thing.data = data
@@ -55,6 +56,13 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
         data.name = name
     tags.mark(thing, kind, Path(root[tags.CAPTURE]))
     return thing
+
+
+def leave_edit_mode() -> None:
+    """Back to object mode, whichever mode the active object is in: what is being edited cannot be exchanged."""
+    active = bpy.context.view_layer.objects.active
+    if active is not None and active.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
 
 
 def remove(things: Iterable[Any]) -> None:

@@ -17,7 +17,7 @@ from ..flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ..flame.model import JOINTS, FlameModel
 from ..flame.sequence import FlameSequence
 from . import compat, tags
-from .hierarchy import Warn, log_warning, place
+from .hierarchy import Warn, leave_edit_mode, log_warning, place, remove
 
 SLIDER = 10.0  # the widest range a shape key's value can have
 BONE_LENGTH = 0.03  # metres; only how long the bones are drawn
@@ -68,11 +68,22 @@ def add_rig(
     return rig
 
 
+def remove_rig(head: Any) -> None:
+    """Remove the rig of `head` and the modifiers that bind the head to it, where it has one."""
+    rigs = _rigs(head)
+    for modifier in [old for old in head.modifiers if old.type == "ARMATURE" and old.object in rigs]:
+        head.modifiers.remove(modifier)
+    remove(rigs)
+
+
+def _rigs(head: Any) -> list[Any]:
+    return [thing for thing in head.parent.children if thing.get(tags.KIND) == tags.RIG]
+
+
 def _place_armature(head: Any, joints: np.ndarray, parents: np.ndarray, moving: Sequence[bool]) -> Any:
     root = head.parent
     title = f"{root.name} rig"
-    old = [thing for thing in root.children if thing.get(tags.KIND) == tags.RIG]
-    rig = place(root, tags.RIG, title, _armature(title, joints, parents, moving), old[0] if old else None)
+    rig = place(root, tags.RIG, title, _armature(title, joints, parents, moving), next(iter(_rigs(head)), None))
     rig.show_in_front = True
     bpy.context.view_layer.update()  # makes the pose bones
     for joint, name in enumerate(JOINTS):
@@ -87,8 +98,7 @@ def _armature(name: str, joints: np.ndarray, parents: np.ndarray, moving: Sequen
     editing = bpy.data.objects.new(name, armature)  # edit mode needs an object that is surely visible
     layer = bpy.context.view_layer
     active = layer.objects.active
-    if active is not None and active.mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
+    leave_edit_mode()
     bpy.context.scene.collection.objects.link(editing)
     layer.objects.active = editing
     bpy.ops.object.mode_set(mode="EDIT")

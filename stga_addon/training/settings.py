@@ -43,14 +43,16 @@ class Settings:
     warm_up        share of the budget trained globally before the first local iteration
     selection      which triangles a frame trains
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
-    scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit in units of sqrt(2·triangle area)
-    stray_every, stray_limit    every so many iterations, a splat farther than this many sqrt(2·area) from its
-                   triangle's origin is put back onto it; 0 never
+    scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
+    distance_weight, distance_limit   the same for the distance from the triangle's origin
+    stray_every, stray_limit    every so many iterations, a splat farther than this from its triangle's origin is
+                   put back onto it; 0 never
+                   All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
+                   for "gaussian_avatars"
     sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
     seeds          add hull seeds for what the mesh does not cover
     density_every  iterations between density control, 0 never; it works during `density_span` of the budget
     growth         most splats that density control may add, as a share of the initial number
-    coarse         share of the budget trained at half resolution first
     background     colour behind the head
     """
 
@@ -69,6 +71,8 @@ class Settings:
     ssim_weight: float = 0.2
     scale_weight: float = 1.0
     scale_limit: float = 4.0
+    distance_weight: float = 0.0
+    distance_limit: float = 1.0
     stray_every: int = 200
     stray_limit: float = 6.0
     sh_degree: int = 3
@@ -77,7 +81,6 @@ class Settings:
     density_every: int = 200
     density_span: tuple[float, float] = (0.1, 0.6)
     growth: float = 0.25
-    coarse: float = 0.0
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
@@ -98,6 +101,7 @@ GAUSSIAN_AVATARS = {
     "lattice": 0,
     "rates": Rates(xyz=5e-3, log_scale=1.7e-2, rotation=1e-3, opacity=5e-2, sh=2.5e-3, sh_rest=1.25e-4, position_end=0.01, end=1.0),
     "scale_limit": 0.6,
+    "distance_weight": 0.01,
     "stray_every": 0,
     "seeds": False,
     "growth": 8.0,

@@ -25,7 +25,7 @@ def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
 
 def by_hand(kind: str, properties: dict[str, str], rows: list[dict[str, float]], before: str = "") -> bytes:
     """A PLY file put together without the code under test; `before` is header text of an earlier element."""
-    lines = ["ply", f"format {kind} 1.0", "comment made by hand"] + ([before] if before else [])
+    lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë"] + ([before] if before else [])
     lines += [f"element vertex {len(rows)}", *(f"property {t} {name}" for name, t in properties.items()), "end_header"]
     codes = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
     if kind == "ascii":

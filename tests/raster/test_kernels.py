@@ -10,7 +10,7 @@ import torch
 from stga_addon.avatar.embedding import WORLD, face_frames
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.render import Parameters, camera_frames, render, render_backward, render_forward
+from stga_addon.raster.render import Parameters, Scratch, camera_frames, render, render_backward, render_forward
 
 NAMES = Parameters._fields
 # Kernels compute in float32 with a polynomial exp; a pixel sums up to a hundred terms below 1.
@@ -187,16 +187,85 @@ def test_embedded_splats_render_and_train_in_their_frames(convention):
     assert_gradients_agree(gradients, expected)
 
 
-def raw_gradients(scene: Scene, focus: np.ndarray | None, reach: int = 0, fill: float = 0.0):
-    """Forward and backward through the array door; untouched rows keep `fill`."""
+def raw_gradients(scene: Scene, fill: float = 0.0, add: bool = False, scratch: Scratch | None = None, **options):
+    """Forward and backward through the array door: rendering, gradients whose untouched rows keep `fill`, and rows.
+
+    background, focus and reach are `render_forward`'s. The cotangents are of colour and alpha.
+    """
     splats = Parameters(*(scene.splats[name] for name in NAMES))
     face = np.zeros(len(splats.xyz), np.int32)
     seen = camera_frames(WORLD, scene.camera)
-    rendering = render_forward(splats, face, seen, scene.degree, focus, reach)
+    rendering = render_forward(splats, face, seen, scene.degree, scratch=scratch, **options)
     v_image, v_alpha, _ = (v.float().numpy() for v in random_cotangents(scene.camera, 3))
     gradients = Parameters(*(np.full_like(a, fill) for a in splats))
-    rows = render_backward(rendering, splats, face, seen, v_image, -v_alpha, gradients, focus)
-    return rendering, gradients, rows
+    rows, screen = render_backward(
+        rendering, splats, face, seen, v_image, gradients, -v_alpha, options.get("focus"), add, scratch
+    )
+    return rendering, gradients, rows, screen
+
+
+def test_background_shows_through_and_pulls_on_the_splats():
+    """Catches a background left out of the image, of its gradient, or counted twice."""
+    scene, background = SCENES["plain"], np.float32([0.9, 0.2, 0.6])
+    rendering, gradients, _, _ = raw_gradients(scene, background=background)
+    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
+    rgb, alpha, _ = reference.render(*tensors, scene.camera)
+    image = rgb + torch.from_numpy(background)[:, None, None] * (1 - alpha)
+    v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
+    expected = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), tensors)
+    assert np.abs(rendering.image - image.detach().numpy()).max() < IMAGE_TOLERANCE
+    assert np.abs(1 - rendering.transmittance - alpha.detach().numpy()).max() < IMAGE_TOLERANCE
+    assert_gradients_agree(gradients._asdict(), dict(zip(NAMES, (g.numpy() for g in expected), strict=True)))
+
+
+def test_screen_gradient_is_that_of_the_projected_centre():
+    """Catches density control fed with pixels, or with the gradient of something else: half images, by both axes."""
+    scene = cloud(25, count=40, size=(60, 35))
+    xyz, rotation, log_scale, opacity, sh = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
+    view = torch.from_numpy(scene.camera.world_to_camera)
+    points = xyz @ view[:3, :3].T + view[:3, 3]
+    order = torch.argsort(points[:, 2])
+    covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
+    centre, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    centre.requires_grad_()
+    colour = reference.sh_colour(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
+    opacity = torch.sigmoid(opacity[order])
+    rgb, alpha, _ = reference._composite(
+        reference._alpha(centre, projected, opacity, scene.camera), colour, points[order, 2]
+    )
+    v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
+    gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), centre)[0]
+    expected = np.zeros(40)
+    expected[order] = np.hypot(gradient[:, 0] * 60 / 2, gradient[:, 1] * 35 / 2)
+    _, _, rows, screen = raw_gradients(scene)
+    assert len(rows) > 20
+    np.testing.assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
+
+
+def test_overwriting_and_adding():
+    """Catches stale gradients: coefficients above the degree in use must be overwritten too, and sums must be sums."""
+    scene = SCENES["lower degree than stored"]
+    _, fresh, rows, _ = raw_gradients(scene)
+    _, overwritten, _, _ = raw_gradients(scene, fill=5.0)
+    _, added, _, _ = raw_gradients(scene, fill=5.0, add=True)
+    for name in NAMES:
+        want = getattr(fresh, name)[rows]
+        np.testing.assert_array_equal(getattr(overwritten, name)[rows], want, err_msg=name)
+        np.testing.assert_allclose(getattr(added, name)[rows], want + 5, rtol=1e-6, atol=1e-6 * np.abs(want).max())
+
+
+def test_reused_buffers_change_nothing():
+    """Catches results that depend on what an earlier, larger or smaller, rendering left in the buffers."""
+    scratch = Scratch()
+    for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
+        scene = SCENES[name]
+        expected, wanted, rows, screen = raw_gradients(scene)
+        rendering, gradients, same_rows, same_screen = raw_gradients(scene, scratch=scratch)
+        np.testing.assert_array_equal(rendering.image, expected.image, err_msg=name)
+        np.testing.assert_array_equal(same_rows, rows)
+        np.testing.assert_array_equal(same_screen[rows], screen[rows])
+        for got, want in zip(gradients, wanted, strict=True):
+            np.testing.assert_array_equal(got, want, err_msg=name)
 
 
 def test_focused_rendering_gives_selected_rows_the_full_images_gradient():
@@ -204,8 +273,8 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient():
     scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
     focus = np.zeros(80, bool)
     focus[[3, 17, 40]] = True
-    full, expected, _ = raw_gradients(scene, None)
-    part, gradients, rows = raw_gradients(scene, focus, reach=10)
+    full, expected, _, _ = raw_gradients(scene)
+    part, gradients, rows, _ = raw_gradients(scene, focus=focus, reach=10)
     assert 0 < len(part.tiles) < len(full.tiles)
     assert set(rows) <= {3, 17, 40}
     for name in NAMES:
@@ -216,7 +285,7 @@ def test_rows_out_of_focus_are_not_written():
     """Catches a backward pass that touches, or zeroes, the gradient rows of frozen splats."""
     scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
     focus = np.arange(80) % 7 == 0
-    _, gradients, rows = raw_gradients(scene, focus, fill=123.0)
+    _, gradients, rows, _ = raw_gradients(scene, fill=123.0, focus=focus)
     assert 0 < len(rows) <= focus.sum()
     for name in NAMES:
         assert (getattr(gradients, name)[~focus] == 123).all(), name
@@ -227,7 +296,7 @@ def test_focused_image_is_the_full_image_within_reach():
     """Catches tiles left out within the reach of SSIM's windows around a selected splat."""
     scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
     focus = np.arange(80) == 17
-    full, part = raw_gradients(scene, None)[0], raw_gradients(scene, focus, reach=10)[0]
+    full, part = raw_gradients(scene)[0], raw_gradients(scene, focus=focus, reach=10)[0]
     tensors = [torch.from_numpy(scene.splats[name]).double()[focus] for name in NAMES]
     touched = reference.render(*tensors, scene.camera)[1].numpy() > 0
     ys, xs = np.nonzero(touched)

@@ -62,3 +62,32 @@ def scale_limit(rows, log_scale, face, loose, limit, weight, gradient):
                     scale = math.exp(log_scale[i, c])
                     gradient[i, c] += factor * max(ZERO, scale - limit[face[i]]) * scale
     return norm
+
+
+@jit
+def distance_limit(rows, xyz, face, loose, limit, weight, gradient):
+    """weight · ‖ReLU(|xyz| − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
+
+    limit (F,) per triangle in local units. Loose splats have no limit. Returns the norm.
+    """
+    total = 0.0
+    for n in range(len(rows)):
+        i = rows[n]
+        if not loose[i]:
+            over = max(ZERO, _length(xyz[i]) - limit[face[i]])
+            total += over * over
+    norm = math.sqrt(total)
+    if norm > 0.0:
+        factor = np.float32(weight / norm)
+        for n in range(len(rows)):
+            i = rows[n]
+            length = _length(xyz[i])
+            if not loose[i] and length > limit[face[i]]:
+                for c in range(3):
+                    gradient[i, c] += factor * (length - limit[face[i]]) * xyz[i, c] / length
+    return norm
+
+
+@jit
+def _length(v):
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

@@ -1,0 +1,54 @@
+"""When what is trained: the order of views, local or global, degrees and rates over the budget."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..capture.model import View
+from .settings import Rates, Settings
+
+
+def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:
+    """Endless random order of views, from position `start` on.
+
+    Views of a frame are visited in groups of `per_visit` (0: all of them, the paper's batches; 1: fully shuffled),
+    and the groups in random order. Epoch e depends on (seed, e) alone, so a resumed run continues the same order.
+    """
+    epoch = start // len(views)
+    skip = start % len(views)
+    while True:
+        yield from _epoch(views, per_visit, seed, epoch)[skip:]
+        epoch, skip = epoch + 1, 0
+
+
+def _epoch(views: Sequence[View], per_visit: int, seed: int, epoch: int) -> list[View]:
+    rng = np.random.default_rng([seed, epoch])
+    frames: dict[int, list[View]] = {}
+    for view in views:
+        frames.setdefault(view.timestep, []).append(view)
+    visits = []
+    for frame in frames.values():
+        shuffled = [frame[n] for n in rng.permutation(len(frame))]
+        size = per_visit or len(shuffled)
+        visits += [shuffled[n : n + size] for n in range(0, len(shuffled), size)]
+    return [view for n in rng.permutation(len(visits)) for view in visits[n]]
+
+
+def trains_globally(settings: Settings, iteration: int, visit: int, progress: float) -> bool:
+    """Whether this iteration trains all splats; `visit` counts frame visits, `progress` is the share of budget."""
+    if settings.strategy != "selective" or progress < settings.warm_up:
+        return True
+    count = iteration if settings.global_unit == "iteration" else visit
+    return count % (settings.global_every + 1) == settings.global_every
+
+
+def sh_degree(settings: Settings, progress: float) -> int:
+    """Degree of spherical harmonics in use at a share of the budget."""
+    return min(settings.sh_degree, sum(progress >= step for step in settings.sh_steps))
+
+
+def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
+    """Exponential decay from the initial rates to their ends."""
+    initial = {n: getattr(rates, n) for n in ("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest")}
+    ends = {name: rates.position_end if name == "xyz" else rates.end for name in initial}
+    return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}

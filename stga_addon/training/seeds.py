@@ -1,0 +1,88 @@
+"""Splats for what the mesh does not cover: hair, shoulders, clothes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
+
+from ..avatar.embedding import face_frames, to_local
+from ..avatar.splats import Splats
+from ..capture.camera import Camera
+from ..capture.images import read_image, read_mask
+from ..capture.model import Capture, View
+
+VOXEL = 0.004
+"""Metres between seeds."""
+CLEARANCE = 0.006
+"""Metres: nearer to the mesh than this, the mesh's own splats cover it."""
+MARGIN = 0.25
+"""How far around the mesh's bounding box to look, as a share of its diagonal."""
+WITNESSES = 0.25
+"""A voxel counts if at least this share of the views sees it at all (and all that do have it inside their mask)."""
+
+
+def hull_seeds(capture: Capture, views: Sequence[View], convention: str, sh_degree: int) -> Splats:
+    """Loose splats on the shell of the visual hull of one timestep, outside the mesh.
+
+    views: all of one timestep. The hull is carved on a grid of VOXEL metres from the masks (or, without masks, from
+    what differs from white); each seed is bound to the nearest triangle, so it follows the head.
+    """
+    mesh = capture.mesh(views[0].timestep)
+    points = _shell(mesh, views)
+    centroids = mesh[capture.faces].mean(1)
+    distance, face = cKDTree(centroids).query(points)
+    if len(mesh):
+        distance = np.minimum(distance, cKDTree(mesh).query(points)[0])
+    outside = distance > CLEARANCE
+    world = _seeds(points[outside], sh_degree)
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    return to_local(world, frames, face[outside])
+
+
+def _shell(mesh: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """Grid points (N, 3) on the surface of the visual hull."""
+    low, high = mesh.min(0), mesh.max(0)
+    margin = MARGIN * np.linalg.norm(high - low)
+    axes = [np.arange(a - margin, b + margin, VOXEL) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.ones(len(grid), bool)
+    witnesses = np.zeros(len(grid), np.int32)
+    for view in views:
+        mask = _foreground(view)
+        alive = np.flatnonzero(inside)
+        x, y, seen = _pixels(grid[alive], view.camera)
+        witnesses[alive[seen]] += 1
+        inside[alive[seen]] = mask[y[seen], x[seen]]
+    solid = (inside & (witnesses >= max(2, WITNESSES * len(views)))).reshape([len(a) for a in axes])
+    return np.asarray(grid[(solid & ~binary_erosion(solid)).ravel()])
+
+
+def _foreground(view: View) -> np.ndarray:
+    mask = read_mask(view)
+    if mask is not None:
+        return np.asarray(mask > 127)
+    return np.asarray((read_image(view) < 247).any(axis=2))
+
+
+def _pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel columns and rows of world points (N, 3), and which of them lie in the image."""
+    p = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    z = np.maximum(p[:, 2], 1e-6)
+    x = np.floor(camera.fl_x * p[:, 0] / z + camera.cx)
+    y = np.floor(camera.fl_y * p[:, 1] / z + camera.cy)
+    seen = (p[:, 2] > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
+
+
+def _seeds(points: np.ndarray, sh_degree: int) -> Splats:
+    n = len(points)
+    return Splats(
+        xyz=points.astype(np.float32),
+        rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        log_scale=np.full((n, 3), np.log(VOXEL / 2), np.float32),
+        opacity=np.zeros(n, np.float32),
+        sh=np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
+        face=np.zeros(n, np.int32),
+        loose=np.ones(n, bool),
+    )

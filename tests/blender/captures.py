@@ -1,0 +1,84 @@
+"""Captures and FLAME sequences made by hand, without files, so that the scene is tested and not the readers."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from stga_addon.capture.model import Capture, View
+from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.model import FlameModel
+from stga_addon.flame.sequence import FlameSequence
+
+
+def strip(vertices: int) -> np.ndarray:
+    """(vertices - 2, 3) triangles of a strip."""
+    first = np.arange(vertices - 2)
+    return np.stack([first, first + 1, first + 2], 1).astype(np.int32)
+
+
+def mesh_capture(
+    root: Path,
+    timesteps: Sequence[int] = (2, 3, 7),
+    vertices: int = 60,
+    views: Mapping[str, tuple[View, ...]] | None = None,
+    seed: int = 0,
+) -> Capture:
+    """A mesh capture of random vertices; the mesh of each timestep is another draw."""
+    neutral = np.random.default_rng(seed).normal(0, 0.1, (vertices, 3))
+    faces = strip(vertices)
+
+    def mesh(timestep: int) -> np.ndarray:
+        return neutral + np.random.default_rng([seed, timestep]).normal(0, 0.02, neutral.shape)
+
+    return Capture(
+        root=root,
+        layout="mesh",
+        faces=faces,
+        neutral=neutral,
+        views=views or {},
+        timesteps=tuple(timesteps),
+        regions={"mouth": np.arange(len(faces)) % 3 == 0},
+        mesh=mesh,
+        expression_mesh=lambda timestep, zero_pose: mesh(timestep),
+    )
+
+
+def flame_model(vertices: int = 80, components: int = 40, identity: int = 10, seed: int = 0) -> FlameModel:
+    """A random model with enough expressions that a joint depends on more terms than one driver holds."""
+    rng = np.random.default_rng(seed)
+    weights = rng.random((vertices, 5)) ** 4
+    regressor = rng.random((5, vertices)) * (rng.random((5, vertices)) < 0.3)
+    regressor[:, 0] += 0.1
+    return FlameModel(
+        v_template=rng.normal(0, 0.08, (vertices, 3)),
+        shapedirs=rng.normal(0, 0.003, (vertices, 3, components)),
+        n_identity=identity,
+        posedirs=rng.normal(0, 0.004, (vertices, 3, 36)),
+        j_regressor=regressor / regressor.sum(1, keepdims=True),
+        parents=np.array([-1, 0, 1, 1, 1]),
+        weights=weights / weights.sum(1, keepdims=True),
+        faces=strip(vertices),
+    )
+
+
+def flame_sequence(
+    model: FlameModel, timesteps: Sequence[int] = (4, 5, 9), seed: int = 0, dynamic: bool = False
+) -> FlameSequence:
+    """Large random poses, so that a transposed rotation or a wrong pivot is centimetres off."""
+    rng = np.random.default_rng(seed)
+    size = len(model.v_template)
+    frames = {
+        timestep: FlameFrame(
+            expr=rng.normal(size=model.n_expression),
+            rotation=rng.normal(0, 0.7, 3),
+            neck_pose=rng.normal(0, 0.4, 3),
+            jaw_pose=rng.normal(0, 0.4, 3),
+            translation=rng.normal(0, 0.2, 3),
+            eyes_pose=rng.normal(0, 0.4, 6),
+            dynamic_offset=rng.normal(0, 0.01, (size, 3)) if dynamic else None,
+        )
+        for timestep in timesteps
+    }
+    shape, offset = rng.normal(size=model.n_identity), rng.normal(0, 0.002, (size, 3))
+    return FlameSequence(model, shape, offset, tuple(timesteps), frames.__getitem__)

@@ -1,0 +1,201 @@
+"""Imported cameras against the capture's own projection."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+bpy = pytest.importorskip("bpy")
+
+from mathutils import Vector  # noqa: E402
+
+from stga_addon.capture.camera import Camera, camera_from_gl  # noqa: E402
+from stga_addon.capture.model import Capture, View  # noqa: E402
+from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.cameras import configure_scene, import_cameras  # noqa: E402
+from stga_addon.scene.hierarchy import capture_root  # noqa: E402
+
+from .captures import mesh_capture  # noqa: E402
+
+
+def pose(seed: int) -> np.ndarray:
+    """Camera-to-world (4, 4), OpenGL axes: about a metre from the origin, roughly looking at it, rolled."""
+    rng = np.random.default_rng(seed)
+    back = rng.normal(size=3)
+    back /= np.linalg.norm(back)
+    right = np.cross(rng.normal(size=3), back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
+    matrix[:3, 3] = back + rng.normal(0, 0.02, 3)
+    return matrix
+
+
+def camera(seed: int = 0, width: int = 550, height: int = 802, fl_y: float = 2050.0) -> Camera:
+    return camera_from_gl(pose(seed), width, height, 2050.0, fl_y, cx=243.7, cy=431.9)
+
+
+def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:
+    """cameras: index -> its camera at timesteps 3, 4, …; images are small PNGs with the timestep as red, index as green."""
+    views = []
+    for index, row in cameras.items():
+        for timestep, one in enumerate(row, start=3):
+            name = f"images/{timestep:05d}_{index:02d}.png"
+            path = root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (4, 4), (timestep, index, 0)).save(path)
+            views.append(View(timestep, index, one, name, path))
+    timesteps = sorted({view.timestep for view in views})
+    return mesh_capture(root, timesteps=timesteps, views={"train": tuple(views[::2]), "val": tuple(views[1::2])})
+
+
+def pixels_in_blender(camera_object, points: np.ndarray) -> np.ndarray:
+    """(N, 2) pixels from the top-left corner where the scene's render puts the capture's points (N, 3)."""
+    scene = bpy.context.scene
+    render = scene.render
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    projection = camera_object.calc_matrix_camera(
+        depsgraph,
+        x=render.resolution_x,
+        y=render.resolution_y,
+        scale_x=render.pixel_aspect_x,
+        scale_y=render.pixel_aspect_y,
+    )
+    # The points stand under the root, whose exact turn is (x, y, z) -> (x, -z, y).
+    world = [Vector((x, -z, y, 1.0)) for x, y, z in points.tolist()]
+    clip = np.array([projection @ camera_object.matrix_world.inverted() @ point for point in world])
+    ndc = clip[:, :2] / clip[:, 3:]
+    return (ndc * [0.5, -0.5] + 0.5) * [render.resolution_x, render.resolution_y]
+
+
+def pixels_of(one: Camera, points: np.ndarray) -> np.ndarray:
+    seen = points @ one.world_to_camera[:3, :3].T + one.world_to_camera[:3, 3]
+    return seen[:, :2] / seen[:, 2:] * [one.fl_x, one.fl_y] + [one.cx, one.cy]
+
+
+def assert_projects(camera_object, one: Camera) -> None:
+    points = np.random.default_rng(9).normal(0, 0.1, (50, 3))
+    np.testing.assert_allclose(pixels_in_blender(camera_object, points), pixels_of(one, points), atol=0.01)
+
+
+@pytest.mark.parametrize("fl_y", [2050.0, 1900.0, 2300.0])
+@pytest.mark.parametrize(("width", "height"), [(550, 802), (802, 550)])
+def test_projection_is_the_captures(tmp_path, width, height, fl_y):
+    """Fails when a shift has the wrong sign or unit, the sensor fits the wrong side, pixels are not square, or y is up."""
+    one = camera(1, width, height, fl_y)
+    capture = capture_of(tmp_path, {0: [one]})
+    (imported,) = import_cameras(capture, capture_root(tmp_path))
+    configure_scene(bpy.context.scene, capture, imported)
+    assert_projects(imported, one)
+
+
+def test_a_moving_camera_is_keyframed(tmp_path):
+    """Fails when only the first pose is imported, or quaternions flip so that the camera tumbles between frames."""
+    row = [camera(seed) for seed in (1, 2, 3)]
+    capture = capture_of(tmp_path, {0: row})
+    (imported,) = import_cameras(capture, capture_root(tmp_path))
+    configure_scene(bpy.context.scene, capture, imported)
+    for timestep, one in enumerate(row, start=3):
+        bpy.context.scene.frame_set(timestep)
+        assert_projects(imported, one)
+    curves = {}
+    for frame in (3, 4, 5):
+        bpy.context.scene.frame_set(frame)
+        curves[frame] = np.array(imported.rotation_quaternion)
+    assert curves[3] @ curves[4] > 0
+    assert curves[4] @ curves[5] > 0
+
+
+def test_studio_head_projects_into_its_masks(shared_data):
+    """Fails when meshes and cameras of a real capture do not meet in Blender as they do in the images."""
+    capture = open_capture(shared_data / "studio_head")
+    cameras = import_cameras(capture, capture_root(capture.root))
+    assert len(cameras) == 16
+    view = next(view for view in capture.views["train"] if view.timestep == 4 and view.camera_index == 7)
+    imported = next(each for each in cameras if each[tags.CAMERA_INDEX] == 7)
+    configure_scene(bpy.context.scene, capture, imported)
+    inside = pixels_in_blender(imported, capture.mesh(4))
+    mask = np.asarray(Image.open(view.mask).convert("L")) > 127
+    column, row = np.floor(inside).astype(int).T
+    seen = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
+    assert seen.mean() > 0.5
+    assert mask[row[seen], column[seen]].mean() > 0.98
+
+
+def test_each_frame_shows_its_own_image(tmp_path):
+    """Fails when the background counts the camera number as Blender's sequences would, or two images show at once."""
+    capture = capture_of(tmp_path, {5: [camera(0)] * 3, 8: [camera(1)] * 3})
+    cameras = import_cameras(capture, capture_root(tmp_path))
+    for frame, timestep in ((1, 3), (3, 3), (4, 4), (5, 5), (9, 5)):
+        bpy.context.scene.frame_set(frame)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        for imported, index in zip(cameras, (5, 8), strict=True):
+            backgrounds = imported.evaluated_get(depsgraph).data.background_images
+            shown = [Path(each.image.filepath).name for each in backgrounds if each.show_background_image]
+            assert shown == [f"{timestep:05d}_{index:02d}.png"]
+            assert imported.data.show_background_images
+
+
+def test_missing_images_are_told(tmp_path):
+    """Fails when cameras without images cannot be imported, or nobody hears of the gap."""
+    capture = capture_of(tmp_path, {0: [camera()] * 3})
+    (tmp_path / "images" / "00004_00.png").unlink()
+    said = []
+    (imported,) = import_cameras(capture, capture_root(tmp_path), warn=said.append)
+    assert len(imported.data.background_images) == 2
+    assert len(said) == 1
+    assert "00004_00.png" in said[0]
+
+
+def test_importing_again_replaces(tmp_path):
+    """Fails when a second import doubles cameras or images, or keeps a camera that the capture has no more."""
+    root = capture_root(tmp_path)
+    first = import_cameras(capture_of(tmp_path, {0: [camera(0), camera(4)], 1: [camera(1)] * 2}), root)
+    counts = [len(blocks) for blocks in (bpy.data.objects, bpy.data.cameras, bpy.data.images, bpy.data.actions)]
+    capture = capture_of(tmp_path, {0: [camera(2), camera(5)], 1: [camera(3)] * 2})
+    assert import_cameras(capture, root) == first
+    assert counts == [len(blocks) for blocks in (bpy.data.objects, bpy.data.cameras, bpy.data.images, bpy.data.actions)]
+    configure_scene(bpy.context.scene, capture, first[1])
+    bpy.context.view_layer.update()
+    assert_projects(first[1], camera(3))
+    assert len(import_cameras(capture_of(tmp_path, {1: [camera(3)] * 2}), root)) == 1
+    assert len(bpy.data.cameras) == 1
+
+
+def test_the_scene_is_configured_only_when_asked(tmp_path):
+    """Fails when an import changes the render settings by itself, or configuring misses one of them."""
+    scene = bpy.context.scene
+    scene.view_settings.view_transform = "AgX"
+    before = (scene.render.resolution_x, scene.frame_start, scene.camera)
+    capture = capture_of(tmp_path, {0: [camera()] * 3, 1: [camera(1, 400, 300)] * 3})
+    cameras = import_cameras(capture, capture_root(tmp_path))
+    assert before == (scene.render.resolution_x, scene.frame_start, scene.camera)
+    assert scene.view_settings.view_transform == "AgX"
+    said = []
+    configure_scene(scene, capture, cameras[0], warn=said.append)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (550, 802)
+    assert (scene.frame_start, scene.frame_end) == (3, 5)
+    assert scene.view_settings.view_transform == "Standard"
+    assert scene.camera == cameras[0]
+    assert len(said) == 1
+    assert cameras[1].name in said[0]
+
+
+def test_changing_intrinsics_are_told(tmp_path):
+    """Fails when a zooming camera is imported as if it stood still, without a word."""
+    zoomed = replace(camera(), fl_x=1500.0)
+    said = []
+    import_cameras(capture_of(tmp_path, {0: [camera(), zoomed]}), capture_root(tmp_path), warn=said.append)
+    assert len(said) == 1
+    assert "intrinsics" in said[0]
+
+
+def test_other_cameras_are_refused(tmp_path):
+    """Fails when configuring through a camera without a capture ends in a KeyError."""
+    mine = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    with pytest.raises(StgaError, match="mine"):
+        configure_scene(bpy.context.scene, capture_of(tmp_path, {0: [camera()]}), mine)

@@ -1,0 +1,120 @@
+"""Selections written as vertex groups and read back."""
+
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.groups import closure, read_selection, write_selection  # noqa: E402
+from stga_addon.scene.head import import_head, import_motion  # noqa: E402
+
+from .captures import flame_model, flame_sequence, mesh_capture  # noqa: E402
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return mesh_capture(tmp_path, timesteps=(2, 3, 7))
+
+
+@pytest.fixture
+def head(capture):
+    return import_head(capture)
+
+
+def random_selection(capture, share: float = 0.2, seed: int = 0) -> dict[int, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {timestep: rng.random(len(capture.faces)) < share for timestep in capture.timesteps}
+
+
+def enclosed(selected: np.ndarray, faces: np.ndarray) -> list[bool]:
+    """`closure` in plain sets."""
+    touched = {int(vertex) for face, chosen in zip(faces, selected, strict=True) if chosen for vertex in face}
+    return [set(face.tolist()) <= touched for face in faces]
+
+
+def test_reading_back_gives_the_closure(capture, head):
+    """Fails when a group is written to the wrong frame or vertices, or one timestep's group leaks into another's."""
+    chosen = random_selection(capture)
+    write_selection(head, chosen)
+    read = read_selection(head)
+    assert list(read) == [2, 3, 7]
+    for timestep, selected in chosen.items():
+        assert read[timestep].tolist() == enclosed(selected, capture.faces)
+        assert closure(selected, capture.faces).tolist() == enclosed(selected, capture.faces)
+        assert (read[timestep] >= selected).all()
+
+
+def test_reading_and_writing_again_changes_nothing(capture, head):
+    """Fails when each round trip grows the selection, or adds groups beside the old ones."""
+    write_selection(head, random_selection(capture))
+    once, names = read_selection(head), sorted(group.name for group in head.vertex_groups)
+    write_selection(head, once)
+    again = read_selection(head)
+    assert sorted(group.name for group in head.vertex_groups) == names
+    assert all((once[timestep] == again[timestep]).all() for timestep in once)
+
+
+def test_a_new_selection_replaces_the_old_and_nothing_else(tmp_path):
+    """Fails when stale frames keep their groups, or the rig's own vertex groups are lost with them."""
+    sequence = flame_sequence(flame_model(), timesteps=(1, 2))
+    head = import_motion(sequence, tmp_path / "motion.npz")
+    bones = {group.name: [head.vertex_groups[group.name].weight(3)] for group in head.vertex_groups}
+    faces = len(sequence.model.faces)
+    write_selection(head, {1: np.ones(faces, bool), 2: np.ones(faces, bool)})
+    write_selection(head, {2: np.arange(faces) < 4, 1: np.zeros(faces, bool)})
+    ours = [group.name for group in head.vertex_groups if tags.group_timestep(group.name) is not None]
+    assert ours == ["stga_2"]
+    assert {name: [head.vertex_groups[name].weight(3)] for name in bones} == bones
+    read = read_selection(head)
+    assert not read[1].any()
+    assert read[2].sum() == 4
+
+
+def test_painted_weights_count_from_one_half(capture, head):
+    """Fails when an artist's brush strokes are not read: added, softened and erased vertices."""
+    group = head.vertex_groups.new(name=tags.group_name(3))
+    group.add([10, 11, 12, 13], 1.0, "REPLACE")
+    group.add([13], 0.4, "REPLACE")
+    assert np.flatnonzero(read_selection(head)[3]).tolist() == [10]
+    group.add([13], 0.6, "REPLACE")
+    assert np.flatnonzero(read_selection(head)[3]).tolist() == [10, 11]
+    group.remove([11])
+    assert not read_selection(head)[3].any()
+
+
+def test_only_our_spelling_names_a_timestep():
+    """Fails when an artist's group is taken for a selection, and then deleted."""
+    assert tags.group_timestep("stga_12") == 12
+    for name in ("stga_012", "stga_", "stga_-1", "stga_1_0", "stga_region_nose", "12", "jaw", "stga_٣"):
+        assert tags.group_timestep(name) is None
+
+
+def test_edit_mode_and_wrong_sizes_are_refused(capture, head):
+    """Fails when Blender's own error, or a half-written selection, reaches the person."""
+    write_selection(head, random_selection(capture))
+    before = read_selection(head)
+    with pytest.raises(StgaError, match=r"timestep 3 has shape \(5,\)"):
+        write_selection(head, {2: np.ones(len(capture.faces), bool), 3: np.ones(5, bool)})
+    bpy.context.view_layer.objects.active = head
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(StgaError, match="edit mode"):
+        write_selection(head, {})
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert all((before[timestep] == after).all() for timestep, after in read_selection(head).items())
+
+
+def test_three_hundred_groups_are_quick(tmp_path):
+    """Fails when vertices are added one at a time or read through Python objects."""
+    capture = mesh_capture(tmp_path, timesteps=(0,), vertices=5000)
+    head = import_head(capture)
+    mask = np.random.default_rng(0).random((300, len(capture.faces))) < 0.1
+    start = perf_counter()
+    write_selection(head, dict(enumerate(mask)))
+    assert perf_counter() - start < 1.5
+    start = perf_counter()
+    assert len(read_selection(head)) == 300
+    assert perf_counter() - start < 1.5

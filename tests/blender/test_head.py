@@ -1,0 +1,157 @@
+"""The imported head against the capture's own meshes."""
+
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.head import import_head, import_motion  # noqa: E402
+
+from .captures import flame_model, flame_sequence, mesh_capture  # noqa: E402
+
+
+def at_frame(head, frame: float) -> np.ndarray:
+    whole = int(np.floor(frame))
+    bpy.context.scene.frame_set(whole, subframe=frame - whole)
+    return evaluated_vertices(head)
+
+
+def block_counts() -> dict[str, int]:
+    kinds = ("objects", "meshes", "shape_keys", "actions", "armatures", "collections")
+    return {kind: len(getattr(bpy.data, kind)) for kind in kinds}
+
+
+def test_every_frame_shows_its_timestep(tmp_path):
+    """Fails when a key is off by a frame, when neighbours leak into a frame, or when gaps in the timesteps shift keys."""
+    capture = mesh_capture(tmp_path, timesteps=(2, 3, 7, 8))
+    head = import_head(capture)
+    for timestep in capture.timesteps:
+        np.testing.assert_allclose(at_frame(head, timestep), capture.mesh(timestep), atol=1e-7)
+    np.testing.assert_allclose(at_frame(head, 6), capture.mesh(3) / 4 + capture.mesh(7) * 3 / 4, atol=1e-7)
+    np.testing.assert_allclose(at_frame(head, 2.5), (capture.mesh(2) + capture.mesh(3)) / 2, atol=1e-7)
+    np.testing.assert_allclose(at_frame(head, -5), capture.mesh(2), atol=1e-7)
+    np.testing.assert_allclose(at_frame(head, 30), capture.mesh(8), atol=1e-7)
+
+
+def test_one_timestep_holds_everywhere(tmp_path):
+    """Fails when a capture of one timestep has no keyframe that keeps its mesh."""
+    capture = mesh_capture(tmp_path, timesteps=(5,))
+    head = import_head(capture)
+    for frame in (0, 5, 9):
+        np.testing.assert_allclose(at_frame(head, frame), capture.mesh(5), atol=1e-7)
+
+
+def test_studio_head_evaluates_to_its_tracked_meshes(shared_data):
+    """Fails when a real capture's vertex order or coordinates do not survive the import."""
+    capture = open_capture(shared_data / "studio_head")
+    head = import_head(capture)
+    assert list(head[tags.TIMESTEPS]) == list(capture.timesteps)
+    for timestep in (capture.timesteps[0], capture.timesteps[5], capture.timesteps[-1]):
+        np.testing.assert_allclose(at_frame(head, timestep), capture.mesh(timestep), atol=1e-6)
+
+
+def test_the_capture_stands_upright(tmp_path):
+    """Fails when the capture's up (y) is not Blender's (z), or when the head is mirrored on the way."""
+    head = import_head(mesh_capture(tmp_path, timesteps=(1,)), name="anna")
+    bpy.context.view_layer.update()
+    turned = np.array(head.matrix_world)[:3, :3]
+    np.testing.assert_allclose(turned @ [0, 1, 0], [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(turned @ [1, 0, 0], [1, 0, 0], atol=1e-6)
+    assert np.linalg.det(turned) == pytest.approx(1)
+    assert head.parent.name == "anna"
+    assert "anna" in bpy.data.collections
+
+
+def test_faces_and_regions_keep_their_order(tmp_path):
+    """Fails when faces are re-ordered or turned (splats are bound to face number and first corner), or regions are lost."""
+    capture = mesh_capture(tmp_path)
+    mesh = import_head(capture).data
+    assert [list(polygon.vertices) for polygon in mesh.polygons] == capture.faces.tolist()
+    members = [element.value for element in mesh.attributes[tags.REGION_PREFIX + "mouth"].data]
+    assert members == capture.regions["mouth"].tolist()
+
+
+def test_importing_again_replaces(tmp_path):
+    """Fails when a second import doubles the head, leaves old blocks behind, or cuts off what points to the head."""
+    first = import_head(mesh_capture(tmp_path))
+    first.modifiers.new("artist's own", "SMOOTH").iterations = 0
+    follower = bpy.data.objects.new("follower", None)
+    follower.parent = first
+    counts = block_counts()
+    changed = mesh_capture(tmp_path, timesteps=(1, 2), vertices=70, seed=3)
+    second = import_head(changed)
+    assert second == first == follower.parent
+    assert block_counts() == counts
+    assert [modifier.name for modifier in second.modifiers] == ["artist's own"]
+    np.testing.assert_allclose(at_frame(second, 2), changed.mesh(2), atol=1e-7)
+    assert list(second[tags.TIMESTEPS]) == [1, 2]
+
+
+def test_importing_again_while_editing(tmp_path):
+    """Fails when the mesh is exchanged under edit mode, which writes the old mesh back on leaving it."""
+    head = import_head(mesh_capture(tmp_path))
+    bpy.context.view_layer.objects.active = head
+    bpy.ops.object.mode_set(mode="EDIT")
+    capture = mesh_capture(tmp_path, seed=4)
+    head = import_head(capture)
+    assert head.mode == "OBJECT"
+    np.testing.assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
+
+
+def test_two_captures_stand_side_by_side(tmp_path):
+    """Fails when the second capture is taken for a new import of the first."""
+    one, other = import_head(mesh_capture(tmp_path / "one")), import_head(mesh_capture(tmp_path / "other"))
+    assert one != other
+    assert one.parent != other.parent
+
+
+def test_a_rig_goes_when_the_capture_has_none_any_more(tmp_path):
+    """Fails when a folder that was FLAME and is a mesh capture now keeps an armature that deforms the new mesh."""
+    source = tmp_path / "capture"
+    import_motion(flame_sequence(flame_model()), source)
+    capture = mesh_capture(source)
+    head = import_head(capture)
+    assert not bpy.data.armatures
+    assert not head.modifiers
+    np.testing.assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
+
+
+def test_a_broken_timestep_leaves_the_scene_as_it_was(tmp_path):
+    """Fails when an unreadable mesh half-way leaves half a head in the scene."""
+    capture = mesh_capture(tmp_path)
+
+    def mesh(timestep: int) -> np.ndarray:
+        if timestep == 7:
+            raise StgaError("00007.obj: is truncated")
+        return capture.mesh(timestep)
+
+    before = block_counts()
+    with pytest.raises(StgaError, match="truncated"):
+        import_head(replace(capture, mesh=mesh))
+    assert block_counts() == before
+
+
+def test_a_saved_file_shows_the_same(tmp_path):
+    """Fails when keyframes or their binding to the shape keys do not survive saving and opening."""
+    capture = mesh_capture(tmp_path)
+    name = import_head(capture).name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    np.testing.assert_allclose(at_frame(bpy.data.objects[name], 7), capture.mesh(7), atol=1e-7)
+
+
+def test_three_hundred_frames_import_in_seconds(tmp_path):
+    """Fails when keys or keyframes are written one value at a time."""
+    capture = mesh_capture(tmp_path, timesteps=range(300), vertices=5000)
+    still = replace(capture, mesh=lambda timestep: capture.neutral)
+    start = perf_counter()
+    import_head(still)
+    assert perf_counter() - start < 3

@@ -1,0 +1,163 @@
+"""The built zip, installed the way a person installs it: into a fresh Blender profile, in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+from stga_addon import __version__
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.open import open_capture
+from stga_addon.errors import StgaError
+from stga_addon.package import WHEELS, build_zip, extension_files, fetch_wheels, read_manifest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def zip_file(tmp_path_factory) -> Path:
+    try:
+        fetch_wheels(ROOT / "wheels")
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    return build_zip(tmp_path_factory.mktemp("dist"))
+
+
+def run(script: str, *arguments: object, home: Path) -> str:
+    """Output of a script in a Python with bpy and an empty Blender profile."""
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home), "PYTHONPATH": "", "PYTHONSAFEPATH": "1"}
+    command = [sys.executable, "-c", script, *map(str, arguments)]
+    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+def blender_ext(command: str, *arguments: object, home: Path) -> str:
+    """Blender's own extension tool."""
+    script = (
+        "import bpy, runpy, sys; from pathlib import Path\n"
+        "tool = next(Path(bpy.utils.resource_path('LOCAL')).rglob('bl_pkg/cli/blender_ext.py'))\n"
+        "sys.argv[0] = str(tool); runpy.run_path(str(tool), run_name='__main__')\n"
+    )
+    return run(script, command, *arguments, home=home)
+
+
+def test_manifest_and_package_agree():
+    """Catches a release whose parts name different versions or different wheels."""
+    manifest = read_manifest(ROOT)
+    assert manifest["version"] == __version__
+    assert manifest["wheels"] == [f"./wheels/{name}" for name in WHEELS]
+
+
+def test_blender_finds_nothing_to_complain_about(zip_file, tmp_path):
+    """Catches a manifest that Blender's extension platform refuses."""
+    assert "error" not in blender_ext("validate", zip_file, home=tmp_path).lower()
+
+
+def test_same_files_as_blenders_own_build(zip_file, tmp_path):
+    """Catches exclude patterns that this build reads otherwise than Blender does."""
+    blender_ext("build", "--source-dir", ROOT, "--output-filepath", tmp_path / "reference.zip", home=tmp_path)
+    names, reference = (set(zipfile.ZipFile(path).namelist()) for path in (zip_file, tmp_path / "reference.zip"))
+    assert names == reference
+    assert not [name for name in names if name.startswith(("tests/", "docs/", ".")) or name.endswith(".pyc")]
+
+
+def test_equal_sources_give_an_equal_zip(zip_file, tmp_path):
+    """Catches times, orders and permissions of this machine in the zip."""
+    for path in extension_files(ROOT, read_manifest(ROOT)):
+        assert path.is_file()
+    assert build_zip(tmp_path).read_bytes() == zip_file.read_bytes()
+
+
+def test_a_folder_that_is_no_checkout_is_refused(tmp_path):
+    """Catches an empty zip."""
+    with pytest.raises(StgaError, match=r"blender_manifest\.toml: cannot be read"):
+        build_zip(tmp_path / "dist", root=tmp_path)
+
+
+# A Blender that nobody has installed anything into: training's packages are out of reach, others come from the zip.
+INSTALL = """
+import importlib.machinery, json, os, sys, time
+from pathlib import Path
+import bpy
+
+class Bare(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        package = name.split(".")[0]
+        if package in {"torch", "numba", "scipy", "PIL", "smplx"}:
+            return None
+        if path is None and package in {"trimesh", "tqdm"}:
+            path = [folder for folder in sys.path if folder.startswith(os.environ["BLENDER_USER_RESOURCES"])]
+        return super().find_spec(name, path, target)
+
+sys.meta_path = [Bare if finder is importlib.machinery.PathFinder else finder for finder in sys.meta_path]
+archive, capture, avatar = sys.argv[1:]
+result = {}
+assert bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True) == {"FINISHED"}
+module = "bl_ext.user_default.stga"
+result["enabled"] = module in bpy.context.preferences.addons
+result["heavy"] = sorted({"torch", "numba", "trimesh", "tqdm"} & {name.split(".")[0] for name in sys.modules})
+names = "import_capture select train show_avatar standard_view import_ply export".split()
+result["missing"] = [name for name in names if not hasattr(bpy.types, "STGA_OT_" + name)]
+result["tabs"] = [name for name in dir(bpy.types) if name.startswith("STGA_PT_")]
+result["wheels"] = [__import__(name).__file__ for name in ("trimesh", "tqdm")]
+
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.preferences.addon_enable(module=module)
+bpy.ops.stga.import_capture(directory=capture)
+bpy.ops.stga.select(threshold=0.002)
+bpy.ops.stga.show_avatar(filepath=avatar)
+scene = bpy.context.scene
+scene.frame_set(scene.frame_end)
+shown = next(i.object.data for i in bpy.context.evaluated_depsgraph_get().object_instances if i.object.type == "POINTCLOUD")
+xyz = [0.0] * 3 * len(shown.points)
+shown.attributes["position"].data.foreach_get("vector", xyz)
+result["frame"], result["xyz"] = scene.frame_current, xyz
+result["groups"] = sum(group.name.startswith("stga_") for group in scene.stga.head.vertex_groups)
+
+bpy.ops.preferences.addon_disable(module=module)
+before = {name for name in sys.modules if name.startswith(module)}
+for name in before:
+    del sys.modules[name]
+start = time.perf_counter()
+bpy.ops.preferences.addon_enable(module=module)
+result["seconds"] = time.perf_counter() - start
+
+bpy.ops.preferences.addon_disable(module=module)
+result["left"] = [name for name in names if hasattr(bpy.types, "STGA_OT_" + name)]
+index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
+bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
+folder = Path(bpy.context.preferences.extensions.repos[index].directory)
+result["files"] = [path.name for path in folder.glob("stga*")]
+print("RESULT " + json.dumps(result))
+"""
+
+
+def test_install_use_and_uninstall(zip_file, shared_data, tmp_path):
+    """Catches absolute imports, files left out of the zip, and packages that enabling, importing or showing needs."""
+    folder = shared_data / "studio_head"
+    capture = open_capture(folder)
+    splats = lattice_splats(capture.neutral, capture.faces, order=0, sh_degree=0)
+    write_avatar(tmp_path / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
+    output = run(INSTALL, zip_file, folder, tmp_path / "a.npz", home=tmp_path)
+    result = json.loads(next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix("RESULT "))
+    assert result["enabled"]
+    assert result["heavy"] == []
+    assert result["missing"] == []
+    assert len(result["tabs"]) == 4
+    assert all(str(tmp_path) in path for path in result["wheels"]), "a bundled wheel was not installed"
+    assert result["groups"] > 0
+    centres = capture.mesh(result["frame"])[capture.faces].mean(1)
+    np.testing.assert_allclose(np.reshape(result["xyz"], (-1, 3)), centres, atol=1e-5)
+    assert result["seconds"] < 0.3
+    assert result["left"] == []
+    assert result["files"] == []

@@ -1,0 +1,287 @@
+"""The operators, called as a script calls them, from the checkout registered as an extension."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
+
+from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
+from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars  # noqa: E402
+from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
+from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
+from stga_addon.avatar.splats import Splats  # noqa: E402
+from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.scene import nodes  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.groups import closure, read_selection  # noqa: E402
+from stga_addon.scene.splats import evaluated_splats, set_input  # noqa: E402
+from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[2]
+OPERATORS = ("import_capture", "select", "train", "show_avatar", "standard_view", "import_ply", "export")
+
+
+@pytest.fixture(scope="module")
+def extension():
+    """The checkout as a package of its own, as Blender imports an extension: only relative imports find their way."""
+    spec = importlib.util.spec_from_file_location(
+        "stga_checkout", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
+    )
+    module = sys.modules["stga_checkout"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.register()
+    yield module
+    module.unregister()
+
+
+@pytest.fixture(autouse=True)
+def _empty_scene(extension):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture
+def mesh_capture(tmp_path) -> Path:
+    return write_mesh_capture(tmp_path / "capture")
+
+
+def registered(name: str) -> bool:
+    # bpy.ops answers for any name; only a registered operator has a type
+    return hasattr(bpy.types, f"STGA_OT_{name}")
+
+
+def write_ball_avatar(path: Path, convention: str = "stga") -> Avatar:
+    vertices, faces = ball()
+    faces = faces.astype(np.int32)
+    splats = lattice_splats(vertices, faces, sh_degree=1, convention=convention)
+    rng = np.random.default_rng(0)
+    splats = replace(splats, xyz=splats.xyz + rng.normal(0, 0.002, splats.xyz.shape).astype(np.float32))
+    avatar = Avatar(splats, convention, vertices.astype(np.float32), faces)
+    write_avatar(path, avatar)
+    return avatar
+
+
+def expected_world(avatar: Avatar, vertices: np.ndarray) -> Splats:
+    return to_world(avatar.splats, face_frames(vertices, avatar.faces, avatar.neutral, avatar.convention))
+
+
+def test_register_and_unregister_leave_nothing(extension):
+    """Catches classes, menus and properties that stay behind, which the next enabling would trip over."""
+    menu = len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs)
+    assert all(registered(name) for name in OPERATORS)
+    extension.unregister()
+    assert not any(registered(name) for name in OPERATORS)
+    assert not hasattr(bpy.types.Scene, "stga")
+    assert not hasattr(bpy.types, "STGA_PT_capture")
+    assert len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs) == menu - 1
+    extension.register()
+    assert all(registered(name) for name in OPERATORS)
+
+
+def test_a_failing_registration_is_rolled_back(extension, monkeypatch):
+    """Catches a half-registered extension, which can be neither enabled nor disabled."""
+    extension.unregister()
+    monkeypatch.setattr(extension.operators.command_line, "register", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        extension.register()
+    assert not any(registered(name) for name in OPERATORS)
+    assert not hasattr(bpy.types.Scene, "stga")
+    monkeypatch.undo()
+    extension.register()
+
+
+def test_every_operator_explains_itself(extension):
+    """Catches operators and properties without the tooltip that is their only manual inside Blender."""
+    for name in OPERATORS:
+        kind = getattr(bpy.ops.stga, name).get_rna_type()
+        assert kind.description not in ("", "(undocumented operator)"), name
+        for prop in kind.properties:
+            assert prop.identifier == "rna_type" or prop.is_hidden or prop.description, (name, prop.identifier)
+
+
+def test_steps_wait_for_a_capture(extension):
+    """Catches steps that run, and fail, before there is anything to work on."""
+    for name in ("select", "train", "show_avatar", "export"):
+        assert not getattr(bpy.ops.stga, name).poll()
+        with pytest.raises(RuntimeError, match="Import a capture first"):
+            getattr(bpy.ops.stga, name)()
+
+
+def test_mesh_capture_from_import_to_show(extension, mesh_capture, tmp_path):
+    """Catches a chain that breaks between two operators: each works on what the one before left in the scene."""
+    capture = open_capture(mesh_capture)
+    assert bpy.ops.stga.import_capture(directory=str(mesh_capture)) == {"FINISHED"}
+    scene = bpy.context.scene
+    head = scene.stga.head
+    assert (scene.frame_start, scene.frame_end) == (0, 3)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (40, 60)
+    scene.frame_set(3)
+    np.testing.assert_allclose(evaluated_vertices(head), capture.mesh(3), atol=1e-6)
+
+    assert bpy.ops.stga.select(threshold=0.0015) == {"FINISHED"}
+    rule = select_capture(capture, SelectionOptions(threshold=0.0015))
+    assert not rule[1].any()
+    assert rule[3].any()
+    written = read_selection(head)
+    for timestep, selected in rule.items():
+        np.testing.assert_array_equal(written[timestep], closure(selected, capture.faces) & selected.any())
+
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
+    xyz, _, _ = evaluated_splats(scene.stga.splats)
+    np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(3)).xyz, atol=1e-5)
+
+
+def test_flame_capture_from_import_to_show(extension, tmp_path):
+    """Catches the same for a rigged head, whose mesh bones and correctives move, not one key a frame."""
+    folder, model = write_flame_capture(tmp_path / "capture")
+    capture = open_capture(folder, model)
+    assert bpy.ops.stga.import_capture(directory=str(folder), flame=str(model)) == {"FINISHED"}
+    scene = bpy.context.scene
+    assert bpy.ops.stga.select(threshold=0.001) == {"FINISHED"}
+    assert read_selection(scene.stga.head)[3].any()
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "flame.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "flame.blend"))
+    scene = bpy.context.scene
+    for timestep in capture.timesteps:
+        scene.frame_set(timestep)
+        xyz, _, _ = evaluated_splats(scene.stga.splats)
+        np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["mesh", "flame"])
+def test_training_in_process(extension, tmp_path, layout):
+    """Catches a train step that does not reach the trainer with this capture, or whose result show cannot read."""
+    for package in ("torch", "numba"):
+        pytest.importorskip(package)
+    if layout == "mesh":
+        bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    else:
+        folder, model = write_flame_capture(tmp_path / "capture")
+        bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    bpy.ops.stga.select(threshold=0.0005)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6) == {"FINISHED"}
+    path = bpy.context.scene.stga.avatar
+    assert bpy.ops.stga.show_avatar(filepath=path) == {"FINISHED"}
+    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(read_avatar(Path(path)).splats)
+
+
+def test_training_without_torch_says_what_is_missing(extension, mesh_capture, tmp_path, monkeypatch):
+    """Catches a traceback about imports where a sentence should say which Python lacks what."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    monkeypatch.setattr(extension.operators.train, "find_spec", lambda name: None)
+    with pytest.raises(
+        RuntimeError, match=r"^Error: training needs torch and numba in Blender's own Python \(.*\): install"
+    ):
+        bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_exports_read_back(extension, mesh_capture, tmp_path):
+    """Catches exports of the neutral pose, of the wrong frame, or in the head's turned world axes."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    capture = open_capture(mesh_capture)
+    bpy.context.scene.frame_set(3)
+    assert bpy.ops.stga.export(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
+    at_3 = expected_world(avatar, capture.mesh(3)).xyz
+    np.testing.assert_allclose(read_ply(tmp_path / "one.ply").xyz, at_3, atol=1e-5)
+    assert bpy.ops.stga.export(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
+    assert sorted(path.name for path in (tmp_path / "many").iterdir()) == [f"{frame:05d}.ply" for frame in range(4)]
+    np.testing.assert_allclose(read_ply(tmp_path / "many/00003.ply").xyz, at_3, atol=1e-5)
+    assert np.abs(read_ply(tmp_path / "many/00000.ply").xyz - at_3).max() > 1e-3
+    assert bpy.context.scene.frame_current == 3
+    with pytest.raises(RuntimeError, match="not tracked with FLAME"):
+        bpy.ops.stga.export(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
+
+
+def test_gaussian_avatars_export(extension, tmp_path):
+    """Catches an export that loses the motion or the binding on its way through Blender."""
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz", "gaussian_avatars")
+    arguments = {
+        "avatar": str(tmp_path / "avatar.npz"),
+        "filepath": str(tmp_path / "pair"),
+        "format": "gaussian-avatars",
+    }
+    assert bpy.ops.stga.export(**arguments) == {"FINISHED"}
+    np.testing.assert_array_equal(read_gaussian_avatars(tmp_path / "pair/point_cloud.ply").face, avatar.splats.face)
+    assert (tmp_path / "pair/flame_param.npz").is_file()
+
+
+@pytest.mark.parametrize("up", ["Y", "-Y", "Z"])
+def test_import_ply(extension, tmp_path, up):
+    """Catches a scan that lies on its back: the file's up axis must point along Blender's z."""
+    vertices, faces = ball()
+    splats = replace(lattice_splats(vertices, faces.astype(np.int32), order=0), face=np.zeros(len(faces), np.int32))
+    write_ply(tmp_path / "scan.ply", splats)
+    assert bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"), up=up) == {"FINISHED"}
+    shown = bpy.context.scene.stga.splats
+    bpy.context.view_layer.update()
+    axis = {"Y": (0, 1, 0), "-Y": (0, -1, 0), "Z": (0, 0, 1)}[up]
+    np.testing.assert_allclose(np.array(shown.matrix_world)[:3, :3] @ axis, (0, 0, 1), atol=1e-6)
+    assert len(evaluated_splats(shown)[0]) == len(splats)
+
+
+def test_mistakes_are_sentences(extension, mesh_capture, tmp_path):
+    """Catches tracebacks, silence, and objects left behind by an import that failed."""
+    with pytest.raises(RuntimeError, match=r"^Error: .*nowhere: is not a folder"):
+        bpy.ops.stga.import_capture(directory=str(tmp_path / "nowhere"))
+    with pytest.raises(RuntimeError, match="no path given"):
+        bpy.ops.stga.import_capture()
+    with pytest.raises(RuntimeError, match="has not been saved yet"):
+        bpy.ops.stga.import_capture(directory="//capture")
+    (mesh_capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
+    with pytest.raises(RuntimeError, match=r"00003\.obj"):
+        bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    assert not bpy.data.objects
+    (tmp_path / "broken.ply").write_bytes(b"ply\n")
+    with pytest.raises(RuntimeError, match=r"broken.ply: is not a PLY file"):
+        bpy.ops.stga.import_ply(filepath=str(tmp_path / "broken.ply"))
+
+
+def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
+    """Catches a traceback when the capture moved after the .blend was saved."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    mesh_capture.rename(mesh_capture.with_name("elsewhere"))
+    with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
+        bpy.ops.stga.select()
+
+
+def test_standard_view(extension):
+    """Catches a one-click cure that does not cure: AgX turns trained colours grey."""
+    bpy.context.scene.view_settings.view_transform = "AgX"
+    bpy.ops.stga.standard_view()
+    assert bpy.context.scene.view_settings.view_transform == "Standard"
+
+
+def test_show_selection_after_select(extension, mesh_capture, tmp_path):
+    """Catches the two sides of the vertex groups' name and weight drifting apart: Python writes, nodes read."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    bpy.ops.stga.select(threshold=0.0015)
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene = bpy.context.scene
+    set_input(scene.stga.splats, nodes.SHOW_SELECTION, True)
+    scene.frame_set(3)
+    points = next(
+        item.object.data
+        for item in bpy.context.evaluated_depsgraph_get().object_instances
+        if item.object.type == "POINTCLOUD"
+    )
+    color = np.empty(4 * len(points.points), np.float32)
+    points.attributes["stga_display_color"].data.foreach_get("color", color)
+    frozen = np.isclose(color.reshape(-1, 4), nodes.FROZEN_GREY).all(1)
+    np.testing.assert_array_equal(~frozen, read_selection(scene.stga.head)[3][avatar.splats.face])

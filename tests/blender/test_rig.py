@@ -1,0 +1,233 @@
+"""The FLAME rig against FLAME's own forward pass in float64."""
+
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.flame.forward import flame_forward  # noqa: E402
+from stga_addon.flame.model import JOINTS  # noqa: E402
+from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh  # noqa: E402
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.head import import_head, import_motion  # noqa: E402
+
+from .captures import flame_model, flame_sequence, mesh_capture  # noqa: E402
+
+TOLERANCE = 2e-6  # metres; float32 skinning of a head half a metre from its origin
+
+
+@pytest.fixture
+def source(tmp_path):
+    return tmp_path / "motion.npz"
+
+
+def at_frame(head, frame: float) -> np.ndarray:
+    whole = int(np.floor(frame))
+    bpy.context.scene.frame_set(whole, subframe=frame - whole)
+    return evaluated_vertices(head)
+
+
+def rig_of(head):
+    return next(thing for thing in head.parent.children if thing.get(tags.KIND) == tags.RIG)
+
+
+def assert_parity(head, sequence: FlameSequence) -> None:
+    for timestep in sequence.timesteps:
+        np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(sequence, timestep), atol=TOLERANCE)
+
+
+def quaternion(axis_angle: np.ndarray) -> np.ndarray:
+    angle = np.linalg.norm(axis_angle)
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) / angle * axis_angle)])
+
+
+def test_tracked_frames_are_the_forward_pass(source):
+    """Fails when a joint, a corrective, a weight, a rotation's sense or the translation is not FLAME's."""
+    sequence = flame_sequence(flame_model())
+    assert_parity(import_motion(sequence, source), sequence)
+
+
+def test_poses_set_by_hand_are_the_forward_pass(source):
+    """Fails when only the imported frames fit: baked pivots, correctives without drivers, unnormalised quaternions."""
+    sequence = flame_sequence(flame_model())
+    head = import_motion(sequence, source)
+    rig, keys = rig_of(head), head.data.shape_keys
+    rig.animation_data.action = keys.animation_data.action = None
+    wanted = sequence_frame = flame_sequence(sequence.model, seed=5).frame(4)
+    for name, axis_angle in zip(JOINTS, sequence_frame.pose, strict=True):
+        rig.pose.bones[name].rotation_quaternion = 1.7 * quaternion(axis_angle)
+    rig.pose.bones["root"].location = wanted.translation
+    for component, value in enumerate(wanted.expr):
+        keys.key_blocks[f"expr_{component:03d}"].value = value
+    bpy.context.view_layer.update()
+    expected = flame_forward(sequence.model, sequence.shape, wanted, sequence.static_offset)
+    np.testing.assert_allclose(evaluated_vertices(head), expected, atol=TOLERANCE)
+
+
+def test_small_rotations_and_offsets_do_not_snap(source):
+    """Fails when drivers keep the keyframes they are born with, to which results under 1e-4 snap."""
+    model = flame_model()
+    sequence = flame_sequence(model)
+
+    def frame(timestep: int):
+        full = sequence.frame(timestep)
+        return replace(full, expr=full.expr * 0.02, neck_pose=np.full(3, 5e-5), jaw_pose=np.full(3, -5e-5))
+
+    small = replace(sequence, frame=frame)
+    head = import_motion(small, source)
+    for timestep in small.timesteps:
+        np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(small, timestep), atol=5e-7)
+
+
+def test_drivers_need_no_python_and_no_cycle(source, capfd):
+    """Fails when Blender would run the drivers as scripts (refused in files from others) or in an undefined order."""
+    head = import_motion(flame_sequence(flame_model()), source)
+    at_frame(head, 5)
+    for owner in (rig_of(head), head.data.shape_keys):
+        assert owner.animation_data.drivers
+        for curve in owner.animation_data.drivers:
+            assert curve.driver.is_simple_expression
+            assert curve.is_valid
+    assert "cycle" not in "".join(capfd.readouterr()).lower()
+
+
+def test_between_frames_the_head_turns_and_does_not_shrink(source):
+    """Fails when a quaternion changes sign between keyframes, so that the interpolated head runs through zero."""
+    model = flame_model()
+    sequence = flame_sequence(model, timesteps=range(12))
+
+    def frame(timestep: int):
+        still = replace(sequence.frame(0), expr=np.zeros(model.n_expression))
+        return replace(still, rotation=np.array([0, 0.6 * timestep, 0]))
+
+    turning = replace(sequence, frame=frame)
+    head = import_motion(turning, source)
+    for timestep in range(11):
+        halfway = replace(turning.frame(0), rotation=np.array([0, 0.6 * (timestep + 0.5), 0]))
+        expected = flame_forward(model, turning.shape, halfway, turning.static_offset)
+        np.testing.assert_allclose(at_frame(head, timestep + 0.5), expected, atol=TOLERANCE)
+
+
+def test_only_the_expressions_in_use_become_keys(source):
+    """Fails when unused components bloat the file, or a used one is missing."""
+    model = flame_model()
+    sequence = flame_sequence(model)
+
+    def frame(timestep: int):
+        full = sequence.frame(timestep)
+        used = np.where(np.isin(np.arange(model.n_expression), [3, 17]), full.expr, 0)
+        return replace(full, expr=used)
+
+    sparse = replace(sequence, frame=frame)
+    head = import_motion(sparse, source)
+    names = [key.name for key in head.data.shape_keys.key_blocks if key.name.startswith("expr_")]
+    assert names == ["expr_003", "expr_017"]
+    assert_parity(head, sparse)
+    head = import_motion(sparse, source, all_expressions=True)
+    names = [key.name for key in head.data.shape_keys.key_blocks if key.name.startswith("expr_")]
+    assert len(names) == model.n_expression
+    assert_parity(head, sparse)
+
+
+def test_joints_that_stay_need_no_helper_bones(source):
+    """Fails when bones are cluttered with helpers where no expression moves a joint."""
+    model = flame_model()
+    model.shapedirs[model.j_regressor.any(axis=0)] = 0
+    sequence = flame_sequence(model)
+    head = import_motion(sequence, source)
+    assert [bone.name for bone in rig_of(head).data.bones] == list(JOINTS)
+    assert not rig_of(head).animation_data.drivers
+    assert {group.name for group in head.vertex_groups} == set(JOINTS)
+    assert_parity(head, sequence)
+
+
+def test_offsets_per_frame_become_keys(source):
+    """Fails when dynamic_offset is dropped, does not move the joints, or comes without a word."""
+    sequence = flame_sequence(flame_model(), dynamic=True)
+    said = []
+    head = import_motion(sequence, source, warn=said.append)
+    assert len(said) == 1
+    assert "dynamic_offset" in said[0]
+    assert_parity(head, sequence)
+
+
+def test_coefficients_beyond_the_sliders_are_told(source):
+    """Fails when a mesh that cannot be shown right is shown without a word."""
+    sequence = flame_sequence(flame_model())
+
+    def frame(timestep: int):
+        full = sequence.frame(timestep)
+        return replace(full, expr=full.expr + np.eye(len(full.expr))[7] * (12 if timestep == 5 else 0))
+
+    said = []
+    import_motion(replace(sequence, frame=frame), source, warn=said.append)
+    assert len(said) == 1
+    assert "expr 7" in said[0]
+    assert "timestep 5" in said[0]
+
+
+def test_a_flame_capture_imports_as_a_rig(tmp_path):
+    """Fails when a capture's FLAME parameters are flattened to one key a frame, or its regions are lost."""
+    sequence = flame_sequence(flame_model(vertices=60))
+    capture = replace(
+        mesh_capture(tmp_path, timesteps=sequence.timesteps),
+        layout="flame",
+        faces=sequence.model.faces,
+        neutral=neutral_mesh(sequence),
+        mesh=lambda timestep: sequence_mesh(sequence, timestep),
+        flame=sequence,
+    )
+    head = import_head(capture)
+    assert rig_of(head).type == "ARMATURE"
+    assert tags.REGION_PREFIX + "mouth" in head.data.attributes
+    assert_parity(head, sequence)
+
+
+def test_importing_again_replaces_the_rig(source):
+    """Fails when a second import doubles rig, modifier or drivers, or leaves actions behind."""
+    first = import_motion(flame_sequence(flame_model(), dynamic=True), source, warn=lambda sentence: None)
+    rig = rig_of(first)
+    counts = [len(blocks) for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)]
+    sequence = flame_sequence(flame_model(seed=2), seed=2)
+    head = import_motion(sequence, source)
+    assert head == first
+    assert rig_of(head) == rig
+    assert counts == [
+        len(blocks) for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)
+    ]
+    assert [modifier.type for modifier in head.modifiers] == ["ARMATURE"]
+    assert_parity(head, sequence)
+
+
+def test_the_rig_keeps_what_was_active(source):
+    """Fails when making bones, which needs edit mode, leaves another object active or a stray object behind."""
+    mine = bpy.data.objects.new("mine", None)
+    bpy.context.scene.collection.objects.link(mine)
+    bpy.context.view_layer.objects.active = mine
+    head = import_motion(flame_sequence(flame_model()), source)
+    assert bpy.context.view_layer.objects.active == mine
+    assert set(bpy.data.objects) == {mine, head, head.parent, rig_of(head)}
+
+
+def test_a_saved_rig_shows_the_same(source, tmp_path):
+    """Fails when drivers, keyframes or bindings do not survive saving and opening."""
+    sequence = flame_sequence(flame_model())
+    name = import_motion(sequence, source).name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
+    assert_parity(bpy.data.objects[name], sequence)
+
+
+def test_a_thousand_frames_import_in_seconds(source):
+    """Fails when keyframes are inserted one at a time (100 expressions, FLAME with teeth)."""
+    model = flame_model(vertices=5143, components=102, identity=2)
+    one = flame_sequence(model, timesteps=(0,)).frame(0)
+    long = replace(flame_sequence(model, timesteps=(0,)), timesteps=tuple(range(1000)), frame=lambda timestep: one)
+    start = perf_counter()
+    import_motion(long, source)
+    assert perf_counter() - start < 3

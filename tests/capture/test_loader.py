@@ -1,0 +1,183 @@
+"""The thread that loads the next views."""
+
+import itertools
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.capture import loader as module
+from stga_addon.capture.images import read_view
+from stga_addon.capture.loader import ViewLoader
+from stga_addon.capture.model import View
+from stga_addon.capture.open import open_capture
+from stga_addon.errors import StgaError
+
+from . import factory
+
+VIEW_BYTES = factory.WIDTH * factory.HEIGHT * 4  # image and mask
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> list[View]:
+    capture = open_capture(factory.write_mesh_capture(tmp_path / "capture"))
+    return [view for split in capture.views.values() for view in split]
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the views in the order in which they are decoded."""
+    names: list[str] = []
+
+    def counted(view: View, *rest: object) -> object:
+        names.append(view.name)
+        return read_view(view, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "read_view", counted)
+    return names
+
+
+def loader_threads() -> int:
+    return sum(thread.name == "view loader" for thread in threading.enumerate())
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+
+
+def test_order_and_content(views: list[View]) -> None:
+    """Catches views out of order, doubled, lost at the end, or paired with another's image."""
+    order = [views[i] for i in (3, 1, 1, 8, 0)]
+    with ViewLoader(order) as loader:
+        loaded = list(loader)
+    assert [view for view, _, _ in loaded] == order
+    for view, image, mask in loaded:
+        np.testing.assert_array_equal(image, factory.picture(view.timestep, view.camera_index))
+        np.testing.assert_array_equal(mask, factory.silhouette() * 255)
+
+
+def test_small_capture_is_decoded_once(views: list[View], decoded: list[str]) -> None:
+    """Catches a cache that misses: three rounds over nine views must decode nine."""
+    with ViewLoader(views * 3) as loader:
+        assert sum(1 for _ in loader) == 27
+    assert len(decoded) == 9
+
+
+def test_cache_is_bounded(views: list[View], decoded: list[str]) -> None:
+    """Catches a cache that outgrows its limit, or drops the view used latest instead of the oldest."""
+    sequence = [views[i] for i in (0, 1, 0, 2, 0, 1)]
+    with ViewLoader(sequence, cache_bytes=2 * VIEW_BYTES) as loader:
+        list(loader)
+    # 2 drives out 1, which is older than 0; so 1 is decoded again and 0 never is.
+    assert decoded == [views[i].name for i in (0, 1, 2, 1)]
+
+
+def test_queue_is_bounded(views: list[View], decoded: list[str]) -> None:
+    """Catches a thread that runs ahead without limit on an endless order of views."""
+    with ViewLoader(itertools.cycle(views), queue_bytes=2 * VIEW_BYTES, cache_bytes=0) as loader:
+        next(loader)
+        wait_until(lambda: len(decoded) == 4)
+        time.sleep(0.1)
+        # One taken, two ready, and one in the thread's hands.
+        assert len(decoded) == 4
+
+
+def test_one_view_larger_than_the_queue(views: list[View]) -> None:
+    """Catches a deadlock where a single view exceeds the bound."""
+    with ViewLoader(views, queue_bytes=1) as loader:
+        assert sum(1 for _ in loader) == 9
+
+
+def test_memory_does_not_grow(views: list[View]) -> None:
+    """Catches arrays held after use: 600 views of 10 kB pass through 10 views' worth of memory."""
+    with ViewLoader(itertools.cycle(views), queue_bytes=4 * VIEW_BYTES, cache_bytes=4 * VIEW_BYTES) as loader:
+        for _ in range(20):
+            next(loader)
+        tracemalloc.start()
+        for _ in range(600):
+            next(loader)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 20 * VIEW_BYTES
+
+
+def test_errors_come_where_their_view_would(views: list[View]) -> None:
+    """Catches an error lost in the thread, or raised before the good views ahead of it; and a hang afterwards."""
+    views[2].image.write_bytes(b"broken")
+    with ViewLoader(views) as loader:
+        assert next(loader)[0] is views[0]
+        assert next(loader)[0] is views[1]
+        for _ in range(2):
+            with pytest.raises(StgaError, match="is not a readable image"):
+                next(loader)
+    assert loader_threads() == 0
+
+
+def test_error_of_the_order_itself(views: list[View]) -> None:
+    """Catches an exception of the given iterator being taken for its end."""
+
+    def order() -> Iterator[View]:
+        yield views[0]
+        raise ValueError("bad schedule")
+
+    with ViewLoader(order()) as loader:
+        next(loader)
+        with pytest.raises(ValueError, match="bad schedule"):
+            next(loader)
+
+
+def test_closes_from_any_state(views: list[View]) -> None:
+    """Catches a thread left behind: full queue, finished, unused, or closed twice."""
+    loader = ViewLoader(itertools.cycle(views), queue_bytes=VIEW_BYTES)
+    next(loader)
+    loader.__exit__(RuntimeError, RuntimeError("stop"), None)
+    loader.close()
+    with pytest.raises(StopIteration):
+        next(loader)
+    ViewLoader([]).close()
+    with ViewLoader(views) as finished:
+        list(finished)
+    assert loader_threads() == 0
+
+
+def test_scales_by_position(views: list[View]) -> None:
+    """Catches a full-size image from the cache where a small one is due, or a camera that does not match it."""
+    sizes = [0.5, 1.0, 0.5, 0.25]
+    with ViewLoader([views[0]] * 4, scale=lambda position: sizes[position]) as loader:
+        loaded = list(loader)
+    shapes = [image.shape[:2] for _, image, _ in loaded]
+    assert shapes == [(30, 20), (60, 40), (30, 20), (15, 10)]
+    assert shapes == [(view.camera.height, view.camera.width) for view, _, _ in loaded]
+
+
+def test_shared_arrays_are_read_only(views: list[View]) -> None:
+    """Catches a consumer that changes the cached image under the next visit's feet."""
+    with ViewLoader(views[:1]) as loader:
+        _, image, mask = next(loader)
+    assert mask is not None
+    for array in (image, mask):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+def test_waiting_is_counted(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a wait that is not measured: slow decoding shows, and views that are ready cost nothing."""
+
+    def slow(view: View, *rest: object) -> object:
+        time.sleep(0.05)
+        return read_view(view, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "read_view", slow)
+    with ViewLoader(views[:3]) as loader:
+        list(loader)
+        assert loader.waited_s > 0.1
+    with ViewLoader(views[:3]) as loader:
+        wait_until(lambda: loader_threads() == 0)
+        list(loader)
+        assert loader.waited_s < 0.05
