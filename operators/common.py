@@ -34,14 +34,19 @@ def settings(context: Any) -> Any:
 def head_of(context: Any) -> Any:
     """The head the steps work on. Raises StgaError where the scene has none."""
     head = settings(context).head
-    if head is None:
+    if not is_head(head):
         raise StgaError("no head in the scene: import a capture first")
     return head
 
 
+def is_head(thing: Any) -> bool:
+    """Whether an object (or None) is a head that was imported from a capture."""
+    return thing is not None and thing.get(tags.KIND) == tags.HEAD
+
+
 def needs_head(operator: Any, context: Any) -> bool:
     """Poll: whether a capture was imported; says what to do where not."""
-    if settings(context).head is not None:
+    if is_head(settings(context).head):
         return True
     operator.poll_message_set("Import a capture first")
     return False
@@ -49,8 +54,6 @@ def needs_head(operator: Any, context: Any) -> bool:
 
 def capture_of(head: Any) -> Capture:
     """Open the capture that a head was imported from again. Raises StgaError where it has moved or changed."""
-    if tags.CAPTURE not in head:
-        raise StgaError(f"{head.name}: was not imported from a capture")
     model = head.get(tags.FLAME_MODEL)
     return open_capture(
         Path(head[tags.CAPTURE]),

@@ -2,10 +2,12 @@
 
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
+from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
@@ -13,7 +15,8 @@ from ..stga_addon.scene.groups import read_selection
 from . import ids
 from .common import capture_of, file_path, head_of, needs_head, reporting, settings
 
-NEEDED = ("torch", "numba")
+# module -> what pip calls it
+NEEDED = {"torch": "torch", "numba": "numba", "PIL": "pillow"}
 
 
 class Train(bpy.types.Operator):
@@ -44,24 +47,49 @@ class Train(bpy.types.Operator):
     )
     seed: bpy.props.IntProperty(name="Seed", description="Fixes every random choice", min=0)
 
+    resume: bpy.props.BoolProperty(
+        name="Resume",
+        description="Continue the run in the folder, with the settings and the budget it was started with",
+    )
+
     @classmethod
     def poll(cls, context: Any) -> bool:
         return needs_head(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = file_path(self.directory, "run folder")
         _require_runtime()
-        from ..stga_addon.training.run import train
-        from ..stga_addon.training.settings import make_settings
-
         head = head_of(context)
-        budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-        chosen = make_settings(self.strategy, seed=self.seed, **budget)
-        avatar = train(capture_of(head), folder, chosen, selection=_painted_selection(head))
+        capture = capture_of(head)
+        folder = file_path(self.directory, "run folder")
+        avatar = self._train(context, capture, folder, head)
         settings(context).avatar = str(avatar)
         self.report({"INFO"}, f"Trained {avatar}")
         return {"FINISHED"}
+
+    def _train(self, context: Any, capture: Capture, folder: Path, head: Any) -> Path:
+        from ..stga_addon.training.folder import Run, read_run
+        from ..stga_addon.training.run import train
+        from ..stga_addon.training.settings import make_settings
+
+        if self.resume:
+            run = read_run(folder)
+        else:
+            budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
+            chosen = make_settings(self.strategy, seed=self.seed, **budget)
+            flame = Path(head[tags.FLAME_MODEL]) if head[tags.FLAME_MODEL] else None
+            run = Run(capture.root, flame, head[tags.PRINCIPAL_POINT], chosen)
+        manager = context.window_manager
+
+        def show(progress: Any) -> bool:
+            manager.progress_update(100 * progress.share)
+            return False
+
+        manager.progress_begin(0, 100)
+        try:
+            return train(capture, folder, run, _painted_selection(head), resume=self.resume, report=show)
+        finally:
+            manager.progress_end()
 
 
 def _painted_selection(head: Any) -> dict[int, Any] | None:
@@ -72,10 +100,10 @@ def _painted_selection(head: Any) -> dict[int, Any] | None:
 
 
 def _require_runtime() -> None:
-    missing = [name for name in NEEDED if find_spec(name) is None]
+    missing = [package for module, package in NEEDED.items() if find_spec(module) is None]
     if missing:
         python = f"{sys.executable}, {sys.version.split()[0]}"
         raise StgaError(
-            f"training needs {' and '.join(missing)} in Blender's own Python ({python}): install it there, "
+            f"training needs {', '.join(missing)} in Blender's own Python ({python}): install what is missing, "
             "or train outside Blender with `python -m stga_addon train` and show the avatar here"
         )

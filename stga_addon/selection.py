@@ -49,9 +49,10 @@ def select_capture(
     regions = {name: capture.regions[name] for name in options.regions if name in capture.regions}
     chosen = {}
     for timestep in capture.timesteps:
-        chosen[timestep] = capture.given_selection.get(timestep)
-        if chosen[timestep] is None:
+        faces = capture.given_selection.get(timestep)
+        if faces is None:
             mesh = capture.expression_mesh(timestep, options.zero_pose)
-            chosen[timestep] = select_faces(mesh, capture.neutral, capture.faces, regions, options.threshold)
+            faces = select_faces(mesh, capture.neutral, capture.faces, regions, options.threshold)
+        chosen[timestep] = faces
         progress(timestep)
     return chosen

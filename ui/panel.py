@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 
 from ..operators import ids
-from ..operators.common import register_classes, settings, unregister_classes
+from ..operators.common import is_head, register_classes, settings, unregister_classes
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import nodes, tags
 from ..stga_addon.scene.compat import modifier_input_owner
@@ -29,9 +29,10 @@ class CapturePanel(_Step, bpy.types.Panel):
         layout, chosen = self.layout, settings(context)
         layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
         layout.prop(chosen, "head")
-        if chosen.head is not None:
-            timesteps = len(chosen.head.get(tags.TIMESTEPS, ()))
-            layout.label(text=f"{timesteps} timesteps, {len(chosen.head.data.polygons)} triangles")
+        if is_head(chosen.head):
+            layout.label(
+                text=f"{len(chosen.head[tags.TIMESTEPS])} timesteps, {len(chosen.head.data.polygons)} triangles"
+            )
 
 
 class SelectPanel(_Step, bpy.types.Panel):
@@ -41,7 +42,7 @@ class SelectPanel(_Step, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, head = self.layout, settings(context).head
         layout.operator(ids.SELECT, icon="GROUP_VERTEX")
-        if head is not None:
+        if is_head(head):
             frames = sum(tags.group_timestep(group.name) is not None for group in head.vertex_groups)
             layout.label(text=f"{frames} frames have a selection" if frames else "No selection yet")
 
@@ -53,9 +54,12 @@ class TrainPanel(_Step, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, chosen = self.layout, settings(context)
         layout.prop(chosen, "run_folder")
-        layout.prop(chosen, "minutes")
+        layout.prop(chosen, "resume")
+        row = layout.row()
+        row.active = not chosen.resume  # a run that goes on keeps its budget
+        row.prop(chosen, "minutes")
         train = layout.operator(ids.TRAIN, icon="PLAY")
-        train.directory, train.minutes = chosen.run_folder, chosen.minutes
+        train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, chosen.resume
 
 
 class ShowPanel(_Step, bpy.types.Panel):

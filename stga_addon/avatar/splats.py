@@ -1,5 +1,6 @@
 """The 3D Gaussians themselves, as plain arrays."""
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -34,7 +35,7 @@ class Splats:
 
     @property
     def sh_degree(self) -> int:
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
+        return math.isqrt(self.sh.shape[1]) - 1
 
     def rows(self, index: np.ndarray) -> "Splats":
         """The splats at `index` (a boolean mask or integer array)."""

@@ -32,9 +32,42 @@ EXPRESSIONS = (
 COLUMNS = 52
 # Height of each row at the front of the face; closer together where the face has more to say.
 ROWS = np.array(
-    "0.130 0.1265 0.117 0.104 0.090 0.076 0.063 0.052 0.043 0.035 0.028 0.0205 0.0135 0.0065 -0.002 -0.010 -0.0175 "
-    "-0.0245 -0.031 -0.038 -0.0445 -0.050 -0.0555 -0.062 -0.070 -0.079 -0.089 -0.099 -0.107 -0.112 -0.118 -0.130 "
-    "-0.150 -0.175".split(),
+    [
+        "0.130",
+        "0.1265",
+        "0.117",
+        "0.104",
+        "0.090",
+        "0.076",
+        "0.063",
+        "0.052",
+        "0.043",
+        "0.035",
+        "0.028",
+        "0.0205",
+        "0.0135",
+        "0.0065",
+        "-0.002",
+        "-0.010",
+        "-0.0175",
+        "-0.0245",
+        "-0.031",
+        "-0.038",
+        "-0.0445",
+        "-0.050",
+        "-0.0555",
+        "-0.062",
+        "-0.070",
+        "-0.079",
+        "-0.089",
+        "-0.099",
+        "-0.107",
+        "-0.112",
+        "-0.118",
+        "-0.130",
+        "-0.150",
+        "-0.175",
+    ],
     float,
 )
 EYE_ROW, EYE_COLUMNS = 11, (3, 9)  # the slit's corners, counted from the middle of the face
@@ -194,7 +227,10 @@ class _Grid:
         for at, (first, last), kind in [*slits, (MOUTH_ROW, MOUTH_COLUMNS, "mouth")]:
             inner = np.arange(first * level + 1, last * level)
             fresh = len(self.row) + np.arange(len(inner))
-            self.row, self.column = np.append(self.row, np.full(len(inner), float(at))), np.append(self.column, inner / level)
+            self.row, self.column = (
+                np.append(self.row, np.full(len(inner), float(at))),
+                np.append(self.column, inner / level),
+            )
             under = np.append(under, np.ones(len(inner), bool))
             upper = above[at * level - 1]
             below[at * level - 1, inner % self.columns] = fresh
@@ -217,14 +253,20 @@ class _Grid:
         crown = self.rows * self.columns
         near, far = np.arange(self.columns), (np.arange(self.columns) + 1) % self.columns
         cap = np.stack([np.full(self.columns, crown), above[0][near], above[0][far]], 1)
-        quads = [np.stack([below[r][near], above[r + 1][near], above[r + 1][far], below[r][far]], 1) for r in range(self.rows - 1)]
+        quads = [
+            np.stack([below[r][near], above[r + 1][near], above[r + 1][far], below[r][far]], 1)
+            for r in range(self.rows - 1)
+        ]
         return np.concatenate([cap, _split(np.concatenate(quads), self.skin.at)])
 
     def _add_pocket(self, ring: np.ndarray, kind: str) -> None:
         """Continue a slit's edge inwards: behind the lids, or into the mouth."""
         edge = self.skin.at[ring]
         if kind == "lid":
-            layers = [edge - [0, 0, 0.002], edge - [0, 0, 0.007]]
+            # Down onto the eyeball, so that no gap shows at the corners.
+            eye = EYE * [np.sign(edge[0, 0]), 1, 1]
+            inwards = (edge - eye) / np.linalg.norm(edge - eye, axis=1, keepdims=True)
+            layers = [edge - [0, 0, 0.0012], eye + 0.96 * EYE_RADIUS * inwards]
         else:
             # The ring runs along the upper lip first.
             apart = np.clip(1 - (edge[:, :1] / 0.0245) ** 2, 0, 1) * [0, 1, 0]
@@ -303,7 +345,9 @@ def _skin(row: np.ndarray, column: np.ndarray, under: np.ndarray) -> Skin:
     front_y = _curve(row, np.arange(len(ROWS), dtype=float), ROWS[:, None])[:, 0]
     # The square root opens up the crown, where the contour is round.
     knots = np.sqrt(CONTOUR[0, 0] - CONTOUR[:, 0])
-    back_y, width, front, middle, back = _curve(np.sqrt(np.maximum(CONTOUR[0, 0] - front_y, 0)), knots, CONTOUR[:, 1:]).T
+    back_y, width, front, middle, back = _curve(
+        np.sqrt(np.maximum(CONTOUR[0, 0] - front_y, 0)), knots, CONTOUR[:, 1:]
+    ).T
     facing = np.cos(angle)
     x = width * np.sin(angle)
     y = back_y + (front_y - back_y) * (1 + facing) / 2
@@ -360,8 +404,10 @@ def _open_slits(skin: Skin) -> Skin:
     at = skin.at.copy()
     lid = _lid_opening(skin)
     at[:, 1] += np.where(skin.above_eyes >= 0, 0.0056, -0.0034) * lid
-    at[:, 1] += np.where(skin.above_mouth >= 0, 0.0002, -0.0002) * np.clip(1 - (at[:, 0] / 0.024) ** 2, 0, 1) * (
-        abs(skin.above_mouth) < 1
+    at[:, 1] += (
+        np.where(skin.above_mouth >= 0, 0.0002, -0.0002)
+        * np.clip(1 - (at[:, 0] / 0.024) ** 2, 0, 1)
+        * (abs(skin.above_mouth) < 1)
     )
     for eye in (EYE, EYE * [-1, 1, 1]):
         at = _outside_eyeball(at, eye)
@@ -396,7 +442,11 @@ def _eyeball(centre: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
     polar = np.pi * np.arange(1, rings) / rings
     turn = 2 * np.pi * np.arange(around) / around
     shell = np.stack(
-        [np.sin(polar)[:, None] * np.cos(turn), np.sin(polar)[:, None] * np.sin(turn), np.cos(polar)[:, None] + 0 * turn],
+        [
+            np.sin(polar)[:, None] * np.cos(turn),
+            np.sin(polar)[:, None] * np.sin(turn),
+            np.cos(polar)[:, None] + 0 * turn,
+        ],
         -1,
     ).reshape(-1, 3)
     points = np.concatenate([shell, [[0, 0, 1], [0, 0, -1]]])
@@ -413,7 +463,7 @@ def _tooth_row(level: int, up: int) -> tuple[np.ndarray, np.ndarray]:
     across, down = 12 * level, 2 * level
     bow = np.linspace(-1.15, 1.15, across + 1)
     drop = np.linspace(0.0, 1.0, down + 1)
-    x = 0.021 * np.sin(bow) / np.sin(1.15)
+    x = 0.0225 * np.sin(bow) / np.sin(1.15)
     z = MOUTH[2] - 0.0055 - (0.0 if up > 0 else 0.0016) - 0.020 * (1 - np.cos(bow))
     edge = MOUTH[1] - (0.0022 if up > 0 else 0.0030)
     y = edge + up * 0.0105 * drop
@@ -427,7 +477,9 @@ def _tooth_row(level: int, up: int) -> tuple[np.ndarray, np.ndarray]:
 # Blend shapes --------------------------------------------------------------------------------------------------------
 
 
-def _vector(skin: Skin, x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0) -> np.ndarray:
+def _vector(
+    skin: Skin, x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0
+) -> np.ndarray:
     return np.stack([np.broadcast_to(part, skin.x.shape) for part in (x, y, z)], 1)
 
 
@@ -472,7 +524,12 @@ def _expressions(skin: Skin) -> list[np.ndarray]:
     parted = np.where(skin.above_mouth >= 0, 0.0042, -0.0058) * lip
     lower_lid = _lid_opening(skin) * (skin.above_eyes < 0)
     return [
-        _vector(skin, sign * 0.0085 * corner + sign * 0.002 * cheek, 0.0085 * corner + 0.004 * cheek, 0.004 * cheek - 0.0045 * corner),
+        _vector(
+            skin,
+            sign * 0.0085 * corner + sign * 0.002 * cheek,
+            0.0085 * corner + 0.004 * cheek,
+            0.004 * cheek - 0.0045 * corner,
+        ),
         _vector(skin, -0.42 * x * mouth, 0.0, 0.0085 * mouth),
         _vector(skin, sign * 0.002 * corner, -0.0085 * corner, -0.001 * corner),
         _vector(skin, 0.0, 0.0085 * brow + 0.0035 * forehead, 0.001 * brow),
@@ -581,11 +638,11 @@ def _masks(grid: _Grid, pieces: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def above_hairline(at: np.ndarray) -> np.ndarray:
     """(N,) metres above the line where hair begins, by rest position (N, 3)."""
-    x, y, z = at.T
+    _, y, z = at.T
     line = np.interp(
         z,
-        [-0.080, -0.045, -0.034, 0.000, 0.010, 0.022, 0.040, 0.060, 0.090],
-        [-0.060, -0.045, 0.028, 0.030, 0.020, 0.048, 0.068, 0.080, 0.087],
+        [-0.088, -0.076, -0.064, -0.052, -0.040, 0.000, 0.010, 0.022, 0.040, 0.060, 0.090],
+        [-0.060, -0.050, -0.026, 0.004, 0.029, 0.031, 0.024, 0.046, 0.068, 0.080, 0.087],
     )
     return np.asarray(y - line)
 

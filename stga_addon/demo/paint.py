@@ -54,6 +54,8 @@ def _skin(at: np.ndarray, skin: np.ndarray, hair: np.ndarray, rng: np.random.Gen
     lips = np.clip((height - abs(y - MOUTH[1])) / 0.0012 + 0.5, 0, 1) * (side < 0.027)
     tint = _mix(tint, LIPS, 0.9 * front * lips)
     tint = _mix(tint, skin * 0.12, front * 0.95 * _spot(at, (0.0065, -0.0290), (0.0040, 0.0016)))  # nostrils
+    ear = np.exp(-(((z + 0.016) / 0.006) ** 2) - ((y - 0.007) / 0.013) ** 2) * (side > 0.06)
+    tint = _mix(tint, skin * [0.55, 0.42, 0.40], 0.8 * ear)
     lash = np.hypot((side - EYE[0]) / 0.0160, (y - EYE[1] - 0.001) / 0.0062)
     tint = _mix(tint, hair, front * (y > EYE[1]) * np.clip(1 - abs(lash - 1.05) / 0.13, 0, 1))
     arch = 0.0375 + 0.0075 * np.sin(np.clip((side - 0.010) / 0.036, 0, 1) * 2.3)
@@ -73,7 +75,10 @@ def _eye(at: np.ndarray, iris: np.ndarray) -> np.ndarray:
     radius = np.where(away[:, 2] > 0, np.hypot(away[:, 0], away[:, 1]), EYE_RADIUS)
     spokes = 1 + 0.3 * np.sin(12 * np.arctan2(away[:, 1], away[:, 0]))
     tint = np.tile([0.78, 0.74, 0.70], (len(at), 1))
-    tint = _mix(tint, iris, np.clip((LIMBUS - radius) / 0.0009 + 0.5, 0, 1)) * np.where(radius < LIMBUS, spokes, 1)[:, None]
+    tint = (
+        _mix(tint, iris, np.clip((LIMBUS - radius) / 0.0009 + 0.5, 0, 1))
+        * np.where(radius < LIMBUS, spokes, 1)[:, None]
+    )
     return _mix(tint, np.full(3, 0.004), np.clip((PUPIL - radius) / 0.0006 + 0.5, 0, 1))
 
 

@@ -13,7 +13,6 @@ from .kernels.bins import count_pairs, depth_order, fill_pairs
 from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
 from .kernels.project import project_backward, project_forward
 
-
 BLACK = np.zeros(3, np.float32)
 
 
@@ -52,7 +51,7 @@ class Rendering:
     transmittance: np.ndarray
     visible: np.ndarray
     projected: np.ndarray
-    extent: np.ndarray
+    extent_y: np.ndarray
     rect: np.ndarray
     last: np.ndarray
     slot_start: np.ndarray
@@ -118,10 +117,10 @@ def render_forward(
     take = (scratch or Scratch()).take
     tiles_x, tiles_y = _tile_grid(camera)
     projected, depth = take("projected", (n, PROJECTED)), take("depth", (n,))
-    extent, rect = take("extent", (n, 2)), take("rect", (n, 4), np.int32)
+    extent_y, rect = take("extent_y", (n,)), take("rect", (n, 4), np.int32)
     project_forward(
         *splats, degree, face, seen.origin, seen.matrix, seen.to_world, seen.lens, seen.size, depth_as_colour,
-        projected, depth, extent, rect,
+        projected, depth, extent_y, rect,
     )  # fmt: skip
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
     order = depth_order(depth, visible)
@@ -140,9 +139,9 @@ def render_forward(
     transmittance = take("transmittance", (camera.height, camera.width))
     last = take("last", (camera.height, camera.width), np.int32)
     background = np.asarray(background, np.float32)
-    blend_forward(tiles, tiles_x, start, pair_splat, projected, extent[:, 1], background, image, transmittance, last)
+    blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last)
     return Rendering(
-        image, transmittance, visible, projected, extent, rect, last, slot_start, slot_count, start, pair_splat,
+        image, transmittance, visible, projected, extent_y, rect, last, slot_start, slot_count, start, pair_splat,
         pair_slot, tiles, background, degree, depth_as_colour,
     )  # fmt: skip
 
@@ -180,7 +179,7 @@ def render_backward(
         v_transmittance = np.broadcast_to(np.float32(0), rendering.transmittance.shape)
     blend_backward(
         tiles, tiles_x, rendering.start, rendering.pair_splat, rendering.pair_slot, wanted, rendering.projected,
-        rendering.extent[:, 1], rendering.background, rendering.transmittance, rendering.last, v_image,
+        rendering.extent_y, rendering.background, rendering.transmittance, rendering.last, v_image,
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
@@ -229,8 +228,8 @@ def render(
     """
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
     seen = camera_frames(frames, camera)
-    rgb, transmittance = _Blend.apply(seen, face, degree, False, *splats)
-    depth, _ = _Blend.apply(seen, face, degree, True, *splats)
+    rgb, transmittance = _Blend.apply(seen, face, degree, False, *splats)  # type: ignore[no-untyped-call]
+    depth, _ = _Blend.apply(seen, face, degree, True, *splats)  # type: ignore[no-untyped-call]
     return rgb, 1 - transmittance, depth[0]
 
 
@@ -245,7 +244,7 @@ class _Blend(torch.autograd.Function):
         return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
 
     @staticmethod
-    def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
         seen, face, splats, rendering = ctx.saved
         gradients = Parameters(*(np.zeros_like(a) for a in splats))
         v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()

@@ -95,14 +95,18 @@ class _Nodes:
         self.tree = tree
 
     def add(self, kind: str, inputs: dict[str, Any] | None = None, **properties: Any) -> bpy.types.Node:
-        """New node; `inputs` maps an enabled socket's name (a list where several share it) to a value or socket."""
+        """New node; `inputs` maps an enabled socket's name or identifier to a value or socket.
+
+        Several sockets of one name take a list. Names differ between Blender versions more often than identifiers.
+        Raises ValueError where no socket has the name.
+        """
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
             setattr(node, name, value)
         for name, values in (inputs or {}).items():
-            sockets = [socket for socket in node.inputs if socket.enabled and socket.name == name]
+            sockets = [socket for socket in node.inputs if socket.enabled and name in (socket.name, socket.identifier)]
             values = values if isinstance(values, list) else [values]
-            for socket, value in zip(sockets, values, strict=len(values) > 1):
+            for socket, value in zip(sockets, values, strict=True):
                 if isinstance(value, bpy.types.NodeSocket):
                     self.tree.links.new(value, socket)
                 else:
@@ -257,7 +261,7 @@ def _ellipsoids(nodes: _Nodes, splats: Any) -> bpy.types.NodeSocket:
     """Instances of one sphere; never realised, which would cost twenty times as much."""
     group = nodes.tree.nodes.new("NodeGroupInput").outputs
     sphere = nodes.out("GeometryNodeMeshIcoSphere", {"Radius": 1.0, "Subdivisions": 2})
-    sphere = nodes.out("GeometryNodeSetShadeSmooth", {"Mesh": sphere})
+    sphere = nodes.out("GeometryNodeSetShadeSmooth", {"Geometry": sphere})
     material = splat_material(ELLIPSOID_MATERIAL, "INSTANCER")
     sphere = nodes.out("GeometryNodeSetMaterial", {"Geometry": sphere, "Material": material})
     return nodes.out(

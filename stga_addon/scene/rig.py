@@ -12,6 +12,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ..flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ..flame.model import JOINTS, FlameModel
@@ -86,6 +87,11 @@ def _place_armature(head: Any, joints: np.ndarray, parents: np.ndarray, moving: 
     rig = place(root, tags.RIG, title, _armature(title, joints, parents, moving), next(iter(_rigs(head)), None))
     rig.show_in_front = True
     bpy.context.view_layer.update()  # makes the pose bones
+    for name in JOINTS:  # an earlier import's
+        rig.pop(_sum_property(name), None)
+        rig.pop(_offset_property(name), None)
+    for bone in rig.pose.bones:
+        bone.matrix_basis = Matrix()
     for joint, name in enumerate(JOINTS):
         bone = rig.pose.bones[name]
         bone.rotation_mode = "QUATERNION"

@@ -65,9 +65,15 @@ def splat_modifier(shown: Any) -> Any:
 
 
 def set_input(shown: Any, name: str, value: Any) -> None:
-    """Set an input of a splat object's modifier by its name, `nodes.ELLIPSOIDS` for one."""
+    """Set an input of a splat object's modifier by its name, `nodes.ELLIPSOIDS` for one.
+
+    Raises StgaError where the splats have no such input: those in world space follow no head.
+    """
     modifier = splat_modifier(shown)
-    set_modifier_input(modifier, input_identifier(modifier, name), value)
+    identifier = input_identifier(modifier, name)
+    if identifier is None:
+        raise StgaError(f"{shown.name}: has no display setting {name!r}")
+    set_modifier_input(modifier, identifier, value)
 
 
 def input_identifier(modifier: Any, name: str) -> str | None:
@@ -82,7 +88,6 @@ def evaluated_splats(shown: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns position (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32.
     Raises StgaError where it displays ellipsoids, which are instances and not one geometry.
     """
-    modifier = splat_modifier(shown)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for instance in depsgraph.object_instances:
         made_by = instance.parent if instance.is_instance else instance.object
@@ -93,7 +98,7 @@ def evaluated_splats(shown: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
                 _read(points, nodes.WORLD_ROTATION, "value", 4),
                 _read(points, nodes.WORLD_SCALE, "vector", 3),
             )
-    raise StgaError(f"{shown.name}: shows no points ({modifier.name} shows ellipsoids, or hides all splats)")
+    raise StgaError(f"{shown.name}: shows ellipsoids or nothing, expected points")
 
 
 def _splat_object(name: str, splats: Splats, collection: Any) -> Any:

@@ -76,7 +76,9 @@ def _render(scene: bpy.types.Scene, path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _studio(sitter: Sitter, samples: int, seed: int) -> Iterator[tuple[bpy.types.Scene, bpy.types.Object, bpy.types.Object]]:
+def _studio(
+    sitter: Sitter, samples: int, seed: int
+) -> Iterator[tuple[bpy.types.Scene, bpy.types.Object, bpy.types.Object]]:
     kinds = ("scenes", "worlds", "lights", "cameras", "meshes", "materials", "objects")
     before = {kind: set(getattr(bpy.data, kind)) for kind in kinds}
     try:
@@ -158,11 +160,11 @@ def _surface() -> bpy.types.Material:
 
     rest, grain = attribute("rest"), attribute("grain")
     mottle = nodes.new("ShaderNodeTexNoise")
-    mottle.inputs["Scale"].default_value, mottle.inputs["Detail"].default_value = 160.0, 5.0
+    mottle.inputs["Scale"].default_value, mottle.inputs["Detail"].default_value = 260.0, 4.0
     link(rest.outputs["Vector"], mottle.inputs["Vector"])
     shade = nodes.new("ShaderNodeMapRange")
     shade.inputs["From Min"].default_value, shade.inputs["From Max"].default_value = 0.3, 0.7
-    shade.inputs["To Min"].default_value, shade.inputs["To Max"].default_value = 0.62, 1.32
+    shade.inputs["To Min"].default_value, shade.inputs["To Max"].default_value = 0.88, 1.12
     link(mottle.outputs["Fac"], shade.inputs["Value"])
     tinted = nodes.new("ShaderNodeVectorMath")
     tinted.operation = "SCALE"

@@ -16,17 +16,17 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> Non
     rates: learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`.
     (STGA, selective training; Adam with a step count per row, because rows are trained unequally often.)
     """
-    np_steps = state.steps.numpy()
-    np_steps[rows] += 1
+    steps = state.steps.numpy()
+    steps[rows] += 1
     for name, parameter in state.parameters._asdict().items():
-        arrays = [t[name].numpy() for t in (state.gradients._asdict(), state.first._asdict(), state.second._asdict())]
-        flat = [a.reshape(len(a), -1) for a in (parameter.numpy(), *arrays)]
+        tensors = (parameter, *(getattr(part, name) for part in (state.gradients, state.first, state.second)))
+        value, gradient, first, second = (t.numpy().reshape(len(state), -1) for t in tensors)
+        # The view-dependent coefficients have a rate of their own.
+        parts = [(slice(None), rates[name])]
         if name == "sh":
-            _step(rows, [a[:, :3] for a in flat], np_steps, rates["sh"])
-            _step(rows, [a[:, 3:] for a in flat], np_steps, rates["sh_rest"])
-        else:
-            _step(rows, flat, np_steps, rates[name])
-
-
-def _step(rows: np.ndarray, arrays: list[np.ndarray], steps: np.ndarray, rate: float) -> None:
-    adam_rows(rows, *arrays, steps, np.float32(rate), BETA1, BETA2, EPSILON)
+            parts = [(slice(0, 3), rates["sh"]), (slice(3, None), rates["sh_rest"])]
+        for part, rate in parts:
+            adam_rows(
+                rows, value[:, part], gradient[:, part], first[:, part], second[:, part], steps,
+                np.float32(rate), BETA1, BETA2, EPSILON,
+            )  # fmt: skip

@@ -1,5 +1,7 @@
 """The image loss and the limits that keep splats near what they cover (STGA, training)."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.ndimage import find_objects, label
 
@@ -12,7 +14,7 @@ __all__ = ["REACH", "image_gradient", "similarity", "tile_rectangles", "whole_im
 def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:
     """Rectangles (bands, 4) of pixels x0, y0, x1, y1 that tile an image, for the threads to share."""
     edges = np.linspace(0, height, min(bands, height) + 1).astype(np.int64)
-    return np.array([[0, top, width, bottom] for top, bottom in zip(edges[:-1], edges[1:], strict=True)], np.int64)
+    return np.array([[0, top, width, bottom] for top, bottom in pairwise(edges)], np.int64)
 
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -99,7 +99,9 @@ PAPER = {
 GAUSSIAN_AVATARS = {
     "convention": "gaussian_avatars",
     "lattice": 0,
-    "rates": Rates(xyz=5e-3, log_scale=1.7e-2, rotation=1e-3, opacity=5e-2, sh=2.5e-3, sh_rest=1.25e-4, position_end=0.01, end=1.0),
+    "rates": Rates(
+        xyz=5e-3, log_scale=1.7e-2, rotation=1e-3, opacity=5e-2, sh=2.5e-3, sh_rest=1.25e-4, position_end=0.01, end=1.0
+    ),
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_every": 0,

@@ -1,6 +1,8 @@
 """What training changes: the splats, their optimiser moments and what density control has gathered."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,21 +41,28 @@ class TrainState:
 
     def splats(self) -> Splats:
         """A copy of the splats as they are now."""
-        return Splats(*(t.numpy().copy() for t in self.parameters), self.face.numpy().copy(), self.loose.numpy().copy())
+        arrays = {name: t.numpy().copy() for name, t in self.parameters._asdict().items()}
+        return Splats(**arrays, face=self.face.numpy().copy(), loose=self.loose.numpy().copy())
 
 
 def new_state(splats: Splats) -> TrainState:
     """Fresh optimiser moments around a copy of the splats."""
     values = [torch.from_numpy(getattr(splats, name).astype(np.float32)) for name in Parameters._fields]
     n = len(splats)
+
+    def zeros() -> Parameters:
+        return Parameters(*(torch.zeros_like(v) for v in values))
+
     return TrainState(
-        Parameters(*values),
-        *(Parameters(*(torch.zeros_like(v) for v in values)) for _ in range(3)),
-        torch.zeros(n, dtype=torch.int32),
-        torch.from_numpy(splats.face.astype(np.int32)),
-        torch.from_numpy(splats.loose.astype(bool)),
-        torch.zeros(n),
-        torch.zeros(n),
+        parameters=Parameters(*values),
+        gradients=zeros(),
+        first=zeros(),
+        second=zeros(),
+        steps=torch.zeros(n, dtype=torch.int32),
+        face=torch.from_numpy(splats.face.astype(np.int32)),
+        loose=torch.from_numpy(splats.loose.astype(bool)),
+        pull=torch.zeros(n),
+        seen=torch.zeros(n),
     )
 
 
@@ -81,15 +90,15 @@ def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
 
 def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
     """Rebuild a state from `tensors_of`. Raises KeyError with the name of a missing tensor."""
-    values = []
+    values: dict[str, Any] = {}
     for f in fields(TrainState):
         if f.name in tensors:
-            values.append(tensors[f.name])
+            values[f.name] = tensors[f.name]
         else:
-            values.append(Parameters(*(tensors[f"{f.name}/{name}"] for name in Parameters._fields)))
-    return TrainState(*values)
+            values[f.name] = Parameters(*(tensors[f"{f.name}/{name}"] for name in Parameters._fields))
+    return TrainState(**values)
 
 
-def _map(function, *states: TrainState) -> TrainState:  # type: ignore[no-untyped-def]
+def _map(function: Callable[[list[torch.Tensor]], torch.Tensor], *states: TrainState) -> TrainState:
     flat = [tensors_of(s) for s in states]
     return state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})

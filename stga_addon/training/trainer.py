@@ -1,7 +1,5 @@
 """The training loop's body: one view in, one step of the splats out."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
@@ -10,9 +8,18 @@ from ..avatar.lattice import lattice_splats
 from ..avatar.splats import Splats
 from ..capture.model import Capture, View
 from ..raster.kernels.rows import distance_limit, scale_limit
-from ..raster.render import Parameters, Rendering, Scratch, camera_frames, render_backward, render_forward, touched_tiles
+from ..raster.render import (
+    Parameters,
+    Rendering,
+    Scratch,
+    camera_frames,
+    render_backward,
+    render_forward,
+    touched_tiles,
+)
 from . import adam
 from .density import control_density
+from .folder import Checkpoint
 from .frames import FrameStore
 from .losses import REACH, image_gradient, tile_rectangles, whole_image
 from .schedule import learning_rates, sh_degree, trains_globally
@@ -43,7 +50,12 @@ class Trainer:
         self._scratch = Scratch()
         self._background = np.array(settings.background, np.float32)
         self._lengths = _face_lengths(capture, settings.convention)
-        self._last_timestep: int | None = None
+        self.last_timestep: int | None = None
+
+    def continue_from(self, checkpoint: Checkpoint) -> None:
+        """Take over everything that a step depends on."""
+        self.state, self.iteration, self.visit = checkpoint.state, checkpoint.iteration, checkpoint.visit
+        self.last_timestep, self.initial_count = checkpoint.last_timestep, checkpoint.initial_count
 
     def step(self, view: View, target: np.ndarray, progress: float) -> float | None:
         """Train one view; target (H, W, 3) uint8; progress is the share of the budget spent.
@@ -51,8 +63,8 @@ class Trainer:
         Returns the image loss of a global iteration; a local one sees only part of the image and returns None.
         """
         settings, state = self.settings, self.state
-        self.visit += view.timestep != self._last_timestep
-        self._last_timestep = view.timestep
+        self.visit += view.timestep != self.last_timestep
+        self.last_timestep = view.timestep
         focus = None if trains_globally(settings, self.iteration, self.visit, progress) else self._focus(view.timestep)
         rows, screen, loss = self._differentiate(view, target, sh_degree(settings, progress), focus)
         self._limit(rows)
@@ -133,8 +145,8 @@ def initial_splats(capture: Capture, settings: Settings) -> Splats:
     )
     if not settings.seeds:
         return lattice
-    views = capture.views["train"]
-    views = [v for v in views if v.timestep == views[0].timestep]
+    first = capture.views["train"][0].timestep
+    views = [view for view in capture.views["train"] if view.timestep == first]
     seeds = hull_seeds(capture, views, settings.convention, settings.sh_degree)
     return Splats(*(np.concatenate([getattr(lattice, n), getattr(seeds, n)]) for n in vars(lattice)))
 
@@ -155,9 +167,4 @@ def _face_lengths(capture: Capture, convention: str) -> np.ndarray:
     """Length (F,) that limits are multiples of, in local units."""
     if convention == "gaussian_avatars":
         return np.ones(len(capture.faces), np.float32)
-    return np.sqrt(2 * face_areas(capture.neutral, capture.faces)).astype(np.float32)
-
-
-def with_state(trainer: Trainer, state: TrainState, iteration: int, visit: int) -> None:
-    """Continue from a checkpoint."""
-    trainer.state, trainer.iteration, trainer.visit = state, iteration, visit
+    return np.asarray(np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32)

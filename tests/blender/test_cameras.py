@@ -40,7 +40,7 @@ def camera(seed: int = 0, width: int = 550, height: int = 802, fl_y: float = 205
 
 
 def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:
-    """cameras: index -> its camera at timesteps 3, 4, …; images are small PNGs with the timestep as red, index as green."""
+    """cameras: index -> its camera at timesteps 3, 4, …; with an image for each."""
     views = []
     for index, row in cameras.items():
         for timestep, one in enumerate(row, start=3):
@@ -85,7 +85,7 @@ def assert_projects(camera_object, one: Camera) -> None:
 @pytest.mark.parametrize("fl_y", [2050.0, 1900.0, 2300.0])
 @pytest.mark.parametrize(("width", "height"), [(550, 802), (802, 550)])
 def test_projection_is_the_captures(tmp_path, width, height, fl_y):
-    """Fails when a shift has the wrong sign or unit, the sensor fits the wrong side, pixels are not square, or y is up."""
+    """Fails when a shift has the wrong sign or unit, the sensor fits the wrong side, or pixels' aspect is lost."""
     one = camera(1, width, height, fl_y)
     capture = capture_of(tmp_path, {0: [one]})
     (imported,) = import_cameras(capture, capture_root(tmp_path))

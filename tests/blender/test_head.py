@@ -29,7 +29,7 @@ def block_counts() -> dict[str, int]:
 
 
 def test_every_frame_shows_its_timestep(tmp_path):
-    """Fails when a key is off by a frame, when neighbours leak into a frame, or when gaps in the timesteps shift keys."""
+    """Fails when a key is off by a frame, neighbours leak into a frame, or gaps in the timesteps shift keys."""
     capture = mesh_capture(tmp_path, timesteps=(2, 3, 7, 8))
     head = import_head(capture)
     for timestep in capture.timesteps:
@@ -70,7 +70,7 @@ def test_the_capture_stands_upright(tmp_path):
 
 
 def test_faces_and_regions_keep_their_order(tmp_path):
-    """Fails when faces are re-ordered or turned (splats are bound to face number and first corner), or regions are lost."""
+    """Fails when faces are re-ordered or turned (splats hang on face number and first corner), or regions are lost."""
     capture = mesh_capture(tmp_path)
     mesh = import_head(capture).data
     assert [list(polygon.vertices) for polygon in mesh.polygons] == capture.faces.tolist()

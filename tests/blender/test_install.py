@@ -33,7 +33,7 @@ def zip_file(tmp_path_factory) -> Path:
 
 def run(script: str, *arguments: object, home: Path) -> str:
     """Output of a script in a Python with bpy and an empty Blender profile."""
-    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home), "PYTHONPATH": "", "PYTHONSAFEPATH": "1"}
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home)}
     command = [sys.executable, "-c", script, *map(str, arguments)]
     done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
@@ -102,7 +102,11 @@ class Bare(importlib.machinery.PathFinder):
 sys.meta_path = [Bare if finder is importlib.machinery.PathFinder else finder for finder in sys.meta_path]
 archive, capture, avatar = sys.argv[1:]
 result = {}
-assert bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True) == {"FINISHED"}
+commands = {}
+bpy.utils.register_cli_command = lambda name, handler: commands.setdefault(name, handler)
+bpy.utils.unregister_cli_command = lambda handler: commands.clear()
+bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+result["commands"] = sorted(commands)
 module = "bl_ext.user_default.stga"
 result["enabled"] = module in bpy.context.preferences.addons
 result["heavy"] = sorted({"torch", "numba", "trimesh", "tqdm"} & {name.split(".")[0] for name in sys.modules})
@@ -118,7 +122,8 @@ bpy.ops.stga.select(threshold=0.002)
 bpy.ops.stga.show_avatar(filepath=avatar)
 scene = bpy.context.scene
 scene.frame_set(scene.frame_end)
-shown = next(i.object.data for i in bpy.context.evaluated_depsgraph_get().object_instances if i.object.type == "POINTCLOUD")
+instances = bpy.context.evaluated_depsgraph_get().object_instances
+shown = next(instance.object.data for instance in instances if instance.object.type == "POINTCLOUD")
 xyz = [0.0] * 3 * len(shown.points)
 shown.attributes["position"].data.foreach_get("vector", xyz)
 result["frame"], result["xyz"] = scene.frame_current, xyz
@@ -133,7 +138,7 @@ bpy.ops.preferences.addon_enable(module=module)
 result["seconds"] = time.perf_counter() - start
 
 bpy.ops.preferences.addon_disable(module=module)
-result["left"] = [name for name in names if hasattr(bpy.types, "STGA_OT_" + name)]
+result["left"] = [*commands] + [name for name in names if hasattr(bpy.types, "STGA_OT_" + name)]
 index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
 folder = Path(bpy.context.preferences.extensions.repos[index].directory)
@@ -151,6 +156,7 @@ def test_install_use_and_uninstall(zip_file, shared_data, tmp_path):
     output = run(INSTALL, zip_file, folder, tmp_path / "a.npz", home=tmp_path)
     result = json.loads(next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix("RESULT "))
     assert result["enabled"]
+    assert result["commands"] == ["stga"]
     assert result["heavy"] == []
     assert result["missing"] == []
     assert len(result["tabs"]) == 4

@@ -162,7 +162,7 @@ def test_flame_capture_from_import_to_show(extension, tmp_path):
 @pytest.mark.parametrize("layout", ["mesh", "flame"])
 def test_training_in_process(extension, tmp_path, layout):
     """Catches a train step that does not reach the trainer with this capture, or whose result show cannot read."""
-    for package in ("torch", "numba"):
+    for package in ("torch", "numba", "PIL"):
         pytest.importorskip(package)
     if layout == "mesh":
         bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
@@ -171,6 +171,9 @@ def test_training_in_process(extension, tmp_path, layout):
         bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
     bpy.ops.stga.select(threshold=0.0005)
     assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6) == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="already holds a run"):
+        bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), resume=True) == {"FINISHED"}
     path = bpy.context.scene.stga.avatar
     assert bpy.ops.stga.show_avatar(filepath=path) == {"FINISHED"}
     assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(read_avatar(Path(path)).splats)
@@ -181,7 +184,7 @@ def test_training_without_torch_says_what_is_missing(extension, mesh_capture, tm
     bpy.ops.stga.import_capture(directory=str(mesh_capture))
     monkeypatch.setattr(extension.operators.train, "find_spec", lambda name: None)
     with pytest.raises(
-        RuntimeError, match=r"^Error: training needs torch and numba in Blender's own Python \(.*\): install"
+        RuntimeError, match=r"^Error: training needs torch, numba, pillow in Blender's own Python \(.*\): install"
     ):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
     assert not (tmp_path / "run").exists()

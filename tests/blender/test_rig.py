@@ -102,7 +102,8 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
 
     def frame(timestep: int):
         still = replace(sequence.frame(0), expr=np.zeros(model.n_expression))
-        return replace(still, rotation=np.array([0, 0.6 * timestep, 0]))
+        wrapped = (0.6 * timestep + np.pi) % (2 * np.pi) - np.pi  # as trackers write it: jumps from π to -π
+        return replace(still, rotation=np.array([0, wrapped, 0]))
 
     turning = replace(sequence, frame=frame)
     head = import_motion(turning, source)

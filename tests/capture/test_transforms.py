@@ -86,6 +86,18 @@ def test_cameras_are_numbered_alike_in_all_splits(tmp_path: Path) -> None:
         assert where == {"train": {0, 1}, "val": {2}, "test": {0, 1, 2}}
 
 
+def test_camera_is_known_by_where_it_stands(tmp_path: Path) -> None:
+    """Catches one camera taken for two because of the sign of a zero or the last digits of its pose."""
+    frames = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(1, 1)]
+    matrix = np.array(frames[1]["transform_matrix"])
+    matrix[:3] -= 1e-9
+    frames[1]["transform_matrix"] = matrix.tolist()
+    for entry in frames:
+        del entry["camera_index"], entry["camera_id"]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    assert [frame.view.camera_index for frame in read_splits(tmp_path).frames] == [0, 0, 1]
+
+
 def test_single_file_is_all_training(tmp_path: Path) -> None:
     """Catches frames lost, or split by guesswork, where a capture has transforms.json alone."""
     frames = [factory.frame(0, camera) for camera in range(3)]

@@ -57,9 +57,9 @@ def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, backgr
 
     tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int32 into the pair
     list; pair_splat (P,) int32 front to back in each tile; projected (N, 9); extent_y (N,) pixels.
-    background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept because the backward
-    needs its small values exactly), and last (H, W) int32: one past the last contributing pair of the tile,
-    counted from the tile's start.
+    background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept
+    because the backward needs its small values exactly), and last (H, W) int32: one past the last contributing pair
+    of the tile, counted from the tile's start.
     """
     height, width = last.shape
     for k in prange(len(tiles)):
@@ -117,8 +117,9 @@ def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, backgr
 
 @parallel_jit
 def blend_backward(
-    tiles, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last, v_image, v_transmittance, grads
-):
+    tiles, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last,
+    v_image, v_transmittance, grads,
+):  # fmt: skip
     """Gradient of every wanted (tile, splat) pair of the listed tiles.
 
     wanted (N,) bool: splats whose gradient is needed. pair_slot (P,) int32: where a pair's gradient goes in

@@ -86,7 +86,7 @@ def _basis_gradient(degree, x, y, z, w):
 @parallel_jit
 def project_forward(
     xyz, rotation, log_scale, opacity, sh, degree, face, origin, matrix, to_world, lens, size, depth_as_colour,
-    projected, depth, extent, rect,
+    projected, depth, extent_y, rect,
 ):  # fmt: skip
     """Project N embedded splats.
 
@@ -94,7 +94,7 @@ def project_forward(
     origin (F, 3), matrix (F, 3, 3): camera-space frames, scale included: camera point = matrix @ xyz + origin.
     to_world (3, 3): camera to world rotation. lens (4,): fl_x, fl_y, cx, cy. size (2,): width, height.
     depth_as_colour: blend (z, 0, 0) instead of the colour.
-    Writes projected (N, 9), depth (N,), extent (N, 2) half axes in pixels up to α = 1/255, and rect (N, 4) int32
+    Writes projected (N, 9), depth (N,), extent_y (N,) half height in pixels up to α = 1/255, and rect (N, 4) int32
     tile bounds x0, y0, x1, y1, empty (x1 ≤ x0) for a splat that cannot be seen or is not finite.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -169,7 +169,7 @@ def project_forward(
                     continue
             rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3] = x0, y0, x1, y1
             depth[i] = z
-            extent[i, 0], extent[i, 1] = ex, ey
+            extent_y[i] = ey
             projected[i, MEAN_X], projected[i, MEAN_Y] = mean_x, mean_y
             projected[i, CONIC_A], projected[i, CONIC_B], projected[i, CONIC_C] = yy / det, -xy / det, xx / det
             projected[i, OPACITY] = visible
@@ -251,8 +251,16 @@ def project_backward(
             e10, e11 = q * va + r * vb, q * vb + r * vc
             vxx, vxy, vyy = -(e00 * p + e01 * q), -(e00 * q + e01 * r), -(e10 * q + e11 * r)
             # covariance = A·Aᵀ
-            b00, b01, b02 = (TWO * (vxx * a00 + vxy * a10), TWO * (vxx * a01 + vxy * a11), TWO * (vxx * a02 + vxy * a12))
-            b10, b11, b12 = (TWO * (vxy * a00 + vyy * a10), TWO * (vxy * a01 + vyy * a11), TWO * (vxy * a02 + vyy * a12))
+            b00, b01, b02 = (
+                TWO * (vxx * a00 + vxy * a10),
+                TWO * (vxx * a01 + vxy * a11),
+                TWO * (vxx * a02 + vxy * a12),
+            )
+            b10, b11, b12 = (
+                TWO * (vxy * a00 + vyy * a10),
+                TWO * (vxy * a01 + vyy * a11),
+                TWO * (vxy * a02 + vyy * a12),
+            )
             v_log_scale[i, 0] += b00 * a00 + b10 * a10
             v_log_scale[i, 1] += b01 * a01 + b11 * a11
             v_log_scale[i, 2] += b02 * a02 + b12 * a12

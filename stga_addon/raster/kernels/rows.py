@@ -26,7 +26,7 @@ def adam_rows(rows, parameter, gradient, first, second, steps, rate, beta1, beta
             sound = ZERO
             for c in range(width):
                 sound += gradient[i, c] * ZERO
-            if not sound == ZERO:
+            if sound != ZERO:
                 continue
             count = np.float64(steps[i])
             correct1 = np.float32(1.0 / (1.0 - math.exp(count * log1)))
