@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from .paint import paint
 DENSITY = 4  # rows and columns of the pictured head for each of the tracked one
 STRANDS = 0.0012  # metres of relief in the hair that the tracker does not see
 DISTANCE, AIM = 1.05, np.array([0.0, -0.012, -0.010])
-FOCAL = 4.0  # image widths
+FOCAL = 3.7  # image widths
 OFF_CENTRE = np.array([0.031, -0.022])  # principal point off the image centre, in image widths
 
 # Strong actions, so that every region moves somewhere in training; the jaw's opening is in radians.
@@ -74,9 +75,7 @@ def make_capture(
     """
     options = options or CaptureOptions()
     if min(options.train, options.test) < 1 or options.cameras < 2 or min(options.width, options.height) < 16:
-        raise StgaError(
-            f"demo capture: {options} is too small, expected a timestep to train, one to test, two cameras and 16 pixels"
-        )
+        raise StgaError(f"demo capture: {options} is too small, expected 1 + 1 timesteps, 2 cameras and 16 pixels")
     from ..scene.studio import Sitter, photograph
 
     folder = Path(folder)
@@ -208,7 +207,7 @@ def _write_transforms(folder: Path, cameras: list[Camera], options: CaptureOptio
     write_json(folder / "transforms.json", {**shared, "frames": entries})
 
 
-def _entry(timestep: int, index: int, camera: Camera) -> dict[str, object]:
+def _entry(timestep: int, index: int, camera: Camera) -> dict[str, Any]:
     name = f"{timestep:05d}_{index:02d}.png"
     return {
         "timestep_index": timestep,

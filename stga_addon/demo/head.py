@@ -299,7 +299,7 @@ def _split(quads: np.ndarray, at: np.ndarray) -> np.ndarray:
     short = np.linalg.norm(at[a] - at[c], axis=1) <= np.linalg.norm(at[b] - at[d], axis=1) + 1e-9
     first = np.where(short, [a, b, c], [a, b, d])
     second = np.where(short, [a, c, d], [b, c, d])
-    return np.stack([first, second], 1).transpose(2, 1, 0).reshape(-1, 3)
+    return np.asarray(np.stack([first, second], 1).transpose(2, 1, 0).reshape(-1, 3))
 
 
 def _whole(faces: np.ndarray) -> np.ndarray:

@@ -75,10 +75,8 @@ def _eye(at: np.ndarray, iris: np.ndarray) -> np.ndarray:
     radius = np.where(away[:, 2] > 0, np.hypot(away[:, 0], away[:, 1]), EYE_RADIUS)
     spokes = 1 + 0.3 * np.sin(12 * np.arctan2(away[:, 1], away[:, 0]))
     tint = np.tile([0.78, 0.74, 0.70], (len(at), 1))
-    tint = (
-        _mix(tint, iris, np.clip((LIMBUS - radius) / 0.0009 + 0.5, 0, 1))
-        * np.where(radius < LIMBUS, spokes, 1)[:, None]
-    )
+    tint = _mix(tint, iris, np.clip((LIMBUS - radius) / 0.0009 + 0.5, 0, 1))
+    tint *= np.where(radius < LIMBUS, spokes, 1)[:, None]
     return _mix(tint, np.full(3, 0.004), np.clip((PUPIL - radius) / 0.0006 + 0.5, 0, 1))
 
 

@@ -1,5 +1,7 @@
 """A photo studio in Blender: path-traced pictures of a moving mesh from calibrated cameras."""
 
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -42,9 +44,10 @@ def photograph(
     samples: int,
     seed: int = 0,
 ) -> None:
-    """Path-trace every pose (V, 3) from every camera; `keep(pose, camera, rgba)` gets (H, W, 4) uint8, sRGB, straight alpha.
+    """Path-trace every pose (V, 3) from every camera, one after the other.
 
-    Works in a scene of its own with Cycles on the CPU and leaves the open file as it was. All cameras share one size.
+    `keep(pose, camera, rgba)` gets each picture: (H, W, 4) uint8, sRGB, straight alpha. Works in a scene of its own
+    with Cycles on the CPU and leaves the open file as it was. All cameras share one size.
     """
     with _studio(sitter, samples, seed) as (scene, head, camera), TemporaryDirectory() as folder:
         for index, vertices in enumerate(poses):
@@ -70,15 +73,31 @@ def _render(scene: bpy.types.Scene, path: Path) -> np.ndarray:
     from PIL import Image
 
     scene.render.filepath = str(path)
-    bpy.ops.render.render(write_still=True, scene=scene.name)
+    with _silent():
+        bpy.ops.render.render(write_still=True, scene=scene.name)
     with Image.open(path) as image:
         return np.asarray(image.convert("RGBA")).copy()
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Blender announces every saved picture on the process's standard output, in between our own progress bar."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 @contextmanager
 def _studio(
     sitter: Sitter, samples: int, seed: int
 ) -> Iterator[tuple[bpy.types.Scene, bpy.types.Object, bpy.types.Object]]:
+    """A scene with the sitter and a camera; everything made for it is gone when the block ends."""
     kinds = ("scenes", "worlds", "lights", "cameras", "meshes", "materials", "objects")
     before = {kind: set(getattr(bpy.data, kind)) for kind in kinds}
     try:

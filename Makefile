@@ -1,0 +1,30 @@
+# Everything runs in .venv, which the first target that needs it makes from pyproject.toml.
+PYTHON ?= python3.11
+BIN := .venv/bin
+
+.PHONY: demo test test-fast lint zip clean
+
+demo: .venv/ready
+	$(BIN)/python -m stga_addon demo --out out/demo
+
+test: lint
+	$(BIN)/python -m pytest
+
+test-fast: .venv/ready
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+zip: .venv/ready
+	$(BIN)/python -m stga_addon.package --out dist
+
+.venv/ready: pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv build dist out wheels *.egg-info
