@@ -22,6 +22,11 @@ class ShowAvatar(bpy.types.Operator):
     filepath: bpy.props.StringProperty(
         name="Avatar", description="Avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
     )
+    hide_head: bpy.props.BoolProperty(
+        name="Hide Head",
+        description="Hide the head's own mesh, which covers the splats; it still moves them",
+        default=True,
+    )
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
 
     @classmethod
@@ -36,9 +41,13 @@ class ShowAvatar(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        path = file_path(self.filepath, "avatar")
+        path, head = file_path(self.filepath, "avatar"), head_of(context)
         avatar = read_avatar(path)
-        shown = show_avatar(avatar, head_of(context), f"{path.stem} splats")
+        shown = show_avatar(avatar, head, f"{head.name} {path.stem}")
+        if self.hide_head:
+            head.hide_render = True
+            if context.view_layer.objects.get(head.name) is head:
+                head.hide_set(True)
         settings(context).avatar, settings(context).splats = self.filepath, shown
         hint = view_transform_hint(context.scene)
         self.report({"WARNING" if hint else "INFO"}, f"{len(avatar.splats)} splats" + (f". {hint}" if hint else ""))

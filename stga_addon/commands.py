@@ -20,6 +20,7 @@ from .selection import SelectionOptions, select_capture
 def train(options: Namespace) -> None:
     """Train, or continue, a run."""
     from .training.folder import Run, read_run
+    from .training.progress import ProgressBar
     from .training.run import train as train_run
 
     changes: dict[str, Any] = {"seed": options.seed}
@@ -32,7 +33,7 @@ def train(options: Namespace) -> None:
     for warning in capture.warnings:
         print(f"warning: {warning}")
     assert isinstance(run, Run)
-    with _ProgressBar() as bar:
+    with ProgressBar() as bar:
         avatar = train_run(capture, options.out, run, resume=options.resume, report=bar.report)
     print(f"avatar: {avatar}")
 
@@ -52,29 +53,6 @@ def _new_run(options: Namespace, changes: dict[str, Any]) -> Any:
     flame = None if options.flame is None else options.flame.resolve()
     settings = make_settings(schedule=options.schedule, **changes)
     return Run(options.capture.resolve(), flame, options.principal_point, settings)
-
-
-class _ProgressBar:
-    """tqdm over the share of the budget, with the figures a person wants beside it."""
-
-    def __enter__(self) -> "_ProgressBar":
-        from tqdm import tqdm
-
-        layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
-        self._bar = tqdm(total=1.0, bar_format=layout, mininterval=0.5, dynamic_ncols=True)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def report(self, progress: Any) -> bool:
-        self._bar.set_description(progress.message, refresh=bool(progress.iteration == 0))
-        psnr = "" if progress.psnr is None else f", PSNR {progress.psnr:.2f}"
-        if progress.iteration:
-            figures = f"{progress.per_second:.1f} it/s, loss {progress.loss:.4f}{psnr}, {progress.splats} splats"
-            self._bar.set_postfix_str(figures, refresh=False)
-        self._bar.update(progress.share - self._bar.n)
-        return False
 
 
 def render(options: Namespace) -> None:

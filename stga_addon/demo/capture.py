@@ -59,7 +59,7 @@ class CaptureOptions:
     cameras: int = 8
     width: int = 200
     height: int = 280
-    samples: int = 12
+    samples: int = 8
 
 
 def make_capture(

@@ -333,6 +333,11 @@ def _curve(at: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     )
 
 
+def _sideways(x: np.ndarray) -> np.ndarray:
+    """-1 on the person's right, 1 on the left, and no jump in the middle."""
+    return np.asarray(np.clip(x / 0.004, -1, 1))
+
+
 def _bump(skin_x: np.ndarray, skin_y: np.ndarray, at: tuple[float, float], size: tuple[float, float]) -> np.ndarray:
     """A Gaussian in the face's plane."""
     return np.asarray(np.exp(-(((skin_x - at[0]) / size[0]) ** 2) - ((skin_y - at[1]) / size[1]) ** 2))
@@ -376,7 +381,7 @@ def _features(skin: Skin) -> np.ndarray:
     relief += _lips(side, skin)
     ear = _bump(z, y, (-0.020, 0.006), (0.011, 0.027)) * (1 - 0.55 * _bump(z, y, (-0.014, 0.008), (0.006, 0.014)))
     ear *= _smooth(abs(np.sin(skin.angle)), 0.75, 0.95)
-    out = np.stack([x + np.sign(x) * 0.019 * ear, y, z + face * relief - 0.010 * ear], 1)
+    out = np.stack([x + _sideways(x) * 0.019 * ear, y, z + face * relief - 0.010 * ear], 1)
     return np.asarray(out)
 
 
@@ -501,17 +506,17 @@ def _identity(skin: Skin) -> list[np.ndarray]:
         _vector(skin, y=0.035 * (y - EYE[1])),
         _vector(skin, x=0.075 * x * _smooth(-y, 0.025, 0.075) * _smooth(y, -0.13, -0.09)),
         _vector(skin, z=0.0035 * nose, y=-0.0012 * nose),
-        _vector(skin, x=np.sign(x) * 0.0022 * cheek, z=0.0026 * cheek),
+        _vector(skin, x=_sideways(x) * 0.0022 * cheek, z=0.0026 * cheek),
         _vector(skin, z=0.0018 * lips, y=np.where(skin.above_mouth >= 0, 0.0005, -0.0006) * lips),
         _vector(skin, z=0.0024 * front * _bump(side, y, (0.0, 0.056), (0.05, 0.022))),
         _vector(skin, z=0.0036 * chin, y=-0.0024 * chin),
         _vector(skin, x=0.10 * x * front * _bump(side, y, (0.012, -0.022), (0.010, 0.010))),
-        _vector(skin, x=np.sign(x) * 0.0045 * ears),
+        _vector(skin, x=_sideways(x) * 0.0045 * ears),
     ]
 
 
 def _expressions(skin: Skin) -> list[np.ndarray]:
-    x, y, side, sign = skin.x, skin.y, abs(skin.x), np.sign(skin.x)
+    x, y, side, sign = skin.x, skin.y, abs(skin.x), _sideways(skin.x)
     front = _smooth(skin.z, 0.0, 0.045)
     corner = front * _bump(side, y, (0.025, MOUTH[1]), (0.014, 0.017))
     cheek = front * _bump(side, y, (0.040, -0.018), (0.017, 0.016))
@@ -583,7 +588,7 @@ def _correctives(skin: Skin) -> np.ndarray:
     side = abs(skin.x)
     cheek = _smooth(skin.z, 0.0, 0.04) * _bump(side, skin.y, (0.044, -0.040), (0.018, 0.022))
     throat = _smooth(skin.z, -0.03, 0.01) * _bump(side, skin.y, (0.0, -0.115), (0.035, 0.016))
-    out[:, 0, 9 + sine] = -np.sign(skin.x) * 0.006 * cheek
+    out[:, 0, 9 + sine] = -_sideways(skin.x) * 0.006 * cheek
     out[:, 2, 9 + sine] = -0.004 * cheek
     out[:, 2, 0 + sine] = -0.006 * throat
     return out
@@ -619,7 +624,7 @@ def _masks(grid: _Grid, pieces: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     neck = (y < -0.100) | ((y < -0.06) & (skin.z < -0.02))
     regions = {
         "lips": lips,
-        "nose": front & (side < 0.020) & (y > -0.033) & (y < 0.016),
+        "nose": front & (side < 0.020) & (y > -0.033) & (y < 0.016) & ~eye & ~lips,
         "eye_region": eye,
         "left_eye_region": eye & (x > 0),
         "right_eye_region": eye & (x < 0),

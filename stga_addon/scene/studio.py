@@ -129,7 +129,8 @@ def _scene(samples: int, seed: int) -> bpy.types.Scene:
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
     scene.view_settings.view_transform = "Standard"
     world = bpy.data.worlds.new("studio")
-    world.use_nodes = True
+    if world.node_tree is None:  # Blender 4: a new world has no tree
+        world.use_nodes = True
     background = world.node_tree.nodes["Background"]
     background.inputs["Color"].default_value = (1, 1, 1, 1)
     background.inputs["Strength"].default_value = AMBIENT
@@ -168,7 +169,8 @@ def _head(scene: bpy.types.Scene, sitter: Sitter) -> bpy.types.Object:
 def _surface() -> bpy.types.Material:
     """Tint times fine noise, and pores as bumps, both fixed to the rest position and faded by `grain`."""
     material = bpy.data.materials.new("sitter")
-    material.use_nodes = True
+    if material.node_tree is None:  # Blender 4: a new material has no tree
+        material.use_nodes = True
     nodes, link = material.node_tree.nodes, material.node_tree.links.new
     surface = nodes["Principled BSDF"]
 

@@ -270,6 +270,20 @@ def test_standard_view(extension):
     assert bpy.context.scene.view_settings.view_transform == "Standard"
 
 
+def test_a_hidden_head_still_moves_its_splats(extension, mesh_capture, tmp_path):
+    """Catches splats that stand still once the mesh below them is hidden, as show does: first where the frame changes."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene, capture = bpy.context.scene, open_capture(mesh_capture)
+    assert scene.stga.head.hide_render
+    assert not scene.stga.head.visible_get()
+    for timestep in (3, 0, 1):
+        scene.frame_set(timestep)
+        xyz, _, _ = evaluated_splats(scene.stga.splats)
+        np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
+
+
 def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     """Catches the two sides of the vertex groups' name and weight drifting apart: Python writes, nodes read."""
     bpy.ops.stga.import_capture(directory=str(mesh_capture))

@@ -19,10 +19,11 @@ bpy = pytest.importorskip("bpy", reason="bpy is not installed")
 TINY = CaptureOptions(train=2, test=1, cameras=3, width=72, height=96, samples=1)
 
 
+KINDS = ("scenes", "objects", "meshes", "materials", "worlds", "lights", "cameras")
+
+
 def _counts() -> dict[str, int]:
-    return {
-        kind: len(getattr(bpy.data, kind)) for kind in ("scenes", "objects", "meshes", "materials", "worlds", "lights")
-    }
+    return {kind: len(getattr(bpy.data, kind)) for kind in KINDS}
 
 
 @pytest.fixture(scope="module")

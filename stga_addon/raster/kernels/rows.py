@@ -12,31 +12,40 @@ CHUNK = 256
 
 
 @parallel_jit
-def adam_rows(rows, parameter, gradient, first, second, steps, rate, beta1, beta2, epsilon):
-    """One Adam step on the listed rows (M,) of parameter (N, D), with each row's own step count for bias correction.
+def count_steps(rows, steps, correct1, correct2, beta1, beta2):
+    """Count a step of each listed row (M,) in steps (N,) int32 and write its two bias corrections (M,)."""
+    log1, log2 = math.log(beta1), math.log(beta2)
+    for n in prange(len(rows)):
+        steps[rows[n]] += 1
+        count = np.float64(steps[rows[n]])
+        correct1[n] = 1.0 / (1.0 - math.exp(count * log1))
+        correct2[n] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
 
-    steps (N,) int32 count this step already. Rows that are not listed are not touched: neither parameter nor
-    moments. A row whose gradient is not finite keeps its values.
+
+@parallel_jit
+def adam_rows(rows, parameter, gradient, first, second, correct1, correct2, rates, beta1, beta2, epsilon):
+    """One Adam step on the listed rows (M,) of parameter (N, D), with each row's own bias corrections (M,).
+
+    rates (D,): learning rate by column. Rows that are not listed are not touched: neither parameter nor moments.
+    A row whose gradient is not finite keeps its values.
     """
     width = parameter.shape[1]
-    log1, log2 = math.log(beta1), math.log(beta2)
     for block in prange((len(rows) + CHUNK - 1) // CHUNK):
         for n in range(block * CHUNK, min(len(rows), (block + 1) * CHUNK)):
             i = rows[n]
-            sound = ZERO
+            unsound = ZERO
             for c in range(width):
-                sound += gradient[i, c] * ZERO
-            if sound != ZERO:
+                unsound += gradient[i, c] * ZERO
+            if unsound != ZERO:
                 continue
-            count = np.float64(steps[i])
-            correct1 = np.float32(1.0 / (1.0 - math.exp(count * log1)))
-            correct2 = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
+            scale1, scale2 = correct1[n], correct2[n]
             for c in range(width):
                 g = gradient[i, c]
                 m = beta1 * first[i, c] + (ONE - beta1) * g
                 v = beta2 * second[i, c] + (ONE - beta2) * g * g
-                first[i, c], second[i, c] = m, v
-                parameter[i, c] -= rate * m * correct1 / (math.sqrt(v) * correct2 + epsilon)
+                first[i, c] = m
+                second[i, c] = v
+                parameter[i, c] -= rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
 
 
 @jit

@@ -1,0 +1,137 @@
+"""The whole chain on a synthetic capture: what a new user sees first, and what proves that everything works."""
+
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from ..avatar.embedding import face_frames, to_world
+from ..avatar.file import Avatar, read_avatar
+from ..capture.images import read_image
+from ..capture.model import Capture
+from ..capture.open import open_capture
+from ..errors import StgaError
+from ..files import replacing, write_json
+from ..raster.draw import draw_avatar
+from ..raster.pictures import selection_picture, side_by_side, to_bytes
+from ..selection import SelectionOptions, select_capture
+from ..training.folder import Run
+from ..training.metrics import evaluate
+from ..training.progress import ProgressBar
+from ..training.run import train
+from ..training.settings import make_settings
+from .capture import make_capture
+
+SEED = 0
+TOLERANCE = 1e-5
+"""Metres between where Blender puts a splat and where numpy does."""
+
+
+def run_demo(out: Path, seconds: float) -> None:
+    """Make a capture of a synthetic head, import, select, train and show it in Blender, and picture the result.
+
+    Leaves avatar.npz, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's bpy.
+    Raises StgaError where the folder cannot be written or Blender's splats do not stand where they should.
+    """
+    begin = perf_counter()
+    folder = out / "capture"
+    with tqdm(desc="path-tracing the capture", unit="image") as bar:
+        model = make_capture(folder, SEED, progress=lambda done, total: _advance(bar, done, total))
+    capture = open_capture(folder, model)
+    head, selection = _import_and_select(capture)
+    avatar = _train(capture, model, out, seconds, selection)
+    error = _show(capture, avatar, head, out / "demo.blend")
+    _picture(capture, avatar, selection, out)
+    metrics = _measure(capture, avatar)
+    write_json(out / "metrics.json", {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error})
+    for split, values in metrics.items():
+        print(f"{split}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
+    print(f"Blender places the splats within {error:.1e} m of numpy")
+    print(f"{out}: avatar.npz, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
+
+
+def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
+    bar.total = total
+    bar.update(done - bar.n)
+
+
+def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
+    """A Blender scene with head, cameras and one vertex group a frame; the selection as Blender gives it back."""
+    from ..scene.cameras import configure_scene, import_cameras
+    from ..scene.file import current_scene, new_file
+    from ..scene.groups import read_selection, write_selection
+    from ..scene.head import import_head
+    from ..scene.hierarchy import capture_root
+
+    new_file()
+    head = import_head(capture)
+    cameras = import_cameras(capture, capture_root(capture.root))
+    configure_scene(current_scene(), capture, cameras[len(cameras) // 2])
+    write_selection(head, select_capture(capture, SelectionOptions()))
+    return head, read_selection(head)
+
+
+def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
+    run = Run(capture.root, model.resolve(), "vhap", make_settings(seconds=seconds, seed=SEED))
+    folder = out / "run"
+    if (folder / "run.json").exists():
+        (folder / "run.json").unlink()  # the demo always starts anew
+    with ProgressBar() as bar:
+        path = train(capture, folder, run, selection, report=bar.report)
+    avatar = read_avatar(path)
+    with replacing(out / "avatar.npz") as partial:
+        partial.write_bytes(path.read_bytes())
+    return avatar
+
+
+def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
+    """Show the avatar, save, reopen, and return how far (metres) a splat is from where numpy puts it, at worst."""
+    from ..scene.file import go_to_frame, object_named, open_file, save_file
+    from ..scene.splats import evaluated_splats, show_avatar
+
+    shown = show_avatar(avatar, head)
+    name = shown.name
+    go_to_frame(capture.timesteps[0])
+    save_file(path)
+    open_file(path)
+    worst = 0.0
+    for timestep in capture.timesteps:
+        go_to_frame(timestep)
+        frames = face_frames(capture.mesh(timestep), avatar.faces, avatar.neutral, avatar.convention)
+        expected = to_world(avatar.splats, frames).xyz
+        worst = max(worst, float(np.abs(evaluated_splats(object_named(name))[0] - expected).max()))
+    if worst > TOLERANCE:
+        raise StgaError(f"{path}: a splat stands {worst:.1e} m from where it should, more than {TOLERANCE:g} m")
+    return worst
+
+
+def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], out: Path) -> None:
+    """comparison.png: ground truth beside rendering, held-out view and unseen expression; selection.png: the frame
+    that selects most."""
+    views = [capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]]
+    rows = []
+    for view in views:
+        image = draw_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
+        rows.append([read_image(view), to_bytes(image)])
+    _save(out / "comparison.png", side_by_side([[picture for row in rows for picture in row]]))
+    busiest = max((view for view in capture.views["val"]), key=lambda view: selection[view.timestep].sum())
+    faces = selection[busiest.timestep]
+    picture = selection_picture(avatar, capture.mesh(busiest.timestep), busiest.camera, faces)
+    _save(out / "selection.png", to_bytes(picture))
+
+
+def _save(path: Path, pixels: np.ndarray) -> None:
+    with replacing(path) as partial:
+        Image.fromarray(pixels).save(partial, format="PNG")
+
+
+def _measure(capture: Capture, avatar: Avatar) -> dict[str, dict[str, float]]:
+    return {
+        split: evaluate(
+            lambda view: draw_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
+            capture.views[split],
+        ).as_json()
+        for split in ("val", "test")
+    }

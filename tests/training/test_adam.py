@@ -1,0 +1,127 @@
+"""Adam with true freezing against torch's Adam, which counts steps per tensor: here one tensor a row."""
+
+import numpy as np
+import pytest
+import torch
+
+from stga_addon.training import adam
+from stga_addon.training.state import TrainState, new_state
+
+from .toys import bits, random_splats, random_state
+
+RATES = {"xyz": 1e-3, "rotation": 5e-3, "log_scale": 2e-2, "opacity": 5e-2, "sh": 1e-2, "sh_rest": 1e-3}
+
+
+def set_gradients(state: TrainState, rng: np.random.Generator, scale: float = 1.0) -> None:
+    for tensor in state.gradients:
+        tensor.copy_(torch.from_numpy(rng.normal(0, scale, tensor.shape)))
+
+
+def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
+    """Each row's parameters as float64 tensors of their own; the view-dependent colour apart."""
+    rows = []
+    for n in range(len(state)):
+        row = {name: t[n].double().clone() for name, t in state.parameters._asdict().items()}
+        row["sh"], row["sh_rest"] = row["sh"][:1].clone(), row["sh"][1:].clone()
+        rows.append({name: value.requires_grad_() for name, value in row.items()})
+    return rows
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_row_is_torchs_adam_with_its_own_history(seed: int) -> None:
+    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, and ε in a wrong place."""
+    state = new_state(random_splats(6, 4, seed))
+    rng = np.random.default_rng(seed)
+    rows = separate_rows(state)
+    groups = [{"params": [row[name] for row in rows], "lr": rate} for name, rate in RATES.items()]
+    theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    for _ in range(60):
+        listed = np.flatnonzero(rng.random(6) < [1, 0.7, 0.5, 0.3, 0.1, 0.0]).astype(np.int32)
+        # Sizes over many orders of magnitude: those of real gradients are 1e-8 to 1e-3.
+        set_gradients(state, rng, 10 ** rng.uniform(-8, 0))
+        for n, row in enumerate(rows):
+            for name, value in row.items():
+                gradient = getattr(state.gradients, name.removesuffix("_rest"))[n].double()
+                if name.startswith("sh"):
+                    gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
+                value.grad = gradient.clone() if n in listed else None
+        theirs.step()
+        adam.step(state, listed, RATES)
+    for n, row in enumerate(rows):
+        for name in ("xyz", "rotation", "log_scale", "opacity"):
+            # 60 float32 steps of at most the rate each
+            np.testing.assert_allclose(
+                getattr(state.parameters, name)[n], row[name].detach(), rtol=1e-5, atol=60 * RATES[name] * 1e-5
+            )
+        colour = torch.cat([row["sh"], row["sh_rest"]]).detach()
+        np.testing.assert_allclose(state.parameters.sh[n], colour, rtol=1e-5, atol=60 * RATES["sh"] * 1e-5)
+
+
+def test_frozen_rows_keep_every_bit() -> None:
+    """Catches anything at all happening to rows that are not listed, also where their gradients are large or NaN."""
+    state = random_state(40, 7)
+    state.gradients.xyz[3] = torch.nan
+    state.parameters.xyz[5] = torch.tensor([torch.nan, -0.0, 1e-42])
+    before = bits(state)
+    listed = np.array([0, 7, 21, 39], np.int32)
+    for _ in range(5):
+        adam.step(state, listed, RATES)
+    after = bits(state)
+    frozen = np.setdiff1d(np.arange(40), listed)
+    for name in before:
+        np.testing.assert_array_equal(after[name][frozen], before[name][frozen], err_msg=name)
+    moved = [name for name in before if (after[name][listed] != before[name][listed]).any(axis=1).all()]
+    trained = [f"{part}/{name}" for part in ("parameters", "first", "second") for name in state.parameters._fields]
+    assert set(trained) | {"steps"} == set(moved)
+
+
+def test_first_step_after_the_others_many() -> None:
+    """Catches bias correction by a common count: Adam's first step is the rate exactly, however late it comes."""
+    state = new_state(random_splats(2, 4))
+    rng = np.random.default_rng(0)
+    others = np.array([0], np.int32)
+    for _ in range(500):
+        adam.step(state, others, RATES)
+    state.steps[0] = 10_000
+    set_gradients(state, rng)
+    before = {name: t.clone() for name, t in state.parameters._asdict().items()}
+    adam.step(state, np.array([0, 1], np.int32), RATES)
+    assert state.steps.tolist() == [10_001, 1]
+    for name in ("xyz", "rotation", "log_scale", "opacity"):
+        moved = (getattr(state.parameters, name) - before[name])[1]
+        expected = -RATES[name] * getattr(state.gradients, name)[1].sign()
+        np.testing.assert_allclose(moved, expected, rtol=1e-3, atol=1e-7)
+    rate = np.array([RATES["sh"], *[RATES["sh_rest"]] * 3])[:, None]
+    np.testing.assert_allclose(
+        (state.parameters.sh - before["sh"])[1], -rate * state.gradients.sh[1].sign().numpy(), rtol=1e-3
+    )
+    # Row 0 has no history but zeros and a full count: (0.1·g) / (√0.001·|g|), corrected by 10,001 steps.
+    expected = -RATES["opacity"] * 0.1 / np.sqrt(0.001 / (1 - 0.999**10_001)) * float(state.gradients.opacity[0].sign())
+    assert float(state.parameters.opacity[0] - before["opacity"][0]) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
+    """Catches one NaN from a degenerate view spreading into parameters or moments, where it would stay for ever."""
+    state = random_state(4, 3)
+    before = bits(state)
+    state.gradients.log_scale[1, 2] = bad
+    state.gradients.sh[2, 3, 1] = bad
+    adam.step(state, np.arange(4, dtype=np.int32), RATES)
+    after = bits(state)
+    for part in ("parameters", "first", "second"):
+        np.testing.assert_array_equal(after[f"{part}/log_scale"][1], before[f"{part}/log_scale"][1])
+        rest = slice(12, None)  # bytes after the first coefficient's three floats
+        np.testing.assert_array_equal(after[f"{part}/sh"][2, rest], before[f"{part}/sh"][2, rest])
+        for row in (0, 2, 3):
+            assert (after[f"{part}/log_scale"][row] != before[f"{part}/log_scale"][row]).any()
+    assert all(torch.isfinite(t).all() for p in (state.parameters, state.first, state.second) for t in p)
+
+
+def test_no_rows() -> None:
+    """Catches a local iteration in which no selected splat is visible."""
+    state = random_state(4, 3)
+    before = bits(state)
+    adam.step(state, np.zeros(0, np.int32), RATES)
+    for name, value in bits(state).items():
+        np.testing.assert_array_equal(value, before[name])

@@ -1,0 +1,94 @@
+"""The limits that keep a splat near what it covers, against autograd of their formulas; stray resets."""
+
+import numpy as np
+import pytest
+import torch
+
+from stga_addon.raster.kernels.rows import distance_limit, scale_limit
+from stga_addon.training.trainer import reset_strays
+
+from .toys import bits, random_splats, random_state
+
+FACES, WEIGHT = 5, 0.7
+
+
+@pytest.fixture(params=range(3))
+def scene(request: pytest.FixtureRequest):
+    """Splats about half of which are over their limits, rows that leave some out, and limits per triangle."""
+    splats = random_splats(50, FACES, request.param)
+    rng = np.random.default_rng(request.param)
+    rows = np.flatnonzero(rng.random(50) < 0.7).astype(np.int32)
+    limit = rng.uniform(0.5, 1.5, FACES).astype(np.float32)
+    return splats, rows, limit
+
+
+def expected(values: np.ndarray, size, splats, rows, limit) -> tuple[float, np.ndarray]:
+    x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    bound = rows[~splats.loose[rows]]
+    of = torch.tensor(limit[splats.face[bound]], dtype=torch.float64)
+    excess = torch.relu(size(x)[bound] - of.reshape(-1, *[1] * (size(x).dim() - 1)))
+    norm = excess.norm()
+    (WEIGHT * norm).backward()
+    return float(norm), x.grad.numpy()
+
+
+def test_scale_limit(scene) -> None:
+    """Catches a gradient that forgets the exponential or the norm, reaches unlisted or loose rows, or overwrites."""
+    splats, rows, limit = scene
+    limit = limit * np.float32(np.exp(-5))
+    norm, gradient = expected(splats.log_scale, torch.exp, splats, rows, limit)
+    assert norm > 0
+    out = np.full((50, 3), 0.25, np.float32)
+    found = scale_limit(rows, splats.log_scale, splats.face, splats.loose, limit, WEIGHT, out)
+    assert found == pytest.approx(norm, rel=1e-5)
+    np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-7)
+    untouched = splats.loose | ~np.isin(np.arange(50), rows)
+    np.testing.assert_array_equal(out[untouched], 0.25)
+
+
+def test_distance_limit(scene) -> None:
+    """Catches a gradient along the wrong axis or of the squared norm, and loose splats pulled towards the mesh."""
+    splats, rows, limit = scene
+    limit = limit * np.float32(0.015)
+    norm, gradient = expected(splats.xyz, lambda x: x.norm(dim=1), splats, rows, limit)
+    assert norm > 0
+    out = np.full((50, 3), 0.25, np.float32)
+    found = distance_limit(rows, splats.xyz, splats.face, splats.loose, limit, WEIGHT, out)
+    assert found == pytest.approx(norm, rel=1e-5)
+    np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-6)
+    untouched = splats.loose | ~np.isin(np.arange(50), rows)
+    np.testing.assert_array_equal(out[untouched], 0.25)
+
+
+@pytest.mark.parametrize("kernel", [scale_limit, distance_limit])
+def test_within_the_limits_nothing_happens(kernel) -> None:
+    """Catches 0/0 of a norm that is zero, also for a splat exactly at its triangle's origin."""
+    splats = random_splats(8, FACES)
+    splats.xyz[0] = 0
+    out = np.full((8, 3), 0.25, np.float32)
+    values = splats.log_scale if kernel is scale_limit else splats.xyz
+    rows, limit = np.arange(8, dtype=np.int32), np.full(FACES, 10, np.float32)
+    assert kernel(rows, values, splats.face, splats.loose, limit, WEIGHT, out) == 0
+    np.testing.assert_array_equal(out, 0.25)
+
+
+def test_stray_resets() -> None:
+    """Catches a limit of another triangle, loose splats pulled home, and momentum that throws a splat out again."""
+    state = random_state(60, FACES)
+    state.loose[:] = torch.arange(60) % 4 == 0
+    limit = np.array([0.005, 0.012, 0.02, 0.03, 10.0], np.float32)
+    xyz, face = state.parameters.xyz.numpy().copy(), state.face.numpy()
+    far = [bool(np.hypot(np.hypot(*p[:2]), p[2]) > limit[f]) for p, f in zip(xyz.astype(float), face, strict=True)]
+    strays = np.array(far) & (np.arange(60) % 4 != 0)
+    assert 5 < strays.sum() < 40
+    assert np.array(far)[::4].any()
+    before = bits(state)
+    assert reset_strays(state, limit) == strays.sum()
+    after = bits(state)
+    for name, old in before.items():
+        if name in ("parameters/xyz", "first/xyz", "second/xyz"):
+            assert not after[name][strays].any()
+            np.testing.assert_array_equal(after[name][~strays], old[~strays])
+        else:
+            np.testing.assert_array_equal(after[name], old, err_msg=name)
+    assert reset_strays(state, limit) == 0

@@ -1,0 +1,156 @@
+"""The fused image loss against its formula in float64 torch, and the rectangles it works in."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import conv2d
+
+from stga_addon.raster.kernels.blend import TILE
+from stga_addon.training.losses import REACH, image_gradient, similarity, tile_rectangles, whole_image
+
+# float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.
+TOLERANCE = 5e-4
+SIZES = [(1, 1), (1, 9), (9, 1), (2, 3), (5, 5), (11, 11), (16, 17), (23, 40), (64, 31)]
+
+
+def random_pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth image with noise, and a target like it, so that SSIM lies between 0 and 1."""
+    rng = np.random.default_rng([seed, height, width])
+    rows, columns = np.mgrid[:height, :width]
+    base = 0.5 + 0.4 * np.sin(rows / 3 + np.arange(3)[:, None, None]) * np.cos(columns / 4)
+    image = (base + rng.normal(0, 0.1, base.shape)).astype(np.float32)
+    target = np.clip(255 * (base + rng.normal(0, 0.05, base.shape)), 0, 255).astype(np.uint8)
+    return image, np.ascontiguousarray(target.transpose(1, 2, 0))
+
+
+def reference(image: np.ndarray, target: np.ndarray, weight: float) -> tuple[np.ndarray, torch.Tensor, torch.Tensor]:
+    """Gradient (3, H, W), |difference| and SSIM maps: plain convolutions in float64, gradient by autograd."""
+    x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
+    # The 8-bit value as the float32 it is compared as, so that equal pixels are equal here too.
+    y = torch.tensor(target * np.float32(1 / 255), dtype=torch.float64).permute(2, 0, 1)
+    line = torch.exp(-torch.arange(-5.0, 6.0, dtype=torch.float64) ** 2 / (2 * 1.5**2))
+    window = torch.outer(line, line) / line.sum() ** 2
+
+    def blur(a: torch.Tensor) -> torch.Tensor:
+        return conv2d(a[:, None], window[None, None], padding=5)[:, 0]
+
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    ssim = (2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+    absolute = (x - y).abs()
+    ((1 - weight) * absolute.mean() + weight * (1 - ssim.mean())).backward()
+    return x.grad.numpy(), absolute.detach(), ssim.detach()
+
+
+def assert_same_gradient(gradient: np.ndarray, expected: np.ndarray) -> None:
+    assert np.abs(gradient - expected).max() <= TOLERANCE * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_gradient_and_values(height: int, width: int, weight: float) -> None:
+    """Catches a wrong window, padding, constant or derivative, rows lost between bands, and images below the window."""
+    image, target = random_pair(height, width)
+    out = np.full_like(image, np.nan)
+    l1, ssim = image_gradient(image, target, whole_image(height, width), weight, out)
+    expected, absolute, similar = reference(image, target, weight)
+    assert_same_gradient(out, expected)
+    assert l1 == pytest.approx(float(absolute.mean()), rel=1e-5)
+    assert ssim == pytest.approx(float(similar.mean()), abs=1e-4)
+    assert similarity(image, target) == pytest.approx(ssim, abs=1e-7)
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_constant_images(value: int) -> None:
+    """Catches 0/0 and a negative variance where nothing varies, and a sign for pixels that already agree."""
+    target = np.full((20, 25, 3), value, np.uint8)
+    same = np.full((3, 20, 25), np.float32(value) * np.float32(1 / 255), np.float32)
+    out = np.empty_like(same)
+    l1, ssim = image_gradient(same, target, whole_image(20, 25), 0.2, out)
+    assert l1 == 0
+    assert ssim == pytest.approx(1, abs=1e-4)
+    assert np.abs(out).max() <= 1e-6
+    other = np.full_like(same, 0.3)
+    image_gradient(other, target, whole_image(20, 25), 0.2, out)
+    assert_same_gradient(out, reference(other, target, 0.2)[0])
+
+
+RECTANGLES = {
+    "inner": [[30, 25, 47, 40]],
+    "corners": [[0, 0, 16, 16], [64, 48, 71, 59]],
+    "one pixel": [[35, 30, 36, 31]],
+    "overlapping": [[10, 10, 40, 30], [20, 20, 50, 45]],
+    "left edge and a column": [[0, 20, 8, 59], [40, 0, 41, 59]],
+}
+
+
+@pytest.mark.parametrize("name", RECTANGLES)
+def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
+    """Catches pixels further than REACH being read (they are NaN here), and pixels outside being written."""
+    image, target = random_pair(59, 71, seed=1)
+    rectangles = np.array(RECTANGLES[name], np.int64)
+    expected, absolute, ssim = reference(image, target, 0.2)
+    inside, near = np.zeros((59, 71), bool), np.zeros((59, 71), bool)
+    for x0, y0, x1, y1 in rectangles:
+        inside[y0:y1, x0:x1] = True
+        near[max(0, y0 - REACH) : y1 + REACH, max(0, x0 - REACH) : x1 + REACH] = True
+    assert not near.all()
+    partial = np.where(near, image, np.float32(np.nan))
+    out = np.full_like(image, 7.0)
+    l1, similar = image_gradient(partial, target, rectangles, 0.2, out)
+    assert np.abs(out - expected)[:, inside].max() <= TOLERANCE * np.abs(expected).max()
+    np.testing.assert_array_equal(out[:, ~inside], 7.0)
+    sums = [(absolute[:, b:d, a:c].sum(), ssim[:, b:d, a:c].sum()) for a, b, c, d in rectangles]
+    np.testing.assert_allclose([l1, similar], np.sum(sums, axis=0) / image.size, rtol=1e-4)
+
+
+def test_too_short_a_reach_would_be_noticed() -> None:
+    """Catches a gradient that ignores its neighbourhood, for which the test above would pass with any REACH."""
+    image, target = random_pair(59, 71, seed=1)
+    expected, changed = np.empty_like(image), np.empty_like(image)
+    rectangles = np.array([[30, 25, 47, 40]])
+    image_gradient(image, target, rectangles, 0.2, expected)
+    image[:, :, 30 - REACH] += 0.5
+    image_gradient(image, target, rectangles, 0.2, changed)
+    assert not np.array_equal(expected[:, 25:40, 30:47], changed[:, 25:40, 30:47])
+
+
+@pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
+@pytest.mark.parametrize("bands", [1, 3, 4, 16])
+def test_bands_tile_the_image(height: int, width: int, bands: int) -> None:
+    """Catches a row that two bands or none covers, and an empty band where the image has fewer rows than bands."""
+    covered = np.zeros((height, width), int)
+    for x0, y0, x1, y1 in whole_image(height, width, bands):
+        assert x0 < x1
+        assert y0 < y1
+        covered[y0:y1, x0:x1] += 1
+    np.testing.assert_array_equal(covered, 1)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.6, 1.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_tile_rectangles_cover_the_marked_tiles(share: float, seed: int) -> None:
+    """Catches tiles left out, swapped axes, and rectangles that reach over the image's edge."""
+    rng = np.random.default_rng(seed)
+    height, width = rng.integers(1, 120, 2)
+    tiles = rng.random((-(-height // TILE), -(-width // TILE))) < share
+    pixels = np.repeat(np.repeat(tiles, TILE, 0), TILE, 1)[:height, :width]
+    covered = np.zeros((height, width), bool)
+    rectangles = tile_rectangles(tiles, height, width)
+    assert rectangles.shape == (len(rectangles), 4)
+    for x0, y0, x1, y1 in rectangles:
+        assert 0 <= x0 < x1 <= width
+        assert 0 <= y0 < y1 <= height
+        assert pixels[y0:y1, x0:x1].any()
+        covered[y0:y1, x0:x1] = True
+    assert covered[pixels].all()
+
+
+def test_separate_tiles_get_separate_rectangles() -> None:
+    """Catches one box around everything, which is right but costs the whole image; and touching tiles split."""
+    tiles = np.zeros((6, 8), bool)
+    tiles[0, 0] = tiles[1, 1] = tiles[5, 7] = True
+    found = {tuple(r) for r in tile_rectangles(tiles, 90, 125).tolist()}
+    assert found == {(0, 0, 32, 32), (112, 80, 125, 90)}
+    assert tile_rectangles(np.zeros((6, 8), bool), 90, 125).shape == (0, 4)

@@ -1,0 +1,47 @@
+"""States and settings small enough to check by hand."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from stga_addon.avatar.splats import Splats
+from stga_addon.training.settings import Settings, make_settings
+from stga_addon.training.state import TrainState, new_state, tensors_of
+
+
+def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        xyz=rng.normal(size=(count, 3)).astype(np.float32) * np.float32(0.01),
+        rotation=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scale=rng.normal(-5, 0.5, (count, 3)).astype(np.float32),
+        opacity=rng.normal(size=count).astype(np.float32),
+        sh=rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
+        face=rng.integers(0, faces, count).astype(np.int32),
+        loose=rng.random(count) < 0.3,
+    )
+
+
+def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> TrainState:
+    """A state in the middle of training: no two rows alike in anything."""
+    state = new_state(random_splats(count, faces, seed, degree))
+    generator = torch.Generator().manual_seed(seed)
+    for part in (state.gradients, state.first, state.second):
+        for tensor in part:
+            tensor.copy_(torch.rand(tensor.shape, generator=generator))
+    state.steps += torch.arange(1, count + 1, dtype=torch.int32)
+    state.pull += torch.rand(count, generator=generator)
+    state.seen += torch.arange(1, count + 1)
+    return state
+
+
+def quick_settings(strategy: str = "selective", **changes: Any) -> Settings:
+    """Without hull seeds, of which the toy's few cameras would make ten times the lattice."""
+    return make_settings(strategy, **{"iterations": 100, "seeds": False, **changes})
+
+
+def bits(state: TrainState) -> dict[str, np.ndarray]:
+    """A copy of every tensor as bytes per row, so that NaN and −0 compare by their bits; gradients left out."""
+    tensors = {name: t for name, t in tensors_of(state).items() if not name.startswith("gradients")}
+    return {name: t.numpy().copy().reshape(len(state), -1).view(np.uint8) for name, t in tensors.items()}
