@@ -6,14 +6,13 @@ are functions of position, so the same head exists at any density: `level` 1 is 
 level is what the camera sees. Metres, y up, facing +z; the person's left is +x.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..files import write_npz
-from ..flame.model import MASK_PREFIX, POSE_FEATURES, FlameModel
+from ..flame.model import JOINTS, MASK_PREFIX, POSE_FEATURES, FlameModel
 
 IDENTITY = ("width", "length", "jaw", "nose", "cheekbones", "lips", "brow", "chin", "nostrils", "ears")
 EXPRESSIONS = (
@@ -104,8 +103,6 @@ EYE_RADIUS, LID = 0.0127, 0.0014
 MOUTH = np.array([0.0, -0.050, 0.085])
 JOINTS_AT = np.array([[0, -0.150, -0.035], [0, -0.075, -0.035], [0, -0.012, 0.000], EYE, EYE * [-1, 1, 1]])
 
-Field = Callable[["Skin"], np.ndarray]
-
 
 @dataclass(frozen=True)
 class Skin:
@@ -169,24 +166,22 @@ def synthetic_head(seed: int, level: int) -> Head:
     """The head of `synthetic_flame` with `level` times as many rows and columns; the motion is the same function."""
     grid = _Grid(level)
     skin, source = grid.skin, grid.source
-    base = [grid.positions]
-    directions = [_components(skin)[source]]
+    base, faces, part = [grid.positions], [grid.faces], [grid.part]
+    directions, correctives = [_components(skin)[source]], [_correctives(skin)[source]]
     weights = [_skin_weights(skin)[source]]
-    correctives = [_correctives(skin)[source]]
-    faces, part = [grid.faces], [grid.part]
-    start = len(grid.positions)
     pieces: dict[str, np.ndarray] = {}
+    start = len(grid.positions)
     for name, points, triangles, joint in (
-        ("left_eyeball", *_eyeball(EYE, level), 3),
-        ("right_eyeball", *_eyeball(EYE * [-1, 1, 1], level), 4),
-        ("upper_teeth", *_tooth_row(level, 1), 1),
-        ("lower_teeth", *_tooth_row(level, -1), 2),
+        ("left_eyeball", *_eyeball(EYE, level), "left_eye"),
+        ("right_eyeball", *_eyeball(EYE * [-1, 1, 1], level), "right_eye"),
+        ("upper_teeth", *_tooth_row(level, 1), "neck"),
+        ("lower_teeth", *_tooth_row(level, -1), "jaw"),
     ):
         pieces[name] = np.arange(start, start + len(points))
         base.append(points)
         faces.append(triangles + start)
         part.append(np.full(len(points), PARTS.index("eyeball" if "eye" in name else "teeth")))
-        weights.append(np.tile(np.eye(5)[joint], (len(points), 1)))
+        weights.append(np.tile(np.eye(len(JOINTS))[JOINTS.index(joint)], (len(points), 1)))
         correctives.append(np.zeros((len(points), 3, POSE_FEATURES)))
         directions.append(_rigid_components(points.mean(0), len(points)))
         start += len(points)
@@ -210,40 +205,43 @@ def synthetic_head(seed: int, level: int) -> Head:
 
 
 class _Grid:
-    """Skin and pockets: positions (V, 3), faces, the grid point each vertex moves with, and parts."""
+    """Skin and pockets: positions (V, 3), faces, the grid point each vertex moves with, and parts.
+
+    Vertex order: the rows below the crown, the crown, the slits' lower edges, the pockets.
+    """
 
     def __init__(self, level: int) -> None:
-        self.level = level
         self.columns, self.rows = COLUMNS * level, (len(ROWS) - 1) * level
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        self.row, self.column = (row + 1) / level, self._signed(column) / level
-        # The crown is one point, at the end; the points of a slit's lower edge follow it.
-        self.row, self.column = np.append(self.row, 0.0), np.append(self.column, 0.0)
-        above = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
-        self.slits: list[tuple[np.ndarray, str]] = []
-        below = above.copy()
-        slits = [(EYE_ROW, EYE_COLUMNS, "lid"), (EYE_ROW, (-EYE_COLUMNS[1], -EYE_COLUMNS[0]), "lid")]
-        under = np.zeros(len(self.row), bool)
-        for at, (first, last), kind in [*slits, (MOUTH_ROW, MOUTH_COLUMNS, "mouth")]:
-            inner = np.arange(first * level + 1, last * level)
-            fresh = len(self.row) + np.arange(len(inner))
-            self.row, self.column = (
-                np.append(self.row, np.full(len(inner), float(at))),
-                np.append(self.column, inner / level),
-            )
-            under = np.append(under, np.ones(len(inner), bool))
-            upper = above[at * level - 1]
-            below[at * level - 1, inner % self.columns] = fresh
-            chain = upper[np.arange(first * level, last * level + 1) % self.columns]
-            self.slits.append((np.concatenate([chain, fresh[::-1]]), kind))
-        self.skin = _skin(self.row, self.column, under)
+        self.row, self.column = np.append((row + 1) / level, 0.0), np.append(self._signed(column) / level, 0.0)
+        rings, above, below = self._cut_slits(level)
+        self.skin = _skin(self.row, self.column, np.arange(len(self.row)) > self.rows * self.columns)
         self.faces = self._skin_faces(above, below)
         self.positions, self.source = self.skin.at, np.arange(len(self.row))
         self.part = np.zeros(len(self.row), int)
-        for ring, kind in self.slits:
+        for ring, kind in rings:
             self._add_pocket(ring, kind)
-        on_coarse = (self.row % 1 == 0) & (self.column % 1 == 0)
-        self.coarse = np.flatnonzero(on_coarse)
+        self.coarse = np.flatnonzero((self.row % 1 == 0) & (self.column % 1 == 0))
+
+    def _cut_slits(self, level: int) -> tuple[list[tuple[np.ndarray, str]], np.ndarray, np.ndarray]:
+        """Rings of vertices around each slit, and vertex ids (rows, columns) as seen from above and from below."""
+        above = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
+        below = above.copy()
+        left, right = EYE_COLUMNS, (-EYE_COLUMNS[1], -EYE_COLUMNS[0])
+        rings = []
+        for at, (first, last), kind in (
+            (EYE_ROW, left, "lid"),
+            (EYE_ROW, right, "lid"),
+            (MOUTH_ROW, MOUTH_COLUMNS, "mouth"),
+        ):
+            inner = np.arange(first * level + 1, last * level)
+            lower = len(self.row) + np.arange(len(inner))
+            self.row = np.append(self.row, np.full(len(inner), float(at)))
+            self.column = np.append(self.column, inner / level)
+            below[at * level - 1, inner % self.columns] = lower
+            upper = above[at * level - 1, np.arange(first * level, last * level + 1) % self.columns]
+            rings.append((np.concatenate([upper, lower[::-1]]), kind))
+        return rings, above, below
 
     def _signed(self, column: np.ndarray) -> np.ndarray:
         """Columns counted from the middle of the face: negative on the person's right."""

@@ -13,7 +13,7 @@ import bpy
 from .. import __version__
 from ..avatar.embedding import TINY
 from . import tags
-from .materials import DISPLAY_COLOR, ELLIPSOID_MATERIAL, OPACITY, POINT_MATERIAL, splat_material
+from .materials import DISPLAY_COLOR, EXTENT, OPACITY, ellipsoid_material, point_material
 
 # Attributes of the splat object: what the tree reads (with OPACITY) ...
 FACE = "stga_face"
@@ -35,7 +35,7 @@ OPACITY_THRESHOLD = "Opacity Threshold"
 PERCENTAGE = "Percentage"
 SHOW_SELECTION = "Show Selection"
 
-FROZEN_GREY = (0.05, 0.05, 0.05, 1.0)
+FROZEN_GREY = (0.25, 0.25, 0.25, 1.0)
 
 _MADE_BY = "stga_version"
 
@@ -72,8 +72,8 @@ def _declare(tree: bpy.types.NodeTree, embedded: bool) -> None:
     add("Geometry", "Geometry")
     if embedded:
         add(HEAD, "Object").description = "The animated head whose triangles carry the splats"
-    add(ELLIPSOIDS, "Bool", False).description = "Show each splat's shape; slower than points"
-    add(SIZE, "Float", 1.0, 0.0).description = "Size in standard deviations"
+    add(ELLIPSOIDS, "Bool", False).description = "Show each splat as the Gaussian it is; slower than points"
+    add(SIZE, "Float", 1.0, 0.0).description = "Factor on the splats' size"
     add(OPACITY_THRESHOLD, "Float", 0.0, 0.0, 1.0).description = "Hide splats that are fainter than this"
     percentage = add(PERCENTAGE, "Float", 100.0, 0.0, 100.0)
     percentage.subtype = "PERCENTAGE"
@@ -252,18 +252,15 @@ def _points(nodes: _Nodes, splats: Any) -> bpy.types.NodeSocket:
     mean = nodes.math("DIVIDE", nodes.vector("DOT_PRODUCT", nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), (1, 1, 1)), 3)
     radius = nodes.math("MULTIPLY", mean, group[SIZE])
     points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": _shown(nodes), "Radius": radius})
-    return nodes.out(
-        "GeometryNodeSetMaterial", {"Geometry": points, "Material": splat_material(POINT_MATERIAL, "GEOMETRY")}
-    )
+    return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": point_material()})
 
 
 def _ellipsoids(nodes: _Nodes, splats: Any) -> bpy.types.NodeSocket:
     """Instances of one sphere; never realised, which would cost twenty times as much."""
     group = nodes.tree.nodes.new("NodeGroupInput").outputs
-    sphere = nodes.out("GeometryNodeMeshIcoSphere", {"Radius": 1.0, "Subdivisions": 2})
+    sphere = nodes.out("GeometryNodeMeshIcoSphere", {"Radius": EXTENT, "Subdivisions": 2})
     sphere = nodes.out("GeometryNodeSetShadeSmooth", {"Geometry": sphere})
-    material = splat_material(ELLIPSOID_MATERIAL, "INSTANCER")
-    sphere = nodes.out("GeometryNodeSetMaterial", {"Geometry": sphere, "Material": material})
+    sphere = nodes.out("GeometryNodeSetMaterial", {"Geometry": sphere, "Material": ellipsoid_material()})
     return nodes.out(
         "GeometryNodeInstanceOnPoints",
         {

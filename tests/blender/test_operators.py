@@ -271,7 +271,7 @@ def test_standard_view(extension):
 
 
 def test_a_hidden_head_still_moves_its_splats(extension, mesh_capture, tmp_path):
-    """Catches splats that stand still once the mesh below them is hidden, as show does: first where the frame changes."""
+    """Catches splats that stand still once the mesh below them is hidden, as show does."""
     bpy.ops.stga.import_capture(directory=str(mesh_capture))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))

@@ -263,3 +263,38 @@ def test_saved_file_does_not_hold_the_trees_twice(tmp_path: Path):
     show_avatar(avatar, head)
     assert len(bpy.data.node_groups) == 1
     assert len(bpy.data.materials) == 2
+
+
+def test_cycles_draws_an_ellipsoid_as_a_gaussian(tmp_path):
+    """Catches flat discs, spheres counted front and back, and a density in world instead of the splat's own units."""
+    sigma, opacity, size = np.array([0.02, 0.01, 0.005]), 0.8, 48
+    one = random_splats(1, 1, degree=0)
+    logit = np.full(1, np.log(opacity / (1 - opacity)), np.float32)
+    splats = replace(
+        one,
+        xyz=np.zeros((1, 3), np.float32),
+        rotation=np.array([[1, 0, 0, 0]], np.float32),
+        log_scale=np.log(sigma, dtype=np.float32)[None],
+        opacity=logit,
+    )
+    set_input(show_world_splats(splats, "one"), nodes.ELLIPSOIDS, True)
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.data.type, camera.data.ortho_scale, camera.data.clip_start = "ORTHO", 0.12, 0.01
+    camera.location = (0, 0, 1)  # looks down: x to the right, y up
+    scene.collection.objects.link(camera)
+    scene.camera, scene.render.engine, scene.render.film_transparent = camera, "CYCLES", True
+    scene.render.resolution_x = scene.render.resolution_y = size
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.pixel_filter_type = 64, False, "BOX"
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(tmp_path / "one.exr")
+    bpy.ops.render.render(write_still=True)
+    pixels = np.empty(size * size * 4, np.float32)
+    bpy.data.images.load(str(tmp_path / "one.exr")).pixels.foreach_get(pixels)
+    alpha = pixels.reshape(size, size, 4)[..., 3]
+    across = ((np.arange(size) + 0.5) / size - 0.5) * 0.12
+    distance2 = (across[None, :] / sigma[0]) ** 2 + (across[:, None] / sigma[1]) ** 2
+    expected = np.where(distance2 < 9, opacity * np.exp(-0.5 * distance2), 0)
+    assert alpha.max() == pytest.approx(opacity, abs=0.15)
+    assert np.abs(alpha - expected).mean() < 0.01
+    assert alpha.sum() == pytest.approx(expected.sum(), rel=0.05)

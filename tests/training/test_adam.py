@@ -29,7 +29,7 @@ def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_each_row_is_torchs_adam_with_its_own_history(seed: int) -> None:
-    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, and ε in a wrong place."""
+    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε."""
     state = new_state(random_splats(6, 4, seed))
     rng = np.random.default_rng(seed)
     rows = separate_rows(state)

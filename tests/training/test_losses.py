@@ -28,7 +28,7 @@ def reference(image: np.ndarray, target: np.ndarray, weight: float) -> tuple[np.
     x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     # The 8-bit value as the float32 it is compared as, so that equal pixels are equal here too.
     y = torch.tensor(target * np.float32(1 / 255), dtype=torch.float64).permute(2, 0, 1)
-    line = torch.exp(-torch.arange(-5.0, 6.0, dtype=torch.float64) ** 2 / (2 * 1.5**2))
+    line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=torch.float64) ** 2) / (2 * 1.5**2))
     window = torch.outer(line, line) / line.sum() ** 2
 
     def blur(a: torch.Tensor) -> torch.Tensor:

@@ -38,13 +38,13 @@ def test_keep_and_join() -> None:
 
 
 def test_memory_is_shared_where_promised_and_only_there() -> None:
-    """Catches training that changes the splats it started from, and a drawing of parameters that are no longer those."""
+    """Catches training that changes the splats it started from, and drawing of parameters of the past."""
     splats = random_splats(6, 4)
     xyz, face = splats.xyz.copy(), splats.face.copy()
     state = new_state(splats)
     copy = state.splats()
-    state.parameters.xyz += 1
-    state.face += 1
+    state.parameters.xyz.add_(1)
+    state.face.add_(1)
     np.testing.assert_array_equal(splats.xyz, xyz)
     np.testing.assert_array_equal(splats.face, face)
     np.testing.assert_array_equal(copy.xyz, xyz)

@@ -1,0 +1,134 @@
+"""Reading without trust and writing without halves."""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.files import read_json, read_npz, replacing, write_json, write_npz
+
+
+def write_half(path: Path) -> None:
+    with replacing(path) as partial:
+        partial.write_text("half of t")
+        raise RuntimeError("mine")
+
+
+def test_replacing_is_all_or_nothing(tmp_path: Path) -> None:
+    """Catches a half-written file under the final name, and temporary files left behind."""
+    path = tmp_path / "new" / "file.txt"
+    with replacing(path) as partial:
+        partial.write_text("one")
+        assert not path.exists()
+    assert path.read_text() == "one"
+    with pytest.raises(RuntimeError, match="mine"):
+        write_half(path)
+    assert path.read_text() == "one"
+    with replacing(path) as partial:
+        partial.write_text("two")
+        assert path.read_text() == "one"
+    assert path.read_text() == "two"
+    assert os.listdir(path.parent) == ["file.txt"]
+
+
+def test_what_cannot_be_written(tmp_path: Path) -> None:
+    """Catches a traceback where a folder is a file, or the file a folder, and litter beside it."""
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder" / "inner").mkdir(parents=True)
+    for path in (tmp_path / "file" / "a.json", tmp_path / "folder"):
+        with pytest.raises(StgaError, match=rf"{path}: cannot be written"):
+            write_json(path, {})
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+def test_json_round_trip(tmp_path: Path) -> None:
+    """Catches another encoding than UTF-8, whatever the system's is."""
+    value = {"name": "Grüße", "list": [1, 2.5, None, True], "nested": {"a": "b"}}
+    write_json(tmp_path / "a.json", value)
+    assert read_json(tmp_path / "a.json") == value
+    (tmp_path / "b.json").write_bytes(json.dumps(value, ensure_ascii=False).encode())
+    assert read_json(tmp_path / "b.json") == value
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"hello", b"\xff\xfe{}", b"[" * 200_000, b'{"a": 1'])
+def test_malformed_json(tmp_path: Path, content: bytes) -> None:
+    """Catches a traceback, a crash by deep nesting, and a message that does not name the file."""
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(StgaError, match=r"a\.json: is not valid JSON"):
+        read_json(tmp_path / "a.json")
+
+
+def test_missing_files(tmp_path: Path) -> None:
+    """Catches a traceback for a name mistyped."""
+    for read in (read_json, read_npz):
+        for path in (tmp_path / "none", tmp_path):
+            with pytest.raises(StgaError, match=rf"{path}: cannot be read"):
+                read(path)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
+    """Catches a suffix that numpy adds, and arrays that change their kind."""
+    arrays = {"a": np.arange(6, dtype=np.int32).reshape(2, 3), "b/c": np.array([True, False]), "d": np.float64(3)}
+    write_npz(tmp_path / "file.part", arrays, compressed)
+    again = read_npz(tmp_path / "file.part")
+    assert os.listdir(tmp_path) == ["file.part"]
+    assert set(again) == set(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(again[name], array)
+        assert again[name].dtype == np.asarray(array).dtype
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9, 0.99])
+def test_truncated_npz(tmp_path: Path, kept: float) -> None:
+    """Catches a download that broke off."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, a=np.random.default_rng(0).random(1000), b=np.arange(5))
+    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+    with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz"):
+        read_npz(path)
+
+
+def test_flipped_bits(tmp_path: Path) -> None:
+    """Catches a damaged disk or memory stick: whatever is read must be what was written, or an error."""
+    path = tmp_path / "a.npz"
+    expected = np.random.default_rng(0).random(50)
+    np.savez_compressed(path, a=expected)
+    whole = path.read_bytes()
+    refused = 0
+    for position in np.random.default_rng(1).integers(0, len(whole), 60):
+        damaged = bytearray(whole)
+        damaged[position] ^= 0x55
+        path.write_bytes(damaged)
+        try:
+            np.testing.assert_array_equal(read_npz(path)["a"], expected)
+        except (StgaError, KeyError):  # KeyError: the name itself was hit
+            refused += 1
+    assert refused > 30
+
+
+def test_hostile_npz(tmp_path: Path) -> None:
+    """Catches pickled objects, which run code, arrays that unpack to more than is allowed, and headers that lie."""
+    path = tmp_path / "a.npz"
+    np.savez(path, a=np.array([{"x": 1}], object))
+    with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz file"):
+        read_npz(path)
+    np.savez_compressed(path, a=np.zeros(100_000))
+    assert path.stat().st_size < 10_000
+    with pytest.raises(StgaError, match="more than the 100000 allowed"):
+        read_npz(path, max_bytes=100_000)
+    header = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(
+        117
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", header + b"\n")
+    with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz file"):
+        read_npz(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"not an array")
+    with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz file"):
+        read_npz(path)

@@ -1,0 +1,180 @@
+"""Density control: what is split, what is pruned, and what must stay as it was."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.camera import Camera
+from stga_addon.raster.render import Parameters, render
+from stga_addon.training.density import FAINT, control_density
+from stga_addon.training.state import TrainState, keep_rows, new_state, tensors_of
+
+from .toys import bits, random_state
+
+FACES, COUNT = 6, 40
+FAINT_LOGIT = float(np.log(FAINT / (1 - FAINT)))
+
+
+def busy_state(pulled: list[int]) -> TrainState:
+    """Forty splats on six triangles, of which the listed ones are pulled at, the first hardest."""
+    state = random_state(COUNT, FACES)
+    state.face[:] = torch.arange(COUNT) % FACES
+    state.pull.zero_()
+    state.seen.fill_(2.0)
+    for strength, row in enumerate(reversed(pulled), 1):
+        state.pull[row] = float(strength)
+    return state
+
+
+def control(state: TrainState, room: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
+    return control_density(state, FACES, room, share, np.random.default_rng(seed))
+
+
+def test_survivors_keep_everything_and_children_start_anew() -> None:
+    """Catches moments of one row given to another after splitting, which throws splats about for many steps."""
+    pulled = [3, 17, 30]
+    state = busy_state(pulled)
+    before = bits(state)
+    after = bits(new := control(state))
+    survivors = np.setdiff1d(np.arange(COUNT), pulled)
+    assert len(new) == COUNT + 3
+    for name, old in before.items():
+        if name not in ("pull", "seen"):
+            np.testing.assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
+    for name, tensor in tensors_of(new).items():
+        if name.startswith(("first", "second", "steps")):
+            assert not tensor[COUNT - 3 :].any()
+    assert not new.pull.any()
+    assert not new.seen.any()
+    assert {len(t) for t in tensors_of(new).values()} == {COUNT + 3}
+
+
+def test_children_stand_on_either_side_along_the_longest_axis() -> None:
+    """Catches a rotation that is transposed or forgotten, an offset in the wrong unit, and a lost triangle."""
+    pulled = [3, 17, 30, 8]
+    state = busy_state(pulled)
+    parents = state.splats()
+    children = control(state).splats().rows(np.arange(COUNT - 4, COUNT + 4))
+    for n, row in enumerate(pulled):
+        pair = children.rows(np.array([n, n + 4]))
+        assert (pair.face == parents.face[row]).all()
+        assert (pair.loose == parents.loose[row]).all()
+        np.testing.assert_allclose(pair.xyz.mean(0), parents.xyz[row], atol=1e-6)
+        longest = int(np.argmax(parents.log_scale[row]))
+        axis = Rotation.from_quat(np.roll(parents.rotation[row], -1)).as_matrix()[:, longest]
+        offset = (pair.xyz[1] - pair.xyz[0]) / np.linalg.norm(pair.xyz[1] - pair.xyz[0])
+        assert abs(offset @ axis) == pytest.approx(1, abs=1e-4)
+        reach = np.abs((pair.xyz - parents.xyz[row]) @ axis) / np.exp(parents.log_scale[row, longest])
+        assert ((reach > 0.2) & (reach < 1.0)).all()
+        shrunk = parents.log_scale[row] - pair.log_scale
+        assert (shrunk[:, longest] > 0.2).all()
+        np.testing.assert_array_equal(np.delete(shrunk, longest, axis=1), 0)
+        np.testing.assert_array_equal(pair.sh, parents.sh[[row, row]])
+
+
+@pytest.mark.parametrize("opacity", [0.2, 0.5, 0.9, 0.99])
+def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
+    """Catches halves that leave a hole or darken the picture: the next steps would only repair what splitting broke."""
+    splats = Splats(
+        xyz=np.zeros((1, 3), np.float32),
+        rotation=np.array([[0.9, 0.1, -0.3, 0.2]], np.float32),
+        log_scale=np.log(np.array([[0.2, 0.1, 0.1]], np.float32)),
+        opacity=np.array([np.log(opacity / (1 - opacity))], np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+        face=np.zeros(1, np.int32),
+        loose=np.zeros(1, bool),
+    )
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    camera = Camera(64, 64, 128.0, 128.0, 32.0, 32.0, pose)
+
+    def cover(state: TrainState) -> np.ndarray:
+        return render(Parameters(*state.parameters), camera, degree=0)[1].numpy()
+
+    state = new_state(splats)
+    parent = cover(state)
+    state.pull[0], state.seen[0] = 1.0, 1.0
+    split = control_density(state, 1, 10, 1.0, np.random.default_rng(0))
+    assert len(split) == 2
+    children = cover(split)
+    assert 0.6 < children.sum() / parent.sum() < 1.15
+    assert np.abs(children - parent).max() < 0.3
+    rows, columns = np.mgrid[:64, :64]
+    for axis in (rows, columns):
+        centre = [np.average(axis, weights=picture) for picture in (parent, children)]
+        assert centre[1] == pytest.approx(centre[0], abs=0.2)
+        spread = [np.sqrt(np.average((axis - centre[0]) ** 2, weights=picture)) for picture in (parent, children)]
+        assert 0.75 < spread[1] / spread[0] < 1.1
+
+
+@pytest.mark.parametrize(("room", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)])
+def test_room_and_share_bound_the_growth(room: int, share: float, split: int) -> None:
+    """Catches growth without end; of those pulled at, the hardest come first, and those not seen never."""
+    pulled = [20, 4, 33, 11, 26]
+    state = busy_state(pulled)
+    gone = {tuple(p) for p in state.splats().xyz[pulled[:split]].tolist()}
+    new = control(state, room, share)
+    assert len(new) == COUNT + split
+    left = {tuple(p) for p in new.splats().xyz.tolist()}
+    assert not gone & left
+    assert {tuple(p) for p in state.splats().xyz[pulled[split:]].tolist()} <= left
+
+
+def test_the_pull_is_a_mean() -> None:
+    """Catches splats that are split because many cameras see them, not because they are wrong."""
+    state = busy_state([])
+    state.pull[5], state.seen[5] = 10.0, 100.0
+    state.pull[6], state.seen[6] = 5.0, 1.0
+    new = control(state, room=1)
+    left = {tuple(p) for p in new.splats().xyz.tolist()}
+    assert tuple(state.parameters.xyz[6].tolist()) not in left
+    assert tuple(state.parameters.xyz[5].tolist()) in left
+
+
+def test_faint_splats_go_but_no_triangles_last_one() -> None:
+    """Catches bald triangles, which nothing would ever fill again; loose splats do not count as a triangle's own."""
+    state = busy_state([])
+    state.loose[:] = torch.arange(COUNT) % 7 == 3
+    state.parameters.opacity[:] = torch.where(torch.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1)
+    state.parameters.opacity[(state.face == 2)] = FAINT_LOGIT - 1
+    state.parameters.opacity[14] = FAINT_LOGIT - 0.5  # the most opaque of triangle 2
+    assert state.face[14] == 2
+    assert not state.loose[14]
+    new = control(state)
+    bound = new.face[~new.loose]
+    assert set(bound.tolist()) == set(range(FACES))
+    assert int((bound == 2).sum()) == 1
+    assert new.parameters.opacity[(new.face == 2) & ~new.loose].tolist() == pytest.approx([FAINT_LOGIT - 0.5])
+    others = new.face != 2
+    assert (new.parameters.opacity[others] > FAINT_LOGIT).all()
+    assert (new.parameters.opacity[new.loose & others] > FAINT_LOGIT).all()
+    assert int(others.sum()) == sum(n >= 30 and n % FACES != 2 for n in range(COUNT))
+
+
+def test_one_splat_a_triangle_survives_even_when_all_are_faint_and_pulled_at() -> None:
+    """Catches pruning and splitting that together empty a triangle."""
+    state = busy_state(list(range(0, COUNT, 2)))
+    state.parameters.opacity[:] = -20.0
+    state.loose[:] = torch.arange(COUNT) % 7 == 0
+    new = control(state)
+    assert set(new.face[~new.loose].tolist()) == set(range(FACES))
+    assert all(torch.isfinite(t).all() for t in new.parameters)
+
+
+def test_same_random_numbers_same_result() -> None:
+    """Catches hidden global randomness, which would make a resumed run another one."""
+    first, again, other = (bits(control(busy_state([1, 2, 3]), seed=s)) for s in (4, 4, 5))
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert any(not np.array_equal(first[name], other[name]) for name in first)
+
+
+def test_no_splat_is_lost_from_the_input() -> None:
+    """Catches control that edits the state it was given, which the caller may still hold."""
+    state = busy_state([1, 2, 3])
+    before = bits(state)
+    control(state)
+    for name, value in bits(state).items():
+        np.testing.assert_array_equal(value, before[name])
+    assert len(keep_rows(state, torch.ones(COUNT, dtype=torch.bool))) == COUNT

@@ -1,0 +1,229 @@
+"""A run's folder: what is written comes back, and what is damaged is refused in one sentence."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.training import folder
+from stga_addon.training.folder import Checkpoint, Run
+from stga_addon.training.settings import STRATEGIES, make_settings
+from stga_addon.training.state import tensors_of
+
+from .toys import random_state
+
+FACES = 5
+
+
+def make_run(**changes: Any) -> Run:
+    return Run(Path("/data/head"), Path("/data/flame.npz"), "opencv", make_settings(iterations=9, **changes))
+
+
+def make_checkpoint() -> Checkpoint:
+    return Checkpoint(random_state(12, FACES), 34, 7, 3, 10, 12.5, 31.25, 4)
+
+
+def edit_json(path: Path, **changes: Any) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
+    """Catches a setting that a resumed run would not have."""
+    run = make_run(strategy=strategy)
+    folder.write_run(tmp_path, run)
+    assert folder.read_run(tmp_path) == run
+    bare = Run(Path("/x"), None, "vhap", make_settings(seconds=60.0))
+    folder.write_run(tmp_path, bare)
+    assert folder.read_run(tmp_path) == bare
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 2}, r"run\.json: was written by run format 2, this version reads 1"),
+        ({"version": None}, r"run\.json: was written by run format None"),
+        ({"format": "stga-avatar"}, r"run\.json: is not a run"),
+        ({"capture": None}, r"run\.json: a field is missing or malformed"),
+        ({"settings": None}, r"run\.json: a field is missing or malformed"),
+        ({"settings": {}}, r"run\.json: a field is missing or malformed .*selection"),
+    ],
+)
+def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    """Catches a run of another version read as one's own, and a traceback for one edited by hand."""
+    folder.write_run(tmp_path, make_run())
+    edit_json(tmp_path / "run.json", **change)
+    with pytest.raises(StgaError, match=message):
+        folder.read_run(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"format": "stga-run", "version": 1}'])
+def test_run_files_that_are_none(tmp_path: Path, text: str) -> None:
+    """Catches a traceback for a run.json cut off by a full disk."""
+    with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
+        folder.read_run(tmp_path)
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(StgaError, match=r"run\.json: "):
+        folder.read_run(tmp_path)
+
+
+def test_selection_round_trip(tmp_path: Path) -> None:
+    """Catches timesteps mixed up or masks that lose their kind, and a selection made for another mesh."""
+    rng = np.random.default_rng(0)
+    selection = {t: rng.random(FACES) < 0.5 for t in (0, 3, 123456)}
+    folder.write_selection(tmp_path, selection)
+    again = folder.read_selection(tmp_path, FACES)
+    assert list(again) == list(selection)
+    for timestep, faces in selection.items():
+        np.testing.assert_array_equal(again[timestep], faces)
+        assert again[timestep].dtype == bool
+    with pytest.raises(StgaError, match=r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"):
+        folder.read_selection(tmp_path, FACES + 1)
+    folder.write_selection(tmp_path, {0: np.ones(FACES, np.float32)})
+    with pytest.raises(StgaError, match="float32"):
+        folder.read_selection(tmp_path, FACES)
+    np.savez(tmp_path / "selection.npz", mouth=selection[0])
+    with pytest.raises(StgaError, match="'mouth'"):
+        folder.read_selection(tmp_path, FACES)
+
+
+def test_checkpoint_round_trip(tmp_path: Path) -> None:
+    """Catches a moment or a count that resumption would lose."""
+    checkpoint = make_checkpoint()
+    folder.write_checkpoint(tmp_path, checkpoint)
+    again = folder.read_checkpoint(tmp_path)
+    theirs = tensors_of(again.state)
+    for name, tensor in tensors_of(checkpoint.state).items():
+        if name.startswith("gradients/"):
+            assert theirs[name].shape == tensor.shape
+        else:
+            np.testing.assert_array_equal(theirs[name], tensor, err_msg=name)
+        assert theirs[name].dtype == tensor.dtype
+    left, right = ({k: v for k, v in vars(c).items() if k != "state"} for c in (again, checkpoint))
+    assert left == right
+
+
+def test_checkpoint_before_any_evaluation(tmp_path: Path) -> None:
+    """Catches −inf and None, which plain JSON does not know, lost on their way."""
+    checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, -np.inf, 0)
+    folder.write_checkpoint(tmp_path, checkpoint)
+    again = folder.read_checkpoint(tmp_path)
+    assert (again.best_psnr, again.last_timestep) == (-np.inf, None)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.2, 0.9, 0.999])
+def test_truncated_checkpoints(tmp_path: Path, kept: float) -> None:
+    """Catches half a checkpoint taken for a whole one."""
+    folder.write_checkpoint(tmp_path, make_checkpoint())
+    path = tmp_path / "checkpoint.npz"
+    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+    with pytest.raises(StgaError, match=r"checkpoint\.npz"):
+        folder.read_checkpoint(tmp_path)
+
+
+def changed(arrays: dict[str, np.ndarray], name: str, value: np.ndarray | None) -> dict[str, np.ndarray]:
+    return {k: v for k, v in {**arrays, name: value}.items() if v is not None}
+
+
+def meta(**changes: Any) -> np.ndarray:
+    values = {"version": 1, **{k: v for k, v in vars(make_checkpoint()).items() if k != "state"}, **changes}
+    return np.frombuffer(json.dumps(values).encode(), np.uint8)
+
+
+DAMAGES: dict[str, tuple[str, np.ndarray | None]] = {
+    "no moments": ("second/sh", None),
+    "no rows": ("steps", None),
+    "no meta": ("meta", None),
+    "shorter array": ("first/xyz", np.zeros((11, 3), np.float32)),
+    "scalar": ("opacity", np.zeros((), np.float32)),
+    "meta is no JSON": ("meta", np.frombuffer(b"hello", np.uint8)),
+    "another version": ("meta", meta(version=2)),
+    "unknown count": ("meta", meta(colour=3)),
+    "wrong width": ("parameters/rotation", np.zeros((12, 3), np.float32)),
+    "wrong kind": ("parameters/xyz", np.zeros((12, 3), np.float64)),
+    "moment of another shape": ("first/sh", np.zeros((12, 1, 3), np.float32)),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
+    """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check."""
+    folder.write_checkpoint(tmp_path, make_checkpoint())
+    path = tmp_path / "checkpoint.npz"
+    with np.load(path) as data:
+        arrays = dict(data)
+    np.savez(path, **changed(arrays, *DAMAGES[name]))
+    with pytest.raises(StgaError, match=r"checkpoint\.npz: "):
+        folder.read_checkpoint(tmp_path)
+
+
+def test_missing_checkpoint(tmp_path: Path) -> None:
+    """Catches a traceback where a run stopped before its first checkpoint."""
+    with pytest.raises(StgaError, match=r"checkpoint\.npz: cannot be read"):
+        folder.read_checkpoint(tmp_path)
+
+
+def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
+    """Catches a run that cannot go on because a kill cut its last line, and lines lost before that one."""
+    assert folder.read_metrics(tmp_path) == []
+    lines = [{"iteration": n, "psnr": 20.0 + n} for n in (10, 20, 30)]
+    for line in lines:
+        folder.append_metrics(tmp_path, line)
+    assert folder.read_metrics(tmp_path) == lines
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(path.read_text()[:-5])
+    assert folder.read_metrics(tmp_path) == lines[:2]
+    folder.cut_metrics(tmp_path, 20)
+    folder.append_metrics(tmp_path, {"iteration": 25})
+    assert folder.read_metrics(tmp_path) == [*lines[:2], {"iteration": 25}]
+    folder.cut_metrics(tmp_path, 15)
+    assert folder.read_metrics(tmp_path) == lines[:1]
+
+
+def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
+    """Catches two processes writing one checkpoint, within one process and across two."""
+    target = tmp_path / "new" / "run"
+    with folder.locked(target):
+        mine = rf"another run is working in this folder \(process {os.getpid()}\)"
+        with pytest.raises(StgaError, match=mine), folder.locked(target):
+            pass
+        assert (target / "run.lock").exists()  # the refused one must not take the lock away
+    assert not (target / "run.lock").exists()
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        (target / "run.lock").write_text(str(other.pid))
+        with pytest.raises(StgaError, match=f"process {other.pid}"), folder.locked(target):
+            pass
+        other.communicate(b"\n")
+    with folder.locked(target):  # its process is gone
+        assert (target / "run.lock").read_text() == str(os.getpid())
+
+
+@pytest.mark.parametrize("content", ["", "hello", "0"])
+def test_a_lock_that_names_nobody_is_taken_over(tmp_path: Path, content: str) -> None:
+    """Catches a folder locked for ever by a process killed while it wrote its lock."""
+    (tmp_path / "run.lock").write_text(content)
+    with folder.locked(tmp_path):
+        pass
+    assert not (tmp_path / "run.lock").exists()
+
+
+def test_the_lock_goes_with_an_error(tmp_path: Path) -> None:
+    """Catches a folder that stays locked after a failed run."""
+    with pytest.raises(ValueError, match="mine"), folder.locked(tmp_path):
+        raise ValueError("mine")
+    with folder.locked(tmp_path):
+        pass
+
+
+def test_a_folder_that_cannot_be_one(tmp_path: Path) -> None:
+    """Catches a traceback, or talk of another run, where the name is that of a file."""
+    (tmp_path / "file").write_text("x")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(StgaError, match="cannot be written"), folder.locked(path):
+            pass

@@ -1,0 +1,266 @@
+"""A whole run: budget, evaluation, the best avatar, and resumption to the same numbers."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
+from stga_addon.training import run as run_module
+from stga_addon.training.folder import Run, read_checkpoint, read_metrics, read_run, read_selection
+from stga_addon.training.metrics import Quality
+from stga_addon.training.run import MOST_VIEWS, Progress, train, watch_views
+from stga_addon.training.settings import STRATEGIES
+from stga_addon.training.state import tensors_of
+
+from .toys import quick_settings
+
+ITERATIONS = 24
+# Everything that changes a state happens in a few iterations.
+BUSY = {"density_every": 5, "density_span": (0.0, 1.0), "stray_every": 4, "stray_limit": 0.3, "lattice": 1}
+
+
+def make_run(capture: Capture, strategy: str = "selective", **changes: Any) -> Run:
+    settings = quick_settings(strategy, **{"iterations": ITERATIONS, **BUSY, **changes})
+    return Run(capture.root, None, "vhap", settings)
+
+
+def stop_at(iteration: int) -> Callable[[Progress], bool]:
+    return lambda progress: progress.iteration >= iteration
+
+
+def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in line.items() if k not in ("seconds", "evaluation_s")} for line in lines]
+
+
+def assert_same_state(folder: Path, expected: Path) -> None:
+    ours, theirs = read_checkpoint(folder), read_checkpoint(expected)
+    right = tensors_of(theirs.state)
+    for name, tensor in tensors_of(ours.state).items():
+        np.testing.assert_array_equal(tensor.numpy().view(np.uint8), right[name].numpy().view(np.uint8), err_msg=name)
+    assert (ours.iteration, ours.visit, ours.initial_count) == (theirs.iteration, theirs.visit, theirs.initial_count)
+
+
+@pytest.fixture(scope="module")
+def unbroken(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run from start to end."""
+    out = tmp_path_factory.mktemp("unbroken") / "run"
+    assert train(toy, out, make_run(toy)) == out / "avatar.npz"
+    return out
+
+
+def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
+    """Catches a budget over- or underrun, missing evaluations, and files that do not read back."""
+    checkpoint = read_checkpoint(unbroken)
+    assert checkpoint.iteration == ITERATIONS
+    assert checkpoint.elapsed_s > 0
+    assert read_run(unbroken) == make_run(toy)
+    selection = read_selection(unbroken, len(toy.faces))
+    assert set(selection) == set(toy.timesteps)
+    assert any(faces.any() for faces in selection.values())
+    lines = read_metrics(unbroken)
+    # Ten evaluations, evenly spread, the last one at the end.
+    assert [line["iteration"] for line in lines] == [3, 5, 8, 10, 12, 15, 17, 20, 22, 24]
+    assert all({"psnr", "ssim", "seconds", "splats", "loss"} <= set(line) for line in lines)
+    assert np.isfinite([line["psnr"] for line in lines]).all()
+    assert lines[-1]["splats"] == len(checkpoint.state) > 3 * len(toy.faces)
+    assert lines[-1]["psnr"] > lines[0]["psnr"]
+    avatar = read_avatar(unbroken / "avatar.npz")
+    np.testing.assert_array_equal(avatar.faces, toy.faces)
+    assert avatar.settings["strategy"] == "selective"
+    assert sorted(p.name for p in unbroken.iterdir()) == [
+        "avatar.npz", "checkpoint.npz", "metrics.jsonl", "run.json", "selection.npz",
+    ]  # fmt: skip
+
+
+def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+    """Catches anything a step depends on and a checkpoint does not hold: order, moments, counts, random numbers."""
+    run = make_run(toy)
+    train(toy, tmp_path, run, report=stop_at(7))
+    assert read_checkpoint(tmp_path).iteration == 7
+    train(toy, tmp_path, run, resume=True, report=stop_at(16))
+    train(toy, tmp_path, run, resume=True)
+    assert_same_state(tmp_path, unbroken)
+    # Stopping adds an evaluation of its own; those of the schedule are the same.
+    ours = {line["iteration"]: line for line in without_times(read_metrics(tmp_path))}
+    for line in without_times(read_metrics(unbroken)):
+        again = ours[line["iteration"]]
+        assert {k: again[k] for k in ("psnr", "ssim", "splats")} == {k: line[k] for k in ("psnr", "ssim", "splats")}
+
+
+class Crash(Exception):
+    """What a power cut looks like from inside."""
+
+
+def test_crashed_and_resumed_is_the_unbroken_run(
+    toy: Capture, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches evaluations that stand twice, or are missing, after going on from an older checkpoint."""
+
+    def crash(progress: Progress) -> bool:
+        # A checkpoint after iteration 8 only; the crash comes after more evaluations.
+        monkeypatch.setattr(run_module, "CHECKPOINT_S", 0.0 if progress.iteration == 7 else 1e9)
+        if progress.iteration == 13:
+            raise Crash
+        return False
+
+    with pytest.raises(Crash):
+        train(toy, tmp_path, make_run(toy), report=crash)
+    assert read_checkpoint(tmp_path).iteration == 8
+    assert max(line["iteration"] for line in read_metrics(tmp_path)) > 8
+    train(toy, tmp_path, make_run(toy), resume=True)
+    assert_same_state(tmp_path, unbroken)
+    assert without_times(read_metrics(tmp_path)) == without_times(read_metrics(unbroken))
+    for name, value in vars(read_avatar(unbroken / "avatar.npz").splats).items():
+        np.testing.assert_array_equal(getattr(read_avatar(tmp_path / "avatar.npz").splats, name), value)
+
+
+def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+    """Catches a run that can neither be resumed nor started again because it was killed early."""
+
+    def crash(progress: Progress) -> bool:
+        if progress.iteration == 4:
+            raise Crash
+        return False
+
+    with pytest.raises(Crash):
+        train(toy, tmp_path, make_run(toy), report=crash)
+    assert (tmp_path / "run.json").exists()
+    assert not (tmp_path / "checkpoint.npz").exists()
+    train(toy, tmp_path, make_run(toy), resume=True)
+    assert_same_state(tmp_path, unbroken)
+    assert without_times(read_metrics(tmp_path)) == without_times(read_metrics(unbroken))
+
+
+def test_resuming_a_finished_run_changes_nothing(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+    """Catches steps beyond the budget and evaluations that pile up."""
+    shutil.copytree(unbroken, tmp_path / "run")
+    train(toy, tmp_path / "run", make_run(toy), resume=True)
+    assert_same_state(tmp_path / "run", unbroken)
+    ours, theirs = read_metrics(tmp_path / "run"), read_metrics(unbroken)
+    assert [line["iteration"] for line in ours] == [line["iteration"] for line in theirs]
+
+
+def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run that gets worse with time taking its best avatar with it, also over an interruption."""
+    scores = iter([10.0, 30.0, 20.0, 29.9, *[25.0] * 20])
+    written: list[Avatar] = []
+
+    def write(path: Path, avatar: Avatar) -> None:
+        written.append(avatar)
+        run_module_write(path, avatar)
+
+    run_module_write = run_module.write_avatar
+    monkeypatch.setattr(run_module, "evaluate", lambda draw, views, perceptual: Quality(next(scores), 0.5))
+    monkeypatch.setattr(run_module, "write_avatar", write)
+    train(toy, tmp_path, make_run(toy), report=stop_at(11))
+    train(toy, tmp_path, make_run(toy), resume=True)
+    assert len(written) == 2
+    assert read_checkpoint(tmp_path).best_psnr == 30.0
+    best = read_avatar(tmp_path / "avatar.npz").splats
+    np.testing.assert_array_equal(best.xyz, written[1].splats.xyz)
+    assert not np.array_equal(written[0].splats.xyz, written[1].splats.xyz)
+
+
+def test_without_held_out_views_the_latest_avatar_is_kept(toy: Capture, tmp_path: Path) -> None:
+    """Catches a run without avatar, or with its first one, where nothing can be measured."""
+    bare = replace(toy, views={"train": toy.views["train"]})
+    train(bare, tmp_path, make_run(toy))
+    avatar = read_avatar(tmp_path / "avatar.npz")
+    np.testing.assert_array_equal(avatar.splats.xyz, read_checkpoint(tmp_path).state.parameters.xyz)
+    assert all("psnr" not in line for line in read_metrics(tmp_path))
+
+
+def test_a_folder_with_a_run_is_not_overwritten(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+    """Catches hours of training lost to a forgotten --resume."""
+    before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
+    with pytest.raises(StgaError, match="already holds a run"):
+        train(toy, unbroken, make_run(toy))
+    assert {p.name: p.read_bytes() for p in unbroken.iterdir()} == before
+
+
+def test_a_capture_without_training_views(toy: Capture, tmp_path: Path) -> None:
+    """Catches an endless wait for views that never come, and a folder made for nothing."""
+    for views in ({}, {"train": (), "val": toy.views["val"]}):
+        with pytest.raises(StgaError, match="has no training views"):
+            train(replace(toy, views=views), tmp_path / "run", make_run(toy))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_budget_in_seconds(toy: Capture, tmp_path: Path) -> None:
+    """Catches wall time that is not counted, counted twice when resumed, or overrun by more than an iteration."""
+    shares: list[float] = []
+
+    def note(progress: Progress) -> bool:
+        shares.append(progress.share)
+        return len(shares) == 8
+
+    run = make_run(toy, iterations=None, seconds=0.6)
+    train(toy, tmp_path, run, report=note)
+    middle = read_checkpoint(tmp_path)
+    assert 0 < middle.elapsed_s < 0.6
+    train(toy, tmp_path, run, resume=True)
+    end = read_checkpoint(tmp_path)
+    assert 0.6 <= end.elapsed_s < 1.6
+    assert end.iteration > middle.iteration > 0
+    assert shares == sorted(shares)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("schedule", ["default", "paper"])
+def test_every_strategy_and_schedule_runs(toy: Capture, tmp_path: Path, strategy: str, schedule: str) -> None:
+    """Catches a combination of settings that no other test trains, and an avatar in the wrong convention."""
+    settings = quick_settings(strategy, schedule=schedule, iterations=8, stray_every=3, density_every=3)
+    train(toy, tmp_path, Run(toy.root, None, "vhap", settings))
+    avatar = read_avatar(tmp_path / "avatar.npz")
+    assert avatar.convention == ("gaussian_avatars" if strategy == "gaussian-avatars" else "stga")
+    assert set(avatar.splats.face.tolist()) == set(range(len(toy.faces)))
+    assert (read_selection(tmp_path, len(toy.faces)) != {}) == (strategy == "selective")
+
+
+def test_a_given_selection_is_used(toy: Capture, tmp_path: Path) -> None:
+    """Catches what an artist painted being replaced by the rule."""
+    chosen = {t: np.arange(len(toy.faces)) % 7 == t for t in toy.timesteps}
+    train(toy, tmp_path, make_run(toy, iterations=3), selection=chosen)
+    again = read_selection(tmp_path, len(toy.faces))
+    for timestep, faces in chosen.items():
+        np.testing.assert_array_equal(again[timestep], faces)
+
+
+def test_a_resumed_run_checks_the_mesh(toy: Capture, tmp_path: Path) -> None:
+    """Catches splats on triangles that the capture no longer has, which kernels would read beyond the end for."""
+    run = make_run(toy, "global", iterations=4)
+    train(toy, tmp_path, run, report=stop_at(2))
+    fewer = replace(toy, faces=toy.faces[:100], regions={})
+    with pytest.raises(StgaError):
+        train(fewer, tmp_path, run, resume=True)
+
+
+def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path) -> None:
+    """Catches shares that do not end at one, and speeds or losses that are never filled in."""
+    told: list[Progress] = []
+    train(toy, tmp_path, make_run(toy), report=lambda progress: bool(told.append(progress)))
+    training = [p for p in told if p.iteration]
+    assert [p.iteration for p in training] == list(range(1, ITERATIONS + 1))
+    assert training[-1].share == 1.0
+    assert training[-1].left_s == 0.0
+    assert all(p.per_second > 0 and np.isfinite(p.loss) for p in training)
+    assert training[-1].psnr is not None
+    assert {p.message for p in told if not p.iteration} >= {"compiling kernels"}
+
+
+def test_watched_views_are_spread(toy: Capture) -> None:
+    """Catches evaluations while training that cost more than the training, or look at one end of the sequence."""
+    view = toy.views["val"][0]
+    many = tuple(replace(view, timestep=t) for t in range(100))
+    watched = [v.timestep for v in watch_views(replace(toy, views={"val": many}))]
+    assert len(watched) == MOST_VIEWS
+    assert (watched[0], watched[-1]) == (0, 99)
+    assert set(np.diff(watched)) <= {6, 7}
+    assert list(watch_views(toy)) == list(toy.views["val"])

@@ -1,0 +1,105 @@
+"""When what is trained."""
+
+from collections import Counter
+from itertools import groupby, islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.model import View
+from stga_addon.training.schedule import learning_rates, sh_degree, trains_globally, view_order
+from stga_addon.training.settings import Rates, Settings
+
+CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
+# Frames of 3, 5, 1 and 4 views.
+VIEWS = [View(t, c, CAMERA, f"{t}_{c}", Path()) for t, count in ((0, 3), (2, 5), (5, 1), (6, 4)) for c in range(count)]
+EPOCH = len(VIEWS)
+
+
+def names(count: int, per_visit: int = 1, seed: int = 0, start: int = 0) -> list[str]:
+    return [view.name for view in islice(view_order(VIEWS, per_visit, seed, start), count)]
+
+
+@pytest.mark.parametrize("per_visit", [0, 1, 2, 4])
+def test_every_view_once_an_epoch_and_another_order_each(per_visit: int) -> None:
+    """Catches views that are skipped or favoured, and an order that repeats itself."""
+    order = names(4 * EPOCH, per_visit)
+    epochs = [order[n : n + EPOCH] for n in range(0, len(order), EPOCH)]
+    assert all(Counter(epoch) == Counter(view.name for view in VIEWS) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 4
+    assert names(EPOCH, per_visit, seed=1) != epochs[0]
+
+
+@pytest.mark.parametrize("per_visit", [0, 1, 2])
+def test_resuming_anywhere_continues_the_same_order(per_visit: int) -> None:
+    """Catches an order that depends on where a run was interrupted."""
+    order = names(4 * EPOCH, per_visit)
+    for start in (0, 1, 5, EPOCH - 1, EPOCH, EPOCH + 1, 2 * EPOCH + 7):
+        assert names(EPOCH, per_visit, start=start) == order[start : start + EPOCH]
+
+
+def visits(per_visit: int) -> list[int]:
+    """Lengths of the runs of one frame's views."""
+    order = islice(view_order(VIEWS, per_visit, 3), EPOCH)
+    return [len(list(group)) for _, group in groupby(order, lambda view: view.timestep)]
+
+
+def test_views_of_a_visit_stay_together() -> None:
+    """Catches frames torn apart in the paper's batches, and full shuffling that keeps frames together."""
+    assert sorted(visits(0)) == [1, 3, 4, 5]
+    assert len(visits(1)) > 6
+    # Groups of two: a run is as long as the groups it is made of, of which the first of a frame are full.
+    order = list(islice(view_order(VIEWS, 2, 3), EPOCH))
+    for _, frame in groupby(sorted(order, key=lambda v: v.timestep), lambda v: v.timestep):
+        positions = [order.index(view) for view in frame]
+        alone = [p for p in positions if p - 1 not in positions and p + 1 not in positions]
+        assert len(alone) <= len(positions) % 2
+
+
+@pytest.mark.parametrize("every", [1, 2, 20])
+def test_global_every_so_many_local_iterations(every: int) -> None:
+    """Catches an off-by-one: `every` local iterations, then a global one, from the first iteration on."""
+    settings = Settings(strategy="selective", global_every=every, global_unit="iteration", warm_up=0.0)
+    kinds = [trains_globally(settings, n, 0, 0.5) for n in range(3 * (every + 1))]
+    assert kinds == ([False] * every + [True]) * 3
+
+
+def test_global_every_so_many_frames() -> None:
+    """Catches the unit being ignored: with frames, the count of iterations must not matter."""
+    settings = Settings(strategy="selective", global_every=3, global_unit="frame", warm_up=0.0)
+    for visit in range(12):
+        kinds = {trains_globally(settings, n, visit, 0.5) for n in range(10)}
+        assert kinds == {visit % 4 == 3}
+
+
+def test_warm_up_and_other_strategies_are_global() -> None:
+    """Catches local iterations before the head has taken shape, or in a run that should have none."""
+    settings = Settings(strategy="selective", warm_up=0.3)
+    assert all(trains_globally(settings, n, n, 0.29) for n in range(6))
+    assert not all(trains_globally(settings, n, n, 0.3) for n in range(6))
+    for strategy in ("global", "gaussian-avatars"):
+        assert all(trains_globally(Settings(strategy=strategy, warm_up=0.0), n, n, 0.9) for n in range(6))
+
+
+def test_sh_degree_rises_step_by_step() -> None:
+    """Catches a degree above the highest, a step skipped, and steps that never come."""
+    settings = Settings(sh_degree=3, sh_steps=(0.2, 0.5, 0.8))
+    degrees = [sh_degree(settings, p) for p in (0, 0.19, 0.2, 0.49, 0.5, 0.79, 0.8, 1.0)]
+    assert degrees == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert sh_degree(Settings(sh_degree=1, sh_steps=(0.2, 0.5, 0.8)), 1.0) == 1
+    assert sh_degree(Settings(sh_degree=0), 1.0) == 0
+
+
+def test_rates_decay_to_their_ends() -> None:
+    """Catches a rate without its own end, linear decay, and rates that rise again past the budget."""
+    rates = Rates(xyz=1e-3, sh=4e-2, sh_rest=2e-3, position_end=0.01, end=0.25)
+    assert learning_rates(rates, 0.0) == {n: getattr(rates, n) for n in learning_rates(rates, 0.0)}
+    half, end = learning_rates(rates, 0.5), learning_rates(rates, 1.0)
+    assert end["xyz"] == pytest.approx(1e-5)
+    assert half["xyz"] == pytest.approx(1e-4)
+    for name in ("rotation", "log_scale", "opacity", "sh", "sh_rest"):
+        assert end[name] == pytest.approx(0.25 * getattr(rates, name))
+        assert half[name] == pytest.approx(0.5 * getattr(rates, name))
+    assert learning_rates(rates, 1.7) == end

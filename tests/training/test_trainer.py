@@ -1,0 +1,213 @@
+"""One step of training: what a local iteration may touch, and that its gradient is the whole image's."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from stga_addon.capture.images import read_image
+from stga_addon.capture.model import Capture, View
+from stga_addon.training.metrics import psnr
+from stga_addon.training.schedule import view_order
+from stga_addon.training.settings import STRATEGIES
+from stga_addon.training.trainer import Trainer, initial_splats
+
+from .toys import bits, quick_settings
+
+
+def lower_part(capture: Capture) -> dict[int, np.ndarray]:
+    """The capture's mouth selected in timesteps 1 and 3, nothing in 0, and 4 left out."""
+    nothing = np.zeros(len(capture.faces), bool)
+    return {0: nothing, 1: capture.regions["mouth"], 3: capture.regions["mouth"]}
+
+
+def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) -> Trainer:
+    quiet = {"warm_up": 0.0, "global_every": 2, "density_every": 0, "stray_every": 0}
+    return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
+
+
+def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
+    views: Sequence[View] = [v for split in capture.views.values() for v in split]
+    return next(v for v in views if (v.timestep, v.camera_index) == (timestep, camera))
+
+
+def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
+    """The view in a larger image, and a noisy target for it: many tiles and a gradient everywhere."""
+    view = replace(view, camera=view.camera.scaled(factor))
+    target = np.random.default_rng(0).integers(0, 256, (view.camera.height, view.camera.width, 3), np.uint8)
+    return view, target
+
+
+def disturb(trainer: Trainer) -> None:
+    """Rows unlike each other, and as many coefficients as there may be."""
+    rng = np.random.default_rng(1)
+    for value in trainer.state.arrays():
+        value += rng.normal(0, 0.2 if value.ndim != 2 else 1e-3, value.shape).astype(np.float32)
+
+
+def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
+    """Catches momentum, limits, decay or statistics that reach rows which the frame does not select."""
+    trainer = make_trainer(toy, distance_weight=0.1, distance_limit=0.01, scale_limit=0.1)
+    view = view_of(toy, 1)
+    target = read_image(view)
+    for _ in range(3):  # the third is global, so that every visible row has moments
+        trainer.step(view, target, 0.5)
+    assert trainer.state.first.xyz.numpy()[trainer.state.steps.numpy() > 0].any()
+    before = bits(trainer.state)
+    for _ in range(2):
+        assert trainer.step(view, target, 0.5) is None
+    after = bits(trainer.state)
+    selected = toy.regions["mouth"][trainer.state.face.numpy()]
+    assert 0.05 < selected.mean() < 0.5
+    for name in before:
+        np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
+    for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
+        changed = (after[name] != before[name]).any(axis=1)
+        # Those on the far side of the ball may be invisible, the rest are trained.
+        assert changed[selected].mean() > 0.3, name
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("camera", [0, 2])
+def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: int) -> None:
+    """Catches tiles left out around the selection, and pixels read that no tile rendered (all buffers hold NaN)."""
+    trainer = make_trainer(toy)
+    disturb(trainer)
+    view, target = large(view_of(toy, 1, camera))
+    focus = toy.regions["mouth"][trainer.state.face.numpy()]
+    rows, screen, loss = trainer._differentiate(view, target, degree, None)
+    full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
+    pull, wanted = screen.copy(), rows[focus[rows]].copy()
+    assert loss is not None
+    for buffer in trainer._scratch._buffers.values():
+        buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
+    for tensor in trainer.state.gradients:
+        tensor.fill_(7.0)
+    rows, screen, loss = trainer._differentiate(view, target, degree, focus)
+    assert loss is None
+    np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
+    assert 20 < len(rows) < 0.5 * len(trainer.state)
+    others = np.setdiff1d(np.arange(len(trainer.state)), rows)
+    for name, tensor in trainer.state.gradients._asdict().items():
+        difference = np.abs(tensor.numpy()[rows] - full[name][rows]).max()
+        assert difference <= 1e-6 * np.abs(full[name][rows]).max(), name
+        np.testing.assert_array_equal(tensor.numpy()[others], 7.0)
+    np.testing.assert_allclose(screen[rows], pull[rows], rtol=1e-5)
+
+
+def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
+    """Catches a restriction that restricts nothing, with which the test above would hold of itself."""
+    trainer = make_trainer(toy)
+    view, _ = large(view_of(toy, 1))
+    focus = toy.regions["mouth"][trainer.state.face.numpy()]
+    everything = len(trainer._render(view, 0).tiles)
+    assert 0 < len(trainer._render(view, 0, focus).tiles) < 0.8 * everything
+
+
+@pytest.mark.parametrize("timestep", [0, 4])
+def test_a_frame_that_selects_nothing_trains_globally(toy: Capture, timestep: int) -> None:
+    """Catches iterations that train nothing, for an empty selection and for a timestep that has none."""
+    trainer = make_trainer(toy)
+    view = view_of(toy, timestep)
+    loss = trainer.step(view, read_image(view), 0.5)
+    assert loss is not None
+    assert loss > 0
+    assert trainer.state.steps.numpy().sum() > 0.3 * len(trainer.state)
+    trainer.step(view_of(toy, 1), read_image(view_of(toy, 1)), 0.5)
+    selected = toy.regions["mouth"][trainer.state.face.numpy()]
+    assert (trainer.state.steps.numpy()[~selected] <= 1).all()
+
+
+def test_kinds_of_iterations(toy: Capture) -> None:
+    """Catches a schedule that the trainer does not follow: by iterations, by visits of frames, and in the warm-up."""
+    views = [view_of(toy, timestep, camera) for timestep in (1, 3, 1, 3) for camera in (0, 1)]
+    images = [read_image(view) for view in views]
+
+    def kinds(trainer: Trainer, share: float = 0.5) -> list[bool]:
+        return [trainer.step(view, image, share) is not None for view, image in zip(views, images, strict=True)]
+
+    assert kinds(make_trainer(toy)) == [False, False, True, False, False, True, False, False]
+    # Two local visits of frames with two views each, then a global visit.
+    by_frame = kinds(make_trainer(toy, global_unit="frame", global_every=2))
+    assert by_frame == [False] * 4 + [True] * 2 + [False] * 2
+    assert all(kinds(make_trainer(toy, warm_up=0.6)))
+    assert all(kinds(make_trainer(toy, "global")))
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
+    """Catches a gradient of the wrong sign, rates that are not applied, and a strategy that does not learn."""
+    trainer = make_trainer(toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up=0.3)
+    views, losses = toy.views["train"], []
+    images = {view.name: read_image(view) for view in views}
+    before = [psnr(trainer.draw(view, 0.0), images[view.name]) for view in views]
+    for n, view in zip(range(60), view_order(views, 1, 0), strict=False):
+        losses.append(trainer.step(view, images[view.name], n / 60))
+    after = [psnr(trainer.draw(view), images[view.name]) for view in views]
+    everywhere = [loss for loss in losses if loss is not None]
+    assert len(everywhere) == 60 if strategy != "selective" else 30 < len(everywhere) < 60
+    assert np.mean(everywhere[-9:]) < 0.85 * np.mean(everywhere[:9])
+    assert np.mean(after) > np.mean(before) + 1.0
+
+
+def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
+    """Catches maintenance that never runs, runs outside its span, or grows beyond what was allowed."""
+    options = {"density_every": 2, "density_span": (0.2, 0.6), "growth": 0.05, "stray_every": 5}
+    trainer = make_trainer(toy, "global", **options)
+    view = view_of(toy, 1)
+    image, counts = read_image(view), []
+    face = trainer.state.face.numpy()
+    trainer.state.parameters.xyz[7] = 1.0
+    assert not trainer.state.loose[7]
+    for n in range(10):
+        if n == 4:
+            assert float(trainer.state.parameters.xyz[trainer.state.face == int(face[7])].norm(dim=1).max()) > 0.9
+        trainer.step(view, image, n / 10)
+        counts.append(len(trainer.state))
+    first = trainer.initial_count
+    assert counts[:2] == [first, first]
+    assert first < counts[3] <= counts[5] <= round(first * 1.05)
+    assert counts[5:] == [counts[5]] * 5
+    assert float(trainer.state.parameters.xyz.norm(dim=1).max()) < 0.5
+
+
+def test_pull_is_gathered_by_global_iterations_only(toy: Capture) -> None:
+    """Catches selected regions that are split more because they are drawn more often, not because they are worse."""
+    trainer = make_trainer(toy)
+    view = view_of(toy, 1)
+    for expected in (0, 0, 1, 1, 1, 2):
+        trainer.step(view, read_image(view), 0.5)
+        assert trainer.state.seen.max() == expected
+
+
+def test_initial_splats_with_hull_seeds(toy: Capture) -> None:
+    """Catches seeds that are mixed up with the lattice, which would be exempt from its limits then."""
+    bare = initial_splats(toy, quick_settings(lattice=2))
+    full = initial_splats(toy, quick_settings(lattice=2, seeds=True))
+    assert len(bare) == 6 * len(toy.faces)
+    assert not bare.loose.any()
+    assert len(full) > len(bare)
+    assert full.loose[len(bare) :].all()
+    for name, value in vars(bare).items():
+        np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
+
+
+def test_draw_is_a_copy(toy: Capture) -> None:
+    """Catches pictures that change when the next one is drawn, since buffers are used again."""
+    trainer = make_trainer(toy)
+    view = view_of(toy, 1)
+    picture = trainer.draw(view)
+    kept = picture.copy()
+    disturb(trainer)
+    assert not np.array_equal(trainer.draw(view), kept)
+    np.testing.assert_array_equal(picture, kept)
+
+
+def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
+    """Catches limits in metres applied to GaussianAvatars' triangle units, and an area without its factor two."""
+    areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
+    np.testing.assert_allclose(make_trainer(toy)._lengths, np.sqrt(2 * areas), rtol=1e-5)
+    np.testing.assert_array_equal(make_trainer(toy, "gaussian-avatars")._lengths, 1)
