@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..raster.kernels.rows import adam_rows, count_steps
+from ..raster.kernels.rows import adam_rows
 from .state import TrainState
 
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
@@ -16,12 +16,11 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> Non
     rates: learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`.
     (STGA, selective training; Adam with a step count per row, because rows are trained unequally often.)
     """
-    correct1, correct2 = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-    count_steps(rows, state.steps.numpy(), correct1, correct2, BETA1, BETA2)
-    for name, parameter in state.parameters._asdict().items():
-        tensors = (parameter, *(getattr(part, name) for part in (state.gradients, state.first, state.second)))
-        flat = [t.numpy().reshape(len(state), -1) for t in tensors]
-        by_column = np.full(flat[0].shape[1], rates[name], np.float32)
+    by_column = np.zeros((len(state.parameters), state.parameters.sh[0].numel()), np.float32)
+    for row, name in zip(by_column, state.parameters._fields, strict=True):
+        row[:] = rates[name]
         if name == "sh":
-            by_column[3:] = rates["sh_rest"]
-        adam_rows(rows, *flat, correct1, correct2, by_column, BETA1, BETA2, EPSILON)
+            row[3:] = rates["sh_rest"]
+    parts = (state.parameters, state.gradients, state.first, state.second)
+    tables = (tuple(t.numpy().reshape(len(state), -1) for t in part) for part in parts)
+    adam_rows(rows, state.steps.numpy(), *tables, by_column, BETA1, BETA2, EPSILON)

@@ -140,6 +140,9 @@ def test_faint_splats_go_but_no_triangles_last_one() -> None:
     state.parameters.opacity[:] = torch.where(torch.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1)
     state.parameters.opacity[(state.face == 2)] = FAINT_LOGIT - 1
     state.parameters.opacity[14] = FAINT_LOGIT - 0.5  # the most opaque of triangle 2
+    state.parameters.opacity[38] = 3.0
+    assert state.loose[38]
+    assert state.face[38] == 2
     assert state.face[14] == 2
     assert not state.loose[14]
     new = control(state)

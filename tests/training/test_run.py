@@ -98,27 +98,42 @@ class Crash(Exception):
     """What a power cut looks like from inside."""
 
 
-def test_crashed_and_resumed_is_the_unbroken_run(
-    toy: Capture, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture(scope="module")
+def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that crashed after iteration 13, went on from a checkpoint of iteration 8, and came to its end."""
+    out = tmp_path_factory.mktemp("continued")
+    with pytest.MonkeyPatch.context() as patch:
+
+        def crash(progress: Progress) -> bool:
+            patch.setattr(run_module, "CHECKPOINT_S", 0.0 if progress.iteration == 7 else 1e9)
+            if progress.iteration == 13:
+                raise Crash
+            return False
+
+        with pytest.raises(Crash):
+            train(toy, out, make_run(toy), report=crash)
+    assert read_checkpoint(out).iteration == 8
+    assert max(line["iteration"] for line in read_metrics(out)) > 8
+    train(toy, out, make_run(toy), resume=True)
+    return out
+
+
+def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path) -> None:
     """Catches evaluations that stand twice, or are missing, after going on from an older checkpoint."""
-
-    def crash(progress: Progress) -> bool:
-        # A checkpoint after iteration 8 only; the crash comes after more evaluations.
-        monkeypatch.setattr(run_module, "CHECKPOINT_S", 0.0 if progress.iteration == 7 else 1e9)
-        if progress.iteration == 13:
-            raise Crash
-        return False
-
-    with pytest.raises(Crash):
-        train(toy, tmp_path, make_run(toy), report=crash)
-    assert read_checkpoint(tmp_path).iteration == 8
-    assert max(line["iteration"] for line in read_metrics(tmp_path)) > 8
-    train(toy, tmp_path, make_run(toy), resume=True)
-    assert_same_state(tmp_path, unbroken)
-    assert without_times(read_metrics(tmp_path)) == without_times(read_metrics(unbroken))
+    assert_same_state(continued, unbroken)
+    ours, theirs = (
+        [{k: v for k, v in line.items() if k != "loss"} for line in without_times(read_metrics(folder))]
+        for folder in (continued, unbroken)
+    )
+    assert ours == theirs
     for name, value in vars(read_avatar(unbroken / "avatar.npz").splats).items():
-        np.testing.assert_array_equal(getattr(read_avatar(tmp_path / "avatar.npz").splats, name), value)
+        np.testing.assert_array_equal(getattr(read_avatar(continued / "avatar.npz").splats, name), value)
+
+
+def test_the_loss_in_the_metrics_survives_a_crash(unbroken: Path, continued: Path) -> None:
+    """Catches a curve with a step in it where the run was interrupted: the mean is over the last iterations."""
+    ours, theirs = ([line["loss"] for line in read_metrics(folder)] for folder in (continued, unbroken))
+    assert ours == theirs
 
 
 def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:

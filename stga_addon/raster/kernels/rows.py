@@ -12,40 +12,49 @@ CHUNK = 256
 
 
 @parallel_jit
-def count_steps(rows, steps, correct1, correct2, beta1, beta2):
-    """Count a step of each listed row (M,) in steps (N,) int32 and write its two bias corrections (M,)."""
-    log1, log2 = math.log(beta1), math.log(beta2)
-    for n in prange(len(rows)):
-        steps[rows[n]] += 1
-        count = np.float64(steps[rows[n]])
-        correct1[n] = 1.0 / (1.0 - math.exp(count * log1))
-        correct2[n] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
+def adam_rows(rows, steps, parameters, gradients, firsts, seconds, rates, beta1, beta2, epsilon):
+    """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
-
-@parallel_jit
-def adam_rows(rows, parameter, gradient, first, second, correct1, correct2, rates, beta1, beta2, epsilon):
-    """One Adam step on the listed rows (M,) of parameter (N, D), with each row's own bias corrections (M,).
-
-    rates (D,): learning rate by column. Rows that are not listed are not touched: neither parameter nor moments.
-    A row whose gradient is not finite keeps its values.
+    parameters, gradients, firsts, seconds: equally long tuples of (N, D) arrays; steps (N,) int32; rates (P, max D):
+    learning rate by parameter and column. Rows that are not listed are not touched: neither parameters, moments nor
+    count. A row whose gradient is not finite keeps that parameter and its moments.
+    All parameters in one parallel loop: on a busy machine every further one waits for its slowest thread.
     """
-    width = parameter.shape[1]
+    log1, log2 = math.log(beta1), math.log(beta2)
     for block in prange((len(rows) + CHUNK - 1) // CHUNK):
-        for n in range(block * CHUNK, min(len(rows), (block + 1) * CHUNK)):
-            i = rows[n]
-            unsound = ZERO
-            for c in range(width):
-                unsound += gradient[i, c] * ZERO
-            if unsound != ZERO:
-                continue
-            scale1, scale2 = correct1[n], correct2[n]
-            for c in range(width):
-                g = gradient[i, c]
-                m = beta1 * first[i, c] + (ONE - beta1) * g
-                v = beta2 * second[i, c] + (ONE - beta2) * g * g
-                first[i, c] = m
-                second[i, c] = v
-                parameter[i, c] -= rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
+        begin, end = block * CHUNK, min(len(rows), (block + 1) * CHUNK)
+        correct1, correct2 = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+        for n in range(begin, end):
+            steps[rows[n]] += 1
+            count = np.float64(steps[rows[n]])
+            correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
+            correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
+        for p in range(len(parameters)):
+            _adam_block(
+                rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], correct1, correct2, rates[p],
+                beta1, beta2, epsilon,
+            )  # fmt: skip
+
+
+@jit
+def _adam_block(rows, parameter, gradient, first, second, correct1, correct2, rates, beta1, beta2, epsilon):
+    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorises."""
+    width = parameter.shape[1]
+    for n in range(len(rows)):
+        i = rows[n]
+        unsound = ZERO
+        for c in range(width):
+            unsound += gradient[i, c] * ZERO
+        if unsound != ZERO:
+            continue
+        scale1, scale2 = correct1[n], correct2[n]
+        for c in range(width):
+            g = gradient[i, c]
+            m = beta1 * first[i, c] + (ONE - beta1) * g
+            v = beta2 * second[i, c] + (ONE - beta2) * g * g
+            first[i, c] = m
+            second[i, c] = v
+            parameter[i, c] -= rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
 
 
 @jit
