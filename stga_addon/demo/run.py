@@ -22,14 +22,14 @@ from ..training.metrics import evaluate
 from ..training.progress import ProgressBar
 from ..training.run import train
 from ..training.settings import make_settings
-from .capture import make_capture
+from .capture import CaptureOptions, make_capture
 
 SEED = 0
 TOLERANCE = 1e-5
 """Metres between where Blender puts a splat and where numpy does."""
 
 
-def run_demo(out: Path, seconds: float) -> None:
+def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -> None:
     """Make a capture of a synthetic head, import, select, train and show it in Blender, and picture the result.
 
     Leaves avatar.npz, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's bpy.
@@ -38,7 +38,7 @@ def run_demo(out: Path, seconds: float) -> None:
     begin = perf_counter()
     folder = out / "capture"
     with tqdm(desc="path-tracing the capture", unit="image") as bar:
-        model = make_capture(folder, SEED, progress=lambda done, total: _advance(bar, done, total))
+        model = make_capture(folder, SEED, options, progress=lambda done, total: _advance(bar, done, total))
     capture = open_capture(folder, model)
     head, selection = _import_and_select(capture)
     avatar = _train(capture, model, out, seconds, selection)
@@ -108,17 +108,16 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
 
 
 def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], out: Path) -> None:
-    """comparison.png: ground truth beside rendering, held-out view and unseen expression; selection.png: the frame
-    that selects most."""
-    views = [capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]]
-    rows = []
-    for view in views:
+    """comparison.png: ground truth beside rendering, of a held-out view and of an unseen expression; selection.png:
+    the held-out view of the frame that selects most."""
+    pictures = []
+    for view in (capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]):
         image = draw_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
-        rows.append([read_image(view), to_bytes(image)])
-    _save(out / "comparison.png", side_by_side([[picture for row in rows for picture in row]]))
-    busiest = max((view for view in capture.views["val"]), key=lambda view: selection[view.timestep].sum())
-    faces = selection[busiest.timestep]
-    picture = selection_picture(avatar, capture.mesh(busiest.timestep), busiest.camera, faces)
+        pictures += [read_image(view), to_bytes(image)]
+    _save(out / "comparison.png", side_by_side(pictures))
+    busiest = max(capture.views["val"], key=lambda view: selection[view.timestep].sum())
+    selected = selection[busiest.timestep]
+    picture = selection_picture(avatar, capture.mesh(busiest.timestep), busiest.camera, selected)
     _save(out / "selection.png", to_bytes(picture))
 
 

@@ -25,16 +25,11 @@ def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected
     return draw_avatar(shown, mesh, camera, (1.0, 1.0, 1.0))
 
 
-def side_by_side(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """A grid of equally large pictures (H, W, 3) uint8, with a narrow white gap between them."""
-    gap = 6
-    height, width = rows[0][0].shape[:2]
-    sheet = np.full((len(rows) * (height + gap) - gap, len(rows[0]) * (width + gap) - gap, 3), 255, np.uint8)
-    for r, row in enumerate(rows):
-        for c, picture in enumerate(row):
-            top, left = r * (height + gap), c * (width + gap)
-            sheet[top : top + height, left : left + width] = picture
-    return sheet
+def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
+    """Equally high pictures (H, W, 3) uint8 in a row, with a narrow white gap between them."""
+    gap = np.full((len(pictures[0]), 6, 3), 255, np.uint8)
+    spaced = [part for picture in pictures for part in (picture, gap)]
+    return np.concatenate(spaced[:-1], axis=1)
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from PIL import Image, ImageDraw
+from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
 from ..avatar.embedding import face_frames, to_local
@@ -20,6 +21,11 @@ MARGIN = 0.25
 """How far around the mesh's bounding box to look, as a share of its diagonal."""
 WITNESSES = 0.25
 """A voxel counts if at least this share of the views sees it at all (and all that do have it inside their mask)."""
+EXPOSED = 0.125
+"""... and if it shows beside the mesh in at least this share of the views. Without this, the hull's phantom volumes
+behind the head, which nothing contradicts, become floaters in every other view."""
+TRACKING_ERROR = 0.01
+"""How far, as a share of the image height, a tracked silhouette may be off the mask."""
 
 
 def hull_seeds(capture: Capture, views: Sequence[View], convention: str, sh_degree: int) -> Splats:
@@ -29,7 +35,7 @@ def hull_seeds(capture: Capture, views: Sequence[View], convention: str, sh_degr
     what differs from white); each seed is bound to the nearest triangle, so it follows the head.
     """
     mesh = capture.mesh(views[0].timestep)
-    points = _shell(mesh, views)
+    points = _shell(mesh, capture.faces, views)
     centroids = mesh[capture.faces].mean(1)
     distance, face = cKDTree(centroids).query(points)
     if len(mesh):
@@ -40,22 +46,36 @@ def hull_seeds(capture: Capture, views: Sequence[View], convention: str, sh_degr
     return to_local(world, frames, face[outside])
 
 
-def _shell(mesh: np.ndarray, views: Sequence[View]) -> np.ndarray:
-    """Grid points (N, 3) on the surface of the visual hull."""
+def _shell(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """Grid points (N, 3) on the surface of the visual hull that show beside the mesh."""
     low, high = mesh.min(0), mesh.max(0)
     margin = MARGIN * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, VOXEL) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = np.ones(len(grid), bool)
-    witnesses = np.zeros(len(grid), np.int32)
+    witnesses, exposed = np.zeros(len(grid), np.int32), np.zeros(len(grid), np.int32)
     for view in views:
-        mask = _foreground(view)
+        mask, beside = _foreground(view), ~_silhouette(mesh, faces, view.camera)
         alive = np.flatnonzero(inside)
         x, y, seen = _pixels(grid[alive], view.camera)
-        witnesses[alive[seen]] += 1
-        inside[alive[seen]] = mask[y[seen], x[seen]]
+        alive, x, y = alive[seen], x[seen], y[seen]
+        witnesses[alive] += 1
+        exposed[alive] += beside[y, x]
+        inside[alive] = mask[y, x]
     solid = (inside & (witnesses >= max(2, WITNESSES * len(views)))).reshape([len(a) for a in axes])
-    return np.asarray(grid[(solid & ~binary_erosion(solid)).ravel()])
+    surface = (solid & ~binary_erosion(solid)).ravel()
+    return np.asarray(grid[surface & (exposed >= np.maximum(1, EXPOSED * len(views)))])
+
+
+def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) bool: pixels that the mesh covers, or that a small tracking error would make it cover."""
+    p = mesh @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = p[:, :2] / np.maximum(p[:, 2:], 1e-6) * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
+    picture = Image.new("1", (camera.width, camera.height))
+    draw = ImageDraw.Draw(picture)
+    for corners in pixels[faces[(p[:, 2] > 0.01)[faces].all(1)]].reshape(-1, 6).tolist():
+        draw.polygon(corners, fill=1)
+    return np.asarray(binary_dilation(np.asarray(picture), iterations=max(1, round(TRACKING_ERROR * camera.height))))
 
 
 def _foreground(view: View) -> np.ndarray:

@@ -51,8 +51,6 @@ class Settings:
                    for "gaussian_avatars"
     sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
     seeds          add hull seeds for what the mesh does not cover
-    fade           pull on the opacity of loose splats, in pixels: one that matters to less than about so many pixels
-                   of any view fades away
     density_every  iterations between density control, 0 never; it works during `density_span` of the budget
     growth         most splats that density control may add, as a share of the initial number
     background     colour behind the head
@@ -80,7 +78,6 @@ class Settings:
     sh_degree: int = 3
     sh_steps: tuple[float, ...] = (0.3, 0.5, 0.7)
     seeds: bool = True
-    fade: float = 0.5
     density_every: int = 200
     density_span: tuple[float, float] = (0.1, 0.6)
     growth: float = 0.25

@@ -7,7 +7,7 @@ from ..avatar.embedding import face_areas
 from ..avatar.lattice import lattice_splats
 from ..avatar.splats import Splats
 from ..capture.model import Capture, View
-from ..raster.kernels.rows import distance_limit, fade, scale_limit
+from ..raster.kernels.rows import distance_limit, scale_limit
 from ..raster.render import (
     Parameters,
     Rendering,
@@ -68,9 +68,6 @@ class Trainer:
         focus = None if trains_globally(settings, self.iteration, self.visit, progress) else self._focus(view.timestep)
         rows, screen, loss = self._differentiate(view, target, sh_degree(settings, progress), focus)
         self._limit(rows)
-        if settings.fade:
-            opacity, pull = state.parameters.opacity.numpy(), np.float32(settings.fade / target.size)
-            fade(rows, opacity, state.loose.numpy(), pull, state.gradients.opacity.numpy())
         adam.step(state, rows, learning_rates(settings.rates, progress))
         if focus is None:
             state.pull.numpy()[rows] += screen[rows]

@@ -5,7 +5,7 @@ import numpy as np
 from ..avatar.embedding import WORLD
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
-from ..raster.kernels.rows import distance_limit, fade, scale_limit
+from ..raster.kernels.rows import distance_limit, scale_limit
 from ..raster.render import Parameters, camera_frames, render_backward, render_forward
 from . import adam
 from .losses import image_gradient, whole_image
@@ -37,5 +37,4 @@ def compile_kernels() -> None:
     limits = rows, state.parameters.log_scale.numpy(), face, state.loose.numpy(), np.ones(1, np.float32), 1.0
     scale_limit(*limits, gradients.log_scale)
     distance_limit(*limits, gradients.xyz)
-    fade(rows, state.parameters.opacity.numpy(), state.loose.numpy(), np.float32(1e-6), gradients.opacity)
     adam.step(state, rows, dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3))

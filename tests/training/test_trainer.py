@@ -2,14 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from capture import factory
+from PIL import Image
 
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
+from stga_addon.capture.open import open_capture
 from stga_addon.training.metrics import psnr
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import STRATEGIES
@@ -183,16 +187,27 @@ def test_pull_is_gathered_by_global_iterations_only(toy: Capture) -> None:
         assert trainer.state.seen.max() == expected
 
 
-def test_initial_splats_with_hull_seeds(toy: Capture) -> None:
+def test_initial_splats_with_hull_seeds(tmp_path: Path) -> None:
     """Catches seeds that are mixed up with the lattice, which would be exempt from its limits then."""
-    bare = initial_splats(toy, quick_settings(lattice=2))
-    full = initial_splats(toy, quick_settings(lattice=2, seeds=True))
-    assert len(bare) == 6 * len(toy.faces)
+    hairy = open_capture(factory.write_mesh_capture(tmp_path / "hairy"))
+    rows, columns = np.mgrid[: factory.HEIGHT, : factory.WIDTH] + 0.5
+    mask = np.hypot(columns - factory.CX, rows - factory.CY) < 29  # the ball itself: 20 pixels
+    for path in (tmp_path / "hairy" / "fg_masks").iterdir():
+        Image.fromarray(mask.astype(np.uint8) * 255).save(path)
+    bare = initial_splats(hairy, quick_settings(lattice=2))
+    full = initial_splats(hairy, quick_settings(lattice=2, seeds=True))
+    assert len(bare) == 6 * len(hairy.faces)
     assert not bare.loose.any()
-    assert len(full) > len(bare)
+    assert len(full) > len(bare) + 100
     assert full.loose[len(bare) :].all()
     for name, value in vars(bare).items():
         np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
+
+
+def test_nothing_beside_the_mesh_gives_no_seeds(toy: Capture) -> None:
+    """Catches the hull's phantom volumes behind the head, which few cameras on one side cannot contradict."""
+    full = initial_splats(toy, quick_settings(lattice=2, seeds=True))
+    assert not full.loose.any()
 
 
 def test_draw_is_a_copy(toy: Capture) -> None:

@@ -37,7 +37,7 @@ def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> Trai
 
 
 def quick_settings(strategy: str = "selective", **changes: Any) -> Settings:
-    """Without hull seeds, of which the toy's few cameras would make ten times the lattice."""
+    """Without hull seeds, which have tests of their own."""
     return make_settings(strategy, **{"iterations": 100, "seeds": False, **changes})
 
 

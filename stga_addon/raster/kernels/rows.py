@@ -107,18 +107,5 @@ def distance_limit(rows, xyz, face, loose, limit, weight, gradient):
 
 
 @jit
-def fade(rows, opacity, loose, weight, gradient):
-    """Add `weight` to the opacity gradient (N,) of the listed loose splats.
-
-    Adam turns even a tiny steady gradient into full steps, so a splat that no image holds against it (hidden behind
-    the head in every view, say) fades away, and one that any image needs does not notice.
-    """
-    for n in range(len(rows)):
-        if loose[rows[n]]:
-            o = ONE / (ONE + math.exp(-opacity[rows[n]]))
-            gradient[rows[n]] += weight * o * (ONE - o)
-
-
-@jit
 def _length(v):
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
