@@ -117,7 +117,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         ),
         "project backward": (
             lambda: project_backward(
-                arrays.xyz, arrays.rotation, arrays.log_scale, arrays.sh, 3, face, seen.origin, seen.matrix,
+                *arrays, 3, face, seen.origin, seen.matrix,
                 seen.to_world, seen.lens, seen.size, False, r.projected, rows, r.slot_start, r.slot_count,
                 pair_gradients, False, *gradients, screen,
             ),

@@ -16,7 +16,7 @@ from . import ids
 from .common import capture_of, file_path, head_of, needs_head, reporting, settings
 
 # module -> what pip calls it
-NEEDED = {"torch": "torch", "numba": "numba", "PIL": "pillow"}
+NEEDED = {"torch": "torch", "numba": "numba", "scipy": "scipy", "PIL": "pillow", "platformdirs": "platformdirs"}
 
 
 class Train(bpy.types.Operator):

@@ -183,8 +183,8 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        splats.xyz, splats.rotation, splats.log_scale, splats.sh, rendering.degree, face, seen.origin, seen.matrix,
-        seen.to_world, seen.lens, seen.size, rendering.depth_as_colour, rendering.projected, rows,
+        *splats, rendering.degree, face, seen.origin, seen.matrix, seen.to_world, seen.lens, seen.size,
+        rendering.depth_as_colour, rendering.projected, rows,
         rendering.slot_start, rendering.slot_count, pair_gradients, add, *gradients, screen,
     )  # fmt: skip
     return rows, screen

@@ -12,7 +12,7 @@ from stga_addon.demo.run import run_demo
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
-SMALL = CaptureOptions(train=2, test=1, cameras=4, width=72, height=100, samples=2)
+SMALL = CaptureOptions(train=2, test=1, cameras=6, width=72, height=100, samples=2)
 
 
 @pytest.mark.slow

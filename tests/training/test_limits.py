@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stga_addon.raster.kernels.rows import distance_limit, fade, scale_limit
+from stga_addon.raster.kernels.rows import distance_limit, scale_limit
 from stga_addon.training.trainer import reset_strays
 
 from .toys import bits, random_splats, random_state
@@ -58,18 +58,6 @@ def test_distance_limit(scene) -> None:
     np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-6)
     untouched = splats.loose | ~np.isin(np.arange(50), rows)
     np.testing.assert_array_equal(out[untouched], 0.25)
-
-
-def test_fade(scene) -> None:
-    """Catches a pull of the wrong sign, one on splats of the mesh, or one that overwrites what the image asks for."""
-    splats, rows, _ = scene
-    x = torch.tensor(splats.opacity, dtype=torch.float64, requires_grad=True)
-    (WEIGHT * torch.sigmoid(x)[rows[splats.loose[rows]]].sum()).backward()
-    assert x.grad.count_nonzero() > 5
-    out = np.full(50, 0.25, np.float32)
-    fade(rows, splats.opacity, splats.loose, np.float32(WEIGHT), out)
-    np.testing.assert_allclose(out - 0.25, x.grad, rtol=1e-4, atol=1e-7)
-    np.testing.assert_array_equal(out[~splats.loose | ~np.isin(np.arange(50), rows)], 0.25)
 
 
 @pytest.mark.parametrize("kernel", [scale_limit, distance_limit])

@@ -188,7 +188,7 @@ def _tan_limits(fx, fy, cx, cy, width, height):
 
 @parallel_jit
 def project_backward(
-    xyz, rotation, log_scale, sh, degree, face, origin, matrix, to_world, lens, size, depth_as_colour,
+    xyz, rotation, log_scale, opacity, sh, degree, face, origin, matrix, to_world, lens, size, depth_as_colour,
     projected, visible, slot_start, slot_count, grads, add,
     v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, screen,
 ):  # fmt: skip
@@ -292,8 +292,8 @@ def project_backward(
             vx, vy = vtx * rz, vty * rz
             vz -= (vtx * slope_x + vty * slope_y) * rz
 
-            o = projected[i, OPACITY]
-            v_opacity[i] += g[OPACITY] * o * (ONE - o)
+            # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
+            v_opacity[i] += g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
             if depth_as_colour:
                 vz += g[RED]
             else:
