@@ -21,6 +21,12 @@ def main(arguments: list[str] | None = None) -> int:
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith(__package__):
+            raise
+        python = sys.executable
+        print(f"stga: '{options.command}' needs the package '{error.name}', which {python} lacks", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("stga: interrupted", file=sys.stderr)
         return 130
@@ -40,11 +46,11 @@ def parser() -> argparse.ArgumentParser:
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
     budget.add_argument("--iterations", type=int, help="number of iterations instead")
     train.add_argument("--strategy", choices=STRATEGIES, help="default: what measured best, see docs/results.md")
-    train.add_argument("--schedule", choices=("default", "paper"), default="default", help="paper: by its letter")
+    train.add_argument("--schedule", choices=("default", "paper"), help="paper: by its letter")
     train.add_argument("--threshold", type=float, help="selection threshold in metres")
     train.add_argument("--resume", action="store_true", help="continue the run in the folder")
     train.add_argument("--device", choices=("auto", "cpu"), default="auto", help="auto takes the CPU in this version")
-    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--seed", type=int, help="fixes every random choice (default 0)")
 
     render = commands.add_parser("render", help="draw an avatar, one PNG per camera entry")
     render.add_argument("source", type=Path, metavar="RUN|AVATAR|PLY")
@@ -90,7 +96,7 @@ def _add_capture(command: argparse.ArgumentParser) -> None:
 
 def _add_principal_point(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--principal-point", choices=("vhap", "opencv", "centre"), default="vhap", help="what cy means in the capture"
+        "--principal-point", choices=("vhap", "opencv", "centre"), help="what cy means in the capture (default vhap)"
     )
 
 

@@ -19,29 +19,52 @@ from .selection import SelectionOptions, select_capture
 
 def train(options: Namespace) -> None:
     """Train, or continue, a run."""
-    from .training.folder import Run, read_run
+    from .training.folder import read_run
     from .training.progress import ProgressBar
     from .training.run import train as train_run
 
-    changes: dict[str, Any] = {"seed": options.seed}
-    run = read_run(options.out) if options.resume else _new_run(options, changes)
-    if options.resume and run.capture != options.capture.resolve():
-        raise StgaError(f"{options.out}: this run trains {run.capture}, not {options.capture.resolve()}")
-    if not options.resume and (options.out / "run.json").exists():
-        raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
+    if options.resume:
+        run = read_run(options.out)
+        _refuse_changes(options, run)
+    else:
+        run = _new_run(options)
+        if (options.out / "run.json").exists():
+            raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
     capture = open_capture(run.capture, options.flame or run.flame, run.principal_point)
     for warning in capture.warnings:
         print(f"warning: {warning}")
-    assert isinstance(run, Run)
     with ProgressBar() as bar:
         avatar = train_run(capture, options.out, run, resume=options.resume, report=bar.report)
     print(f"avatar: {avatar}")
 
 
-def _new_run(options: Namespace, changes: dict[str, Any]) -> Any:
+def _refuse_changes(options: Namespace, run: Any) -> None:
+    """A resumed run ends where an unbroken one would have: with its own capture and settings."""
+    if run.capture != options.capture.resolve():
+        raise StgaError(f"{options.out}: this run trains {run.capture}, not {options.capture.resolve()}")
+    settings = run.settings
+    began_with = {
+        "budget": settings.seconds,
+        "iterations": settings.iterations,
+        "strategy": settings.strategy,
+        "schedule": settings.schedule,
+        "threshold": settings.selection.threshold,
+        "seed": settings.seed,
+        "principal_point": run.principal_point,
+    }
+    for name, value in began_with.items():
+        if getattr(options, name) not in (None, value):
+            option = "--" + name.replace("_", "-")
+            raise StgaError(f"{option}: this run began with {value}, which cannot change; use another --out")
+
+
+def _new_run(options: Namespace) -> Any:
     from .training.folder import Run
     from .training.settings import make_settings
 
+    changes: dict[str, Any] = {}
+    if options.seed is not None:
+        changes["seed"] = options.seed
     if options.iterations is not None:
         changes["iterations"] = options.iterations
     else:
@@ -51,8 +74,8 @@ def _new_run(options: Namespace, changes: dict[str, Any]) -> Any:
     if options.threshold is not None:
         changes["selection"] = SelectionOptions(threshold=options.threshold)
     flame = None if options.flame is None else options.flame.resolve()
-    settings = make_settings(schedule=options.schedule, **changes)
-    return Run(options.capture.resolve(), flame, options.principal_point, settings)
+    settings = make_settings(schedule=options.schedule or "default", **changes)
+    return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
 
 
 def render(options: Namespace) -> None:
@@ -63,7 +86,7 @@ def render(options: Namespace) -> None:
     from .capture.transforms import read_transforms
 
     draw = _drawer(options)
-    frames = read_transforms(options.cameras, options.principal_point)
+    frames = read_transforms(options.cameras, options.principal_point or "vhap")
     names = _unique_names([frame.view.name for frame in frames])
     for frame, name in zip(tqdm(frames, desc="rendering", unit="image"), names, strict=True):
         pixels = np.rint(draw(frame.view).transpose(1, 2, 0) * 255).astype(np.uint8)
@@ -92,13 +115,16 @@ def _mesh(capture: Capture, view: View) -> np.ndarray:
 
 
 def _unique_names(paths: list[str]) -> list[str]:
-    """File names with the suffix .png; where two entries share one, their folders become part of it."""
-    short = [PurePosixPath(path).with_suffix(".png").name for path in paths]
-    if len(set(short)) == len(short):
-        return short
-    return [
-        "_".join(p for p in PurePosixPath(path).with_suffix(".png").parts if p not in ("..", "/")) for path in paths
-    ]
+    """File names with the suffix .png; where entries share one, their folders become part of it, then a number."""
+    pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
+    names = [png.name for png in pngs]
+    if len(set(names)) < len(names):
+        names = ["_".join(part for part in png.parts if part not in ("..", "/")) for png in pngs]
+    unique: list[str] = []
+    for name in names:
+        candidates = (name, *(f"{PurePosixPath(name).stem}_{n}.png" for n in range(2, len(names) + 2)))
+        unique.append(next(c for c in candidates if c not in unique))
+    return unique
 
 
 def eval(options: Namespace) -> None:
@@ -107,8 +133,10 @@ def eval(options: Namespace) -> None:
     from .raster.draw import draw_avatar
     from .training.metrics import evaluate
 
+    if not options.run.is_dir():
+        raise StgaError(f"{options.run}: is not a folder; expected that of a run")
     avatar, capture = _avatar_and_capture(options.run, None, None)
-    assert capture is not None
+    assert capture is not None  # a run names one
     views = capture.views.get(options.split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{options.split}'")
@@ -123,7 +151,7 @@ def eval(options: Namespace) -> None:
 
 def select(options: Namespace) -> None:
     """Print how many triangles each frame selects."""
-    capture = open_capture(options.capture, options.flame, options.principal_point)
+    capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
     threshold = SelectionOptions.threshold if options.threshold is None else options.threshold
     selection = select_capture(capture, SelectionOptions(threshold=threshold, zero_pose=options.zero_pose))
     print(f"threshold {1000 * threshold:g} mm, {len(capture.faces)} triangles")
@@ -181,7 +209,7 @@ def info(options: Namespace) -> None:
     """Print what a capture holds."""
     from .capture.summary import describe
 
-    lines = describe(open_capture(options.capture, options.flame, options.principal_point))
+    lines = describe(open_capture(options.capture, options.flame, options.principal_point or "vhap"))
     width = max(len(label) for label, _ in lines)
     for label, value in lines:
         print(f"{label:<{width}}  {value}")

@@ -5,7 +5,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # where the folder is the problem, that was said above
+            partial.unlink()
 
 
 def read_json(path: Path) -> Any:
@@ -61,7 +62,11 @@ def read_npz(path: Path, max_bytes: int = 4 << 30) -> dict[str, np.ndarray]:
         if unpacked > max_bytes:
             raise StgaError(f"{path}: unpacks to {unpacked} bytes, more than the {max_bytes} allowed")
         with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
+            arrays = {name: data[name] for name in data.files}
+        strangers = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
+        if strangers:
+            raise StgaError(f"{path}: is not a readable npz file (entry '{strangers[0]}' is no array)")
+        return arrays
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, MemoryError) as error:

@@ -1,4 +1,4 @@
-"""Which triangles really moved, and so which splats a frame trains (METHOD 3)."""
+"""Which triangles really moved, and so which splats a frame trains (STGA, selective training)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

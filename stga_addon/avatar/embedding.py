@@ -1,4 +1,4 @@
-"""Where a splat stands when its triangle moves: one local frame per triangle (METHOD 1)."""
+"""Where a splat stands when its triangle moves: one local frame per triangle (STGA, embedding)."""
 
 from dataclasses import dataclass, replace
 
@@ -133,7 +133,7 @@ def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
 
 
 def _normal(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray) -> np.ndarray:
-    return np.cross(p1 - p0, p2 - p0)
+    return np.asarray(np.cross(p1 - p0, p2 - p0))
 
 
 def _orthonormal(first: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Pictures of a finished avatar: what `render`, `eval` and the render engine show."""
+"""Pictures of a finished avatar: what `render` and `eval` show."""
 
 import numpy as np
 

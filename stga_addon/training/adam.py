@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..raster.kernels.rows import adam_rows
+from ..raster.render import Parameters
 from .state import TrainState
 
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
@@ -21,6 +22,12 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> Non
         row[:] = rates[name]
         if name == "sh":
             row[3:] = rates["sh_rest"]
-    parts = (state.parameters, state.gradients, state.first, state.second)
-    tables = (tuple(t.numpy().reshape(len(state), -1) for t in part) for part in parts)
-    adam_rows(rows, state.steps.numpy(), *tables, by_column, BETA1, BETA2, EPSILON)
+    adam_rows(
+        rows, state.steps.numpy(), _tables(state.parameters), _tables(state.gradients), _tables(state.first),
+        _tables(state.second), by_column, BETA1, BETA2, EPSILON,
+    )  # fmt: skip
+
+
+def _tables(tensors: Parameters) -> tuple[np.ndarray, ...]:
+    """Each tensor as a numpy array (N, D) that shares its memory."""
+    return tuple(t.numpy().reshape(len(t), -1) for t in tensors)

@@ -42,6 +42,7 @@ class Checkpoint:
 
     elapsed_s  seconds of training so far, evaluation not counted
     best_psnr  of avatar.npz, dB; −inf before the first evaluation
+    losses     of the last global iterations
     """
 
     state: TrainState
@@ -52,6 +53,7 @@ class Checkpoint:
     elapsed_s: float
     best_psnr: float
     evaluations: int
+    losses: list[float]
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -124,12 +126,25 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         for name in [n for n in tensors if n.startswith("first/")]:
             tensors[name.replace("first/", "gradients/")] = torch.zeros_like(tensors[name])
+        if any(tensor.ndim == 0 for tensor in tensors.values()):
+            raise StgaError(f"{path}: an array has no rows")
         state = state_of(tensors)
-        if {len(t) for t in tensors.values()} != {len(state)}:
-            raise StgaError(f"{path}: its arrays differ in length")
+        _check_state(path, state)
         return Checkpoint(state=state, **meta)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
+
+
+def _check_state(path: Path, state: TrainState) -> None:
+    """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the array."""
+    n, coefficients = len(state), state.parameters.sh.shape[1]
+    tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "opacity": (), "sh": (coefficients, 3)}
+    whole = {"steps": torch.int32, "face": torch.int32, "loose": torch.bool}
+    for name, tensor in tensors_of(state).items():
+        dtype = whole.get(name, torch.float32)
+        shape = (n, *tails.get(name.rpartition("/")[2], ()))
+        if tensor.dtype != dtype or tuple(tensor.shape) != shape:
+            raise StgaError(f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {shape}")
 
 
 def append_metrics(folder: Path, line: dict[str, Any]) -> None:
@@ -165,6 +180,9 @@ def locked(folder: Path) -> Iterator[None]:
     path = folder / "run.lock"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StgaError(f"{folder}: cannot be written as a folder ({error.strerror or error})") from error
+    try:
         if path.exists() and not _alive(path):
             path.unlink(missing_ok=True)
         with path.open("x", encoding="ascii") as out:

@@ -31,6 +31,7 @@ def evaluate(draw: Callable[[View], np.ndarray], views: Iterable[View], perceptu
     scores = []
     for view in views:
         image, target = np.clip(draw(view), 0, 1), read_image(view)
+        target.setflags(write=False)  # as in training; Numba would compile anew for writable arrays
         lpips = _lpips(image, target) if perceptual else None
         scores.append((psnr(image, target), similarity(image, target), np.nan if lpips is None else lpips))
     mean = np.mean(scores, axis=0) if scores else [np.nan] * 3

@@ -104,14 +104,20 @@ class _Loop:
         self._tell("reading the checkpoint")
         checkpoint = run_folder.read_checkpoint(self.out)
         selection = run_folder.read_selection(self.out, len(self.capture.faces))
+        face = checkpoint.state.face
+        if len(face) and not 0 <= int(face.min()) <= int(face.max()) < len(self.capture.faces):
+            raise StgaError(f"{self.out}: its splats stand on triangles that {self.capture.root} does not have")
         self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state)
         self.trainer.continue_from(checkpoint)
+        self.losses.extend(checkpoint.losses)
         self.elapsed, self.best = checkpoint.elapsed_s, checkpoint.best_psnr
         self.evaluations = checkpoint.evaluations
         run_folder.cut_metrics(self.out, checkpoint.iteration)
 
     def work(self) -> None:
         """Train until the budget is spent or the report says stop."""
+        if self._share() >= 1:
+            return  # a finished run was resumed
         settings, trainer = self.settings, self.trainer
         views = self.capture.views["train"]
         order = view_order(views, settings.views_per_visit, settings.seed, trainer.iteration)
@@ -147,7 +153,7 @@ class _Loop:
         """Look at the held-out views, write the metrics down, and keep the avatar if it is the best so far."""
         share = min(1.0, self._share())
         self.evaluations = max(self.evaluations, int(share * EVALUATIONS))
-        views = self.capture.views.get("val", ()) if last else watch_views(self.capture)
+        views = watch_views(self.capture)
         begin = perf_counter()
         line = {
             "iteration": self.trainer.iteration,
@@ -183,7 +189,7 @@ class _Loop:
             self.out,
             Checkpoint(
                 trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
-                self.elapsed, self.best, self.evaluations,
+                self.elapsed, self.best, self.evaluations, list(self.losses),
             ),
         )  # fmt: skip
 

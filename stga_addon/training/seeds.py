@@ -8,6 +8,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
 from ..avatar.embedding import face_frames, to_local
+from ..avatar.lattice import lattice_weights
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
 from ..capture.images import read_image, read_mask
@@ -36,14 +37,19 @@ def hull_seeds(capture: Capture, views: Sequence[View], convention: str, sh_degr
     """
     mesh = capture.mesh(views[0].timestep)
     points = _shell(mesh, capture.faces, views)
-    centroids = mesh[capture.faces].mean(1)
-    distance, face = cKDTree(centroids).query(points)
-    if len(mesh):
-        distance = np.minimum(distance, cKDTree(mesh).query(points)[0])
+    distance, face = _nearest_triangle(points, mesh, capture.faces)
     outside = distance > CLEARANCE
     world = _seeds(points[outside], sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(world, frames, face[outside])
+
+
+def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) to the mesh and nearest triangle (N,), by a lattice of samples on every triangle."""
+    weights = lattice_weights(4, inset=0.02)
+    samples = np.einsum("pc,fci->fpi", weights, mesh[faces]).reshape(-1, 3)
+    distance, nearest = cKDTree(samples).query(points)
+    return distance, nearest // len(weights)
 
 
 def _shell(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from types import NoneType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import StgaError
 from ..selection import SelectionOptions
@@ -34,6 +35,7 @@ class Settings:
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
                    ones; "gaussian-avatars" is global training with that method's binding, losses and rates
+    schedule       "paper" took the paper's letter wherever `PAPER` differs from the defaults
     seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two
     seed           fixes the order of views and every random choice
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA, embedding)
@@ -57,6 +59,7 @@ class Settings:
     """
 
     strategy: str = "selective"
+    schedule: str = "default"
     seconds: float | None = None
     iterations: int | None = None
     seed: int = 0
@@ -92,7 +95,7 @@ PAPER = {
     "stray_limit": 1.0,
     "lattice": 4,
     "seeds": False,
-    "selection": SelectionOptions(threshold=0.01),
+    "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
 """The paper's letter, where it differs from the defaults, which are what measured best (docs/results.md)."""
 
@@ -122,11 +125,15 @@ def make_settings(strategy: str = "selective", schedule: str = "default", **chan
         base.update(PAPER)
     if strategy == "gaussian-avatars":
         base.update(GAUSSIAN_AVATARS)
-    settings = Settings(**{**base, "strategy": strategy, **changes})
+    settings = Settings(**{**base, "strategy": strategy, "schedule": schedule, **changes})
     if (settings.seconds is None) == (settings.iterations is None):
         raise StgaError("give a budget in wall time (--budget) or in iterations (--iterations), one of the two")
     if not (settings.seconds or settings.iterations or 0) > 0:
         raise StgaError("the budget must be more than nothing")
+    if settings.seed < 0:
+        raise StgaError(f"--seed: {settings.seed} is negative, expected a whole number from 0 up")
+    if not 0 <= settings.selection.threshold < float("inf"):
+        raise StgaError(f"--threshold: {settings.selection.threshold} is no distance in metres")
     return settings
 
 
@@ -142,4 +149,19 @@ def from_json(values: dict[str, Any]) -> Settings:
     values["rates"] = Rates(**values["rates"])
     for name in ("sh_steps", "density_span", "background"):
         values[name] = tuple(values[name])
-    return Settings(**values)
+    settings = Settings(**values)
+    for part in (settings, settings.selection, settings.rates):
+        _check_types(part)
+    return settings
+
+
+def _check_types(part: Any) -> None:
+    """Raise TypeError where a plain value is of another type than its field says."""
+    for name, hint in get_type_hints(type(part)).items():
+        plain = [kind for kind in (get_args(hint) or (hint,)) if kind in (int, float, str, bool, NoneType)]
+        if get_origin(hint) is tuple or not plain:
+            continue
+        value = getattr(part, name)
+        wanted = (*plain, int) if float in plain else tuple(plain)
+        if not isinstance(value, wanted) or (isinstance(value, bool) and bool not in plain):
+            raise TypeError(f"{name} is {value!r}")

@@ -45,7 +45,7 @@ class Trainer:
         self.capture, self.settings, self.selection = capture, settings, selection
         self.frames = FrameStore(capture, settings.convention)
         self.state = new_state(initial_splats(capture, settings)) if state is None else state
-        self.iteration, self.visit = 0, 0
+        self.iteration, self.visit = 0, -1
         self.initial_count = len(self.state)
         self._scratch = Scratch()
         self._background = np.array(settings.background, np.float32)

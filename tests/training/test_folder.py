@@ -26,7 +26,7 @@ def make_run(**changes: Any) -> Run:
 
 
 def make_checkpoint() -> Checkpoint:
-    return Checkpoint(random_state(12, FACES), 34, 7, 3, 10, 12.5, 31.25, 4)
+    return Checkpoint(random_state(12, FACES), 34, 7, 3, 10, 12.5, 31.25, 4, [0.5, 0.25])
 
 
 def edit_json(path: Path, **changes: Any) -> None:
@@ -111,7 +111,7 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 
 def test_checkpoint_before_any_evaluation(tmp_path: Path) -> None:
     """Catches −inf and None, which plain JSON does not know, lost on their way."""
-    checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, -np.inf, 0)
+    checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, -np.inf, 0, [])
     folder.write_checkpoint(tmp_path, checkpoint)
     again = folder.read_checkpoint(tmp_path)
     assert (again.best_psnr, again.last_timestep) == (-np.inf, None)

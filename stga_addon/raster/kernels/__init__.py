@@ -6,12 +6,14 @@ that no run-time alias checks are needed.
 """
 
 import numba
+from numba.core import config
 from platformdirs import user_cache_path
 
 # Compiled kernels are kept between processes, but never in the package's own folder: an installed extension must
 # not write there. NUMBA_CACHE_DIR still wins.
-if not numba.config.CACHE_DIR:
-    numba.config.CACHE_DIR = str(user_cache_path("stga", appauthor=False) / "kernels")
+# Numba sets its options as module attributes while it is imported, where mypy cannot see them.
+if not config.CACHE_DIR:  # type: ignore[attr-defined]
+    config.CACHE_DIR = str(user_cache_path("stga", appauthor=False) / "kernels")  # type: ignore[attr-defined]
 
 # Reassociation and contraction let reductions vectorise; NaN and infinity keep their meaning, because a broken
 # splat must be recognised and dropped.
