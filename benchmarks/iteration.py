@@ -141,7 +141,7 @@ def iteration(splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camer
         r = render_forward(arrays, face, seen, 3, background, focus, REACH, scratch=scratch)
         rectangles = whole_image(camera.height, camera.width)
         if focus is not None:
-            tiles = touched_tiles(r.rect, focus, -(-camera.width // 16), -(-camera.height // 16))
+            tiles = touched_tiles(r, focus)
             rectangles = tile_rectangles(tiles, camera.height, camera.width)
         v_image = scratch.take("v_image", r.image.shape)
         image_gradient(r.image, target, rectangles, 0.2, v_image)

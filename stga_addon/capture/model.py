@@ -32,7 +32,7 @@ class Capture:
     timesteps  all timesteps that have a mesh, ascending
     regions    key region name -> (F,) bool
     mesh       timestep -> (V, 3) float64, the tracked mesh in world space; read when called
-    expression_mesh  (timestep, zero_pose) -> (V, 3) float64 with the rigid head motion removed (STGA, selective training)
+    expression_mesh  (timestep, zero_pose) -> (V, 3) float64 without rigid head motion (STGA, selective training)
     flame      the parameters and model behind the meshes, for FLAME captures
     given_selection  timestep -> (F,) bool where the capture came with its own selection
     warnings   one sentence each, for the person who opened it

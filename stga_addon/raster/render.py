@@ -9,7 +9,7 @@ import torch
 
 from ..avatar.embedding import WORLD, FaceFrames
 from ..capture.camera import Camera
-from .kernels.bins import count_pairs, depth_order, fill_pairs
+from .kernels.bins import count_pairs, depth_order, fill_pairs, mark_tiles
 from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
 from .kernels.project import project_backward, project_forward
 
@@ -133,7 +133,7 @@ def render_forward(
 
     tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
     if focus is not None:
-        tiles = tiles[_near(touched_tiles(rect, focus, tiles_x, tiles_y), reach).ravel()]
+        tiles = tiles[_near(_touched(rect, focus, visible, (camera.height, camera.width)), reach).ravel()]
     tiles = _deal(tiles, numba.get_num_threads())
     image = take("image", (3, camera.height, camera.width))
     transmittance = take("transmittance", (camera.height, camera.width))
@@ -167,11 +167,11 @@ def render_backward(
     the projected centre in units of half the image.
     """
     n, take = len(splats.xyz), (scratch or Scratch()).take
-    tiles_x, tiles_y = _tile_grid(seen.camera)
+    tiles_x, _ = _tile_grid(seen.camera)
     tiles, rows = rendering.tiles, rendering.visible
     wanted = np.ones(n, bool) if focus is None else focus
     if focus is not None:
-        tiles = tiles[touched_tiles(rendering.rect, focus, tiles_x, tiles_y).ravel()[tiles]]
+        tiles = tiles[touched_tiles(rendering, focus).ravel()[tiles]]
         rows = rows[focus[rows]]
     pair_gradients = take("pair_gradients", (len(rendering.pair_slot), PROJECTED))
     screen = take("screen", (n,))
@@ -190,13 +190,15 @@ def render_backward(
     return rows, screen
 
 
-def touched_tiles(rect: np.ndarray, focus: np.ndarray, tiles_x: int, tiles_y: int) -> np.ndarray:
-    """(tiles_y, tiles_x) bool: the tiles that a splat of `focus` (N,) bool reaches; rect (N, 4) tile bounds."""
-    x0, y0, x1, y1 = rect[focus & (rect[:, 2] > rect[:, 0])].T
-    corners = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
-    for y, x, sign in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
-        np.add.at(corners, (y, x), sign)
-    return np.asarray(corners.cumsum(0).cumsum(1)[:-1, :-1] > 0)
+def touched_tiles(rendering: Rendering, focus: np.ndarray) -> np.ndarray:
+    """(tiles_y, tiles_x) bool: the tiles that a splat of `focus` (N,) bool reaches."""
+    return _touched(rendering.rect, focus, rendering.visible, rendering.last.shape)
+
+
+def _touched(rect: np.ndarray, focus: np.ndarray, visible: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    marked = np.zeros([-(-pixels // TILE) for pixels in size], bool)
+    mark_tiles(rect, focus, visible, marked)
+    return marked
 
 
 def _tile_grid(camera: Camera) -> tuple[int, int]:

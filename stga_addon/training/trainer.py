@@ -89,7 +89,7 @@ class Trainer:
         if focus is None:
             rectangles = whole_image(height, width)
         else:
-            tiles = touched_tiles(rendering.rect, focus, -(-width // 16), -(-height // 16))
+            tiles = touched_tiles(rendering, focus)
             rectangles = tile_rectangles(tiles, height, width)
         v_image = self._scratch.take("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, settings.ssim_weight, v_image)

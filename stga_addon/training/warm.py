@@ -6,7 +6,7 @@ from ..avatar.embedding import WORLD
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
 from ..raster.kernels.rows import distance_limit, scale_limit
-from ..raster.render import Parameters, camera_frames, render_backward, render_forward
+from ..raster.render import Parameters, camera_frames, render_backward, render_forward, touched_tiles
 from . import adam
 from .losses import image_gradient, whole_image
 from .state import new_state
@@ -28,6 +28,7 @@ def compile_kernels() -> None:
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     seen, face = camera_frames(WORLD, camera), state.face.numpy()
     rendering = render_forward(state.arrays(), face, seen, 3)
+    touched_tiles(rendering, np.ones(2, bool))
     gradient = np.empty_like(rendering.image)
     target = np.zeros((16, 16, 3), np.uint8)
     target.setflags(write=False)  # as the loader's are; Numba compiles for that

@@ -87,3 +87,14 @@ def fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, bands, pair_spl
                     pair_slot[place[at]] = slot
                     place[at] += 1
                     slot += 1
+
+
+@jit
+def mark_tiles(rect, focus, visible, marked):
+    """Set marked (tiles_y, tiles_x) bool where a visible (M,) splat of focus (N,) bool reaches; rect (N, 4)."""
+    for n in range(len(visible)):
+        i = visible[n]
+        if focus[i]:
+            for y in range(rect[i, 1], rect[i, 3]):
+                for x in range(rect[i, 0], rect[i, 2]):
+                    marked[y, x] = True

@@ -23,9 +23,9 @@ PROJECTED = 9
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
 # around in Python, and the test for it keeps LLVM from vectorising (12 times slower).
-ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y = (np.uint64(n * PIXELS) for n in range(1, 8))
+ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, WEIGHT, PULL = (np.uint64(n * PIXELS) for n in range(1, 10))
 BEHIND, V_RED, V_GREEN, V_BLUE = ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE
-STATE = 8 * PIXELS
+STATE = 10 * PIXELS
 
 
 @inline_jit
@@ -153,7 +153,10 @@ def blend_backward(
             slot = pair_slot[j]
             for c in range(PROJECTED):
                 grads[slot, c] = np.float32(0.0)
-        for j in range(begin + deepest - 1, begin - 1, -1):
+        nearest = begin  # nothing in front of the first wanted pair needs to be walked
+        while nearest < begin + deepest and not wanted[pair_splat[nearest]]:
+            nearest += 1
+        for j in range(begin + deepest - 1, nearest - 1, -1):
             i = pair_splat[j]
             mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
             a_, b_, c_ = projected[i, CONIC_A], projected[i, CONIC_B], projected[i, CONIC_C]
@@ -162,7 +165,6 @@ def blend_backward(
             red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
             first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
             order = np.float32(j - begin + 1)
-            g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
             for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
                 dx = s[X + p] - mean_x
                 dy = s[Y + p] - mean_y
@@ -173,30 +175,36 @@ def blend_backward(
                 ra = np.float32(1.0) / (np.float32(1.0) - a)
                 t = s[p] * ra
                 weight = a * t
-                vr, vg, vb = s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p]
-                along = red * vr + green * vg + blue * vb
+                along = red * s[V_RED + p] + green * s[V_GREEN + p] + blue * s[V_BLUE + p]
                 v_a = t * along - ra * s[BEHIND + p]
                 s[p] = t
                 s[BEHIND + p] += weight * along
+                s[WEIGHT + p] = weight
                 # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
-                g = a * v_a if raw < ALPHA_MAX else np.float32(0.0)
+                s[PULL + p] = a * v_a if raw < ALPHA_MAX else np.float32(0.0)
+            if not wanted[i]:
+                continue  # a frozen splat only has to be stepped through, in the very same arithmetic
+            g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
+            for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
+                dx = s[X + p] - mean_x
+                dy = s[Y + p] - mean_y
+                g, weight = s[PULL + p], s[WEIGHT + p]
                 g0 += g
                 gx += g * dx
                 gy += g * dy
                 gxx += g * dx * dx
                 gxy += g * dx * dy
                 gyy += g * dy * dy
-                gr += weight * vr
-                gg += weight * vg
-                gb += weight * vb
-            if wanted[i]:
-                slot = pair_slot[j]
-                grads[slot, MEAN_X] = a_ * gx + b_ * gy
-                grads[slot, MEAN_Y] = b_ * gx + c_ * gy
-                grads[slot, CONIC_A] = np.float32(-0.5) * gxx
-                grads[slot, CONIC_B] = -gxy
-                grads[slot, CONIC_C] = np.float32(-0.5) * gyy
-                grads[slot, OPACITY] = g0 / opacity
-                grads[slot, RED] = gr
-                grads[slot, GREEN] = gg
-                grads[slot, BLUE] = gb
+                gr += weight * s[V_RED + p]
+                gg += weight * s[V_GREEN + p]
+                gb += weight * s[V_BLUE + p]
+            slot = pair_slot[j]
+            grads[slot, MEAN_X] = a_ * gx + b_ * gy
+            grads[slot, MEAN_Y] = b_ * gx + c_ * gy
+            grads[slot, CONIC_A] = np.float32(-0.5) * gxx
+            grads[slot, CONIC_B] = -gxy
+            grads[slot, CONIC_C] = np.float32(-0.5) * gyy
+            grads[slot, OPACITY] = g0 / opacity
+            grads[slot, RED] = gr
+            grads[slot, GREEN] = gg
+            grads[slot, BLUE] = gb
