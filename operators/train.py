@@ -19,6 +19,19 @@ from .common import capture_of, file_path, head_of, needs_head, reporting, setti
 NEEDED = {"torch": "torch", "numba": "numba", "scipy": "scipy", "PIL": "pillow", "platformdirs": "platformdirs"}
 
 
+def strategy_property() -> Any:
+    """The choice of strategy: the operator's, and the panel's that is handed to it."""
+    return bpy.props.EnumProperty(
+        name="Strategy",
+        description="Which splats an iteration trains",
+        items=(
+            ("global", "Global", "Every iteration trains all splats: best on the captures measured so far"),
+            ("selective", "Selective", "Local iterations on what each frame selects, global ones in between"),
+            ("gaussian-avatars", "GaussianAvatars", "That method's binding, losses and rates"),
+        ),
+    )
+
+
 class Train(bpy.types.Operator):
     """Train the avatar on the capture's images, in Blender's own process; Blender waits until the time is up"""
 
@@ -36,15 +49,7 @@ class Train(bpy.types.Operator):
     iterations: bpy.props.IntProperty(
         name="Iterations", description="Train this many iterations, whatever time they take; 0: by time", min=0
     )
-    strategy: bpy.props.EnumProperty(
-        name="Strategy",
-        description="Which splats an iteration trains",
-        items=(
-            ("selective", "Selective", "Local iterations on what each frame selects, global ones in between"),
-            ("global", "Global", "Every iteration trains all splats"),
-            ("gaussian-avatars", "GaussianAvatars", "That method's binding, losses and rates"),
-        ),
-    )
+    strategy: strategy_property()
     seed: bpy.props.IntProperty(name="Seed", description="Fixes every random choice", min=0)
 
     resume: bpy.props.BoolProperty(

@@ -45,7 +45,11 @@ def parser() -> argparse.ArgumentParser:
     budget = train.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
     budget.add_argument("--iterations", type=int, help="number of iterations instead")
-    train.add_argument("--strategy", choices=STRATEGIES, help="default: what measured best, see docs/results.md")
+    train.add_argument(
+        "--strategy",
+        choices=STRATEGIES,
+        help="default: global, which measured best (docs/results.md); selective with --schedule paper",
+    )
     train.add_argument("--schedule", choices=("default", "paper"), help="paper: by its letter")
     train.add_argument("--threshold", type=float, help="selection threshold in metres")
     train.add_argument("--resume", action="store_true", help="continue the run in the folder")

@@ -55,11 +55,13 @@ class TrainPanel(_Step, bpy.types.Panel):
         layout, chosen = self.layout, settings(context)
         layout.prop(chosen, "run_folder")
         layout.prop(chosen, "resume")
-        row = layout.row()
-        row.active = not chosen.resume  # a run that goes on keeps its budget
-        row.prop(chosen, "minutes")
+        column = layout.column()
+        column.active = not chosen.resume  # a run that goes on keeps its budget and strategy
+        column.prop(chosen, "minutes")
+        column.prop(chosen, "strategy")
         train = layout.operator(ids.TRAIN, icon="PLAY")
         train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, chosen.resume
+        train.strategy = chosen.strategy
 
 
 class ShowPanel(_Step, bpy.types.Panel):

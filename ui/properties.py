@@ -4,6 +4,7 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import register_classes, unregister_classes
+from ..operators.train import strategy_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
@@ -26,6 +27,7 @@ class Settings(bpy.types.PropertyGroup):
         default="//stga_run",
     )
     minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
+    strategy: strategy_property()
     resume: bpy.props.BoolProperty(name="Resume", description="Continue the run in the folder instead of a new one")
     avatar: bpy.props.StringProperty(
         name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
