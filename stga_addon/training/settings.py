@@ -34,7 +34,8 @@ class Settings:
     """One training run.
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
-                   ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training with that method's binding, losses and rates
+                   ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training
+                   with that method's binding, losses and rates
     schedule       "paper" took the paper's letter wherever `PAPER` differs from the defaults
     seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two
     seed           fixes the order of views and every random choice
