@@ -5,20 +5,35 @@ instead), use float32 constants only, and address several per-pixel values as of
 that no run-time alias checks are needed.
 """
 
+import os
+from typing import Any
+
 import numba
 from numba.core import config
 from platformdirs import user_cache_path
-
-# Compiled kernels are kept between processes, but never in the package's own folder: an installed extension must
-# not write there. NUMBA_CACHE_DIR still wins.
-# Numba sets its options as module attributes while it is imported, where mypy cannot see them.
-if not config.CACHE_DIR:  # type: ignore[attr-defined]
-    config.CACHE_DIR = str(user_cache_path("stga", appauthor=False) / "kernels")  # type: ignore[attr-defined]
 
 # Reassociation and contraction let reductions vectorise; NaN and infinity keep their meaning, because a broken
 # splat must be recognised and dropped.
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
-jit = numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True)
-parallel_jit = numba.njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+# Compiled kernels are kept between processes, but never in the package's own folder: an installed extension must
+# not write there. One folder per package name, because a cached kernel refers to its modules by name, and the same
+# files may be imported as `stga_addon` and as part of an extension.
+CACHE = os.environ.get("NUMBA_CACHE_DIR") or str(user_cache_path("stga", appauthor=False) / "kernels" / __name__)
+
+
+def _cached(**options: Any) -> Any:
+    def decorate(function: Any) -> Any:
+        before = vars(config)["CACHE_DIR"]
+        vars(config)["CACHE_DIR"] = CACHE  # read while decorating; other users of Numba keep their own
+        try:
+            return numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True, **options)(function)
+        finally:
+            vars(config)["CACHE_DIR"] = before
+
+    return decorate
+
+
+jit = _cached()
+parallel_jit = _cached(parallel=True)
 inline_jit = numba.njit(fastmath=FASTMATH, error_model="numpy", inline="always")

@@ -18,7 +18,9 @@ STOP = np.float32(1e-4)
 LOG2E = np.float32(1.4426950408889634)
 
 # Columns of the projected splat (see project.py) and of the gradient of one (tile, splat) pair.
-MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, RED, GREEN, BLUE = range(9)
+# Its density is 2^power, power = −½·log2(e)·(PRECISION_X·(dx − SHEAR·dy)² + PRECISION_Y·dy²). The usual three entries
+# of the inverse covariance lose the small one of a long needle, and with it the sign of the power; squares cannot.
+MEAN_X, MEAN_Y, PRECISION_X, SHEAR, PRECISION_Y, OPACITY, RED, GREEN, BLUE = range(9)
 PROJECTED = 9
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
@@ -82,17 +84,17 @@ def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, backgr
                     break
             i = pair_splat[j]
             mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
-            qa = np.float32(-0.5) * LOG2E * projected[i, CONIC_A]
-            qb = -LOG2E * projected[i, CONIC_B]
-            qc = np.float32(-0.5) * LOG2E * projected[i, CONIC_C]
+            qx = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
+            qy = np.float32(-0.5) * LOG2E * projected[i, PRECISION_Y]
+            shear = projected[i, SHEAR]
             opacity = projected[i, OPACITY]
             red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
             first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
             order = np.float32(j - begin + 1)
             for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
-                dx = s[X + p] - mean_x
                 dy = s[Y + p] - mean_y
-                power = qa * dx * dx + qb * dx * dy + qc * dy * dy
+                dx = s[X + p] - mean_x - shear * dy
+                power = qx * dx * dx + qy * dy * dy
                 a = min(ALPHA_MAX, opacity * _exp2(power))
                 a = a * s[ALIVE + p] if a >= ALPHA_MIN else np.float32(0.0)
                 t = s[p]
@@ -159,16 +161,16 @@ def blend_backward(
         for j in range(begin + deepest - 1, nearest - 1, -1):
             i = pair_splat[j]
             mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
-            a_, b_, c_ = projected[i, CONIC_A], projected[i, CONIC_B], projected[i, CONIC_C]
-            qa, qb, qc = np.float32(-0.5) * LOG2E * a_, -LOG2E * b_, np.float32(-0.5) * LOG2E * c_
+            precision_x, shear, precision_y = projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y]
+            qx, qy = np.float32(-0.5) * LOG2E * precision_x, np.float32(-0.5) * LOG2E * precision_y
             opacity = projected[i, OPACITY]
             red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
             first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
             order = np.float32(j - begin + 1)
             for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
-                dx = s[X + p] - mean_x
                 dy = s[Y + p] - mean_y
-                power = qa * dx * dx + qb * dx * dy + qc * dy * dy
+                dx = s[X + p] - mean_x - shear * dy
+                power = qx * dx * dx + qy * dy * dy
                 raw = opacity * _exp2(power)
                 a = min(ALPHA_MAX, raw)
                 a = a if (a >= ALPHA_MIN) and (order <= s[LAST + p]) else np.float32(0.0)
@@ -186,8 +188,8 @@ def blend_backward(
                 continue  # a frozen splat only has to be stepped through, in the very same arithmetic
             g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
             for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
-                dx = s[X + p] - mean_x
                 dy = s[Y + p] - mean_y
+                dx = s[X + p] - mean_x - shear * dy
                 g, weight = s[PULL + p], s[WEIGHT + p]
                 g0 += g
                 gx += g * dx
@@ -199,11 +201,11 @@ def blend_backward(
                 gg += weight * s[V_GREEN + p]
                 gb += weight * s[V_BLUE + p]
             slot = pair_slot[j]
-            grads[slot, MEAN_X] = a_ * gx + b_ * gy
-            grads[slot, MEAN_Y] = b_ * gx + c_ * gy
-            grads[slot, CONIC_A] = np.float32(-0.5) * gxx
-            grads[slot, CONIC_B] = -gxy
-            grads[slot, CONIC_C] = np.float32(-0.5) * gyy
+            grads[slot, MEAN_X] = precision_x * gx
+            grads[slot, MEAN_Y] = precision_y * gy - shear * precision_x * gx
+            grads[slot, PRECISION_X] = np.float32(-0.5) * gxx
+            grads[slot, SHEAR] = precision_x * gxy
+            grads[slot, PRECISION_Y] = np.float32(-0.5) * gyy
             grads[slot, OPACITY] = g0 / opacity
             grads[slot, RED] = gr
             grads[slot, GREEN] = gg

@@ -9,12 +9,25 @@ import math
 import numpy as np
 from numba import prange
 
-from . import inline_jit, parallel_jit
-from .blend import BLUE, CONIC_A, CONIC_B, CONIC_C, GREEN, MEAN_X, MEAN_Y, OPACITY, PROJECTED, RED, TILE
+from . import jit, parallel_jit
+from .blend import (
+    BLUE,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    PRECISION_X,
+    PRECISION_Y,
+    PROJECTED,
+    RED,
+    SHEAR,
+    TILE,
+)
 
 LOW_PASS = np.float32(0.3)
 """Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
 NEAR = np.float32(0.01)
+LIFT = np.float32(2.0**90)
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 SH = np.array(
     [
@@ -26,7 +39,7 @@ SH = np.array(
 """The normalisation constants of the real spherical harmonics up to degree 3, in order of first use."""
 
 
-@inline_jit
+@jit
 def _rotation(q0, q1, q2, q3):
     """Rotation matrix entries of a unit quaternion wxyz."""
     return (
@@ -36,7 +49,24 @@ def _rotation(q0, q1, q2, q3):
     )  # fmt: skip
 
 
-@inline_jit
+@jit
+def _unit(q0, q1, q2, q3):
+    """Unit quaternion and 1 / norm of a quaternion of any length; zero counts as the identity, with 1 / norm = 0.
+
+    The squares of 1e-20 and 1e20 leave float32's range, so quaternions far from length one are first scaled by a
+    power of two. 1 / norm only serves the gradient, whose square must stay in range too: it ends at 1e12.
+    """
+    size = abs(q0) + abs(q1) + abs(q2) + abs(q3)
+    lift = LIFT if size < np.float32(1e-12) else (ONE / LIFT if size > np.float32(1e12) else ONE)
+    q0, q1, q2, q3 = q0 * lift, q1 * lift, q2 * lift, q3 * lift
+    rn = ONE / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    if size == ZERO:
+        q0, q1, q2, q3, rn = ONE, ZERO, ZERO, ZERO, ONE
+        lift = ZERO
+    return q0 * rn, q1 * rn, q2 * rn, q3 * rn, min(rn * lift, np.float32(1e12))
+
+
+@jit
 def _basis(degree, x, y, z, b):
     """Real spherical harmonics of the unit direction (x, y, z), written to b (16,)."""
     b[0] = SH[0]
@@ -58,7 +88,7 @@ def _basis(degree, x, y, z, b):
         b[15] = -SH[5] * x * (xx - three * yy)
 
 
-@inline_jit
+@jit
 def _basis_gradient(degree, x, y, z, w):
     """Gradient with respect to (x, y, z) of Σ w[k]·basis[k], for w (16,)."""
     gx, gy, gz = ZERO, ZERO, ZERO
@@ -95,7 +125,8 @@ def project_forward(
     to_world (3, 3): camera to world rotation. lens (4,): fl_x, fl_y, cx, cy. size (2,): width, height.
     depth_as_colour: blend (z, 0, 0) instead of the colour.
     Writes projected (N, 9), depth (N,), extent_y (N,) half height in pixels up to α = 1/255, and rect (N, 4) int32
-    tile bounds x0, y0, x1, y1, empty (x1 ≤ x0) for a splat that cannot be seen or is not finite.
+    tile bounds x0, y0, x1, y1: all 0 for a splat that cannot be seen, all −1 for one that is not finite or would be
+    wider than float32 can square (some 1e9 pixels).
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     width, height = size[0], size[1]
@@ -111,14 +142,12 @@ def project_forward(
             x = matrix[f, 0, 0] * lx + matrix[f, 0, 1] * ly + matrix[f, 0, 2] * lz + origin[f, 0]
             y = matrix[f, 1, 0] * lx + matrix[f, 1, 1] * ly + matrix[f, 1, 2] * lz + origin[f, 1]
             z = matrix[f, 2, 0] * lx + matrix[f, 2, 1] * ly + matrix[f, 2, 2] * lz + origin[f, 2]
-            if not z >= NEAR:
+            if z < NEAR:
                 continue
             rz = ONE / z
             tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
-            q0, q1, q2, q3 = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
-            norm = math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-            rn = ONE / norm
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0 * rn, q1 * rn, q2 * rn, q3 * rn)
+            q0, q1, q2, q3, _ = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
+            r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
             # U = J · matrix, the affine map from the local frame to pixels.
             jx, jy = fx * rz, fy * rz
             u00 = jx * (matrix[f, 0, 0] - tx * matrix[f, 2, 0])
@@ -141,7 +170,10 @@ def project_forward(
             visible = ONE / (ONE + math.exp(-opacity[i]))
             reach = TWO * math.log(np.float32(255.0) * visible)
             mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
-            if not (reach > ZERO and det < np.inf and abs(mean_x) < np.inf and abs(mean_y) < np.inf):
+            if not (visible >= ZERO and det < np.inf and abs(mean_x) < np.inf and abs(mean_y) < np.inf):
+                rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
+                continue
+            if reach <= ZERO:
                 continue
             ex, ey = math.sqrt(reach * xx), math.sqrt(reach * yy)
             limit_x, limit_y = np.float32(tiles_x), np.float32(tiles_y)
@@ -152,31 +184,33 @@ def project_forward(
             y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
             if x1 <= x0 or y1 <= y0:
                 continue
-            red, green, blue = z, ZERO, ZERO
-            if not depth_as_colour:
-                rd = ONE / math.sqrt(x * x + y * y + z * z)
-                dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
-                dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
-                dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
-                _basis(degree, dx, dy, dz, basis)
-                red = green = blue = HALF
-                for k in range((degree + 1) * (degree + 1)):
-                    red += basis[k] * sh[i, k, 0]
-                    green += basis[k] * sh[i, k, 1]
-                    blue += basis[k] * sh[i, k, 2]
-                red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
-                if not (red < np.inf and green < np.inf and blue < np.inf):
-                    continue
+            rd = ONE / math.sqrt(x * x + y * y + z * z)
+            dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
+            dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
+            dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
+            _basis(degree, dx, dy, dz, basis)
+            red = green = blue = HALF
+            for k in range((degree + 1) * (degree + 1)):
+                red += basis[k] * sh[i, k, 0]
+                green += basis[k] * sh[i, k, 1]
+                blue += basis[k] * sh[i, k, 2]
+            # Before the cut at zero, which would turn NaN and −∞ into black.
+            if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
+                rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
+                continue
+            red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
+            if depth_as_colour:
+                red, green, blue = z, ZERO, ZERO
             rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3] = x0, y0, x1, y1
             depth[i] = z
             extent_y[i] = ey
             projected[i, MEAN_X], projected[i, MEAN_Y] = mean_x, mean_y
-            projected[i, CONIC_A], projected[i, CONIC_B], projected[i, CONIC_C] = yy / det, -xy / det, xx / det
+            projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y] = yy / det, xy / yy, ONE / yy
             projected[i, OPACITY] = visible
             projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
 
 
-@inline_jit
+@jit
 def _tan_limits(fx, fy, cx, cy, width, height):
     """Bounds of x/z and y/z in the projection's Jacobian: the image plus 0.3 of its half field of view."""
     half_x, half_y = HALF * np.float32(width) / fx, HALF * np.float32(height) / fy
@@ -230,9 +264,7 @@ def project_backward(
             rz = ONE / z
             slope_x, slope_y = x * rz, y * rz
             tx, ty = min(high_x, max(low_x, slope_x)), min(high_y, max(low_y, slope_y))
-            q0, q1, q2, q3 = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
-            rn = ONE / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-            q0, q1, q2, q3 = q0 * rn, q1 * rn, q2 * rn, q3 * rn
+            q0, q1, q2, q3, rn = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
             r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
             jx, jy = fx * rz, fy * rz
             u00, u01, u02 = jx * (c00 - tx * c20), jx * (c01 - tx * c21), jx * (c02 - tx * c22)
@@ -244,31 +276,30 @@ def project_backward(
             w12 = u10 * r02 + u11 * r12 + u12 * r22
             a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
 
-            # conic → covariance: V_cov = −conic · V_conic · conic, with V_conic's off-diagonal split in two.
-            p, q, r = projected[i, CONIC_A], projected[i, CONIC_B], projected[i, CONIC_C]
-            va, vb, vc = g[CONIC_A], HALF * g[CONIC_B], g[CONIC_C]
-            e00, e01 = p * va + q * vb, p * vb + q * vc
-            e10, e11 = q * va + r * vb, q * vb + r * vc
-            vxx, vxy, vyy = -(e00 * p + e01 * q), -(e00 * q + e01 * r), -(e10 * q + e11 * r)
-            # covariance = A·Aᵀ
-            b00, b01, b02 = (
-                TWO * (vxx * a00 + vxy * a10),
-                TWO * (vxx * a01 + vxy * a11),
-                TWO * (vxx * a02 + vxy * a12),
-            )
-            b10, b11, b12 = (
-                TWO * (vxy * a00 + vyy * a10),
-                TWO * (vxy * a01 + vyy * a11),
-                TWO * (vxy * a02 + vyy * a12),
-            )
-            v_log_scale[i, 0] += b00 * a00 + b10 * a10
-            v_log_scale[i, 1] += b01 * a01 + b11 * a11
-            v_log_scale[i, 2] += b02 * a02 + b12 * a12
+            # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0 − shear·a1,
+            # ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy: the gradient with respect to
+            # a0 is v0, that with respect to a1 is −shear·v0 + v1. The residual, and every product of −shear·v0 with
+            # something of row 1, is taken together with row 0, because the two cancel for long splats.
+            shear, inverse_yy = projected[i, SHEAR], projected[i, PRECISION_Y]
+            m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+            e0 = inverse_yy * (LOW_PASS * a00 + a11 * m01 + a12 * m02)
+            e1 = inverse_yy * (LOW_PASS * a01 - a10 * m01 + a12 * m12)
+            e2 = inverse_yy * (LOW_PASS * a02 - a10 * m02 - a11 * m12)
+            vs = -TWO * projected[i, PRECISION_X] * projected[i, PRECISION_X] * g[PRECISION_X]
+            vk = inverse_yy * g[SHEAR]
+            vw = -TWO * inverse_yy * inverse_yy * g[PRECISION_Y]
+            v00, v01, v02 = vs * e0 + vk * a10, vs * e1 + vk * a11, vs * e2 + vk * a12
+            v10, v11, v12 = vk * e0 + vw * a10, vk * e1 + vw * a11, vk * e2 + vw * a12
+            by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
+            v_log_scale[i, 0] += by0
+            v_log_scale[i, 1] += by1
+            v_log_scale[i, 2] += by2
             # A = U·R·diag(s): to R, then through the normalised quaternion.
-            b00, b01, b02, b10, b11, b12 = b00 * s0, b01 * s1, b02 * s2, b10 * s0, b11 * s1, b12 * s2
-            h00, h01, h02 = u00 * b00 + u10 * b10, u00 * b01 + u10 * b11, u00 * b02 + u10 * b12
-            h10, h11, h12 = u01 * b00 + u11 * b10, u01 * b01 + u11 * b11, u01 * b02 + u11 * b12
-            h20, h21, h22 = u02 * b00 + u12 * b10, u02 * b01 + u12 * b11, u02 * b02 + u12 * b12
+            v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
+            p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
+            h00, h01, h02 = p0 * v00 + u10 * v10, p0 * v01 + u10 * v11, p0 * v02 + u10 * v12
+            h10, h11, h12 = p1 * v00 + u11 * v10, p1 * v01 + u11 * v11, p1 * v02 + u11 * v12
+            h20, h21, h22 = p2 * v00 + u12 * v10, p2 * v01 + u12 * v11, p2 * v02 + u12 * v12
             vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
             vq1 = TWO * (q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22))
             vq2 = TWO * (q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22))
@@ -279,13 +310,14 @@ def project_backward(
             v_rotation[i, 2] += (vq2 - radial * q2) * rn
             v_rotation[i, 3] += (vq3 - radial * q3) * rn
             # to U, and through it to the camera-space position (the Jacobian depends on it).
-            d00, d01 = b00 * r00 + b01 * r01 + b02 * r02, b00 * r10 + b01 * r11 + b02 * r12
-            d02 = b00 * r20 + b01 * r21 + b02 * r22
-            d10, d11 = b10 * r00 + b11 * r01 + b12 * r02, b10 * r10 + b11 * r11 + b12 * r12
-            d12 = b10 * r20 + b11 * r21 + b12 * r22
-            vtx = -jx * (d00 * c20 + d01 * c21 + d02 * c22)
-            vty = -jy * (d10 * c20 + d11 * c21 + d12 * c22)
-            vz = -rz * (d00 * u00 + d01 * u01 + d02 * u02 + d10 * u10 + d11 * u11 + d12 * u12)
+            d00, d01 = v00 * r00 + v01 * r01 + v02 * r02, v00 * r10 + v01 * r11 + v02 * r12
+            d02 = v00 * r20 + v01 * r21 + v02 * r22
+            d10, d11 = v10 * r00 + v11 * r01 + v12 * r02, v10 * r10 + v11 * r11 + v12 * r12
+            d12 = v10 * r20 + v11 * r21 + v12 * r22
+            from_row_0 = d00 * c20 + d01 * c21 + d02 * c22
+            vtx = -jx * from_row_0
+            vty = -jy * (d10 * c20 + d11 * c21 + d12 * c22 - shear * from_row_0)
+            vz = -rz * (by0 + by1 + by2)  # U shrinks with z as the scales do
             vtx = vtx if tx == slope_x else ZERO
             vty = vty if ty == slope_y else ZERO
             vtx, vty = vtx + g[MEAN_X] * fx, vty + g[MEAN_Y] * fy
