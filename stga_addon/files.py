@@ -1,17 +1,29 @@
 """Reading without trust and writing without halves: JSON, npz and atomic replacement."""
 
 import json
+import math
 import os
+import stat
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from .errors import StgaError
+
+MAX_JSON_BYTES = 256 << 20
+MAX_PACKING = 256
+"""Unpacked bytes that a byte of an npz may stand for; Deflate's best is 1030, real parameters and masks reach 230."""
+FREE_BYTES = 128 << 20
+"""What any npz may unpack to, however small it is."""
+
+
+def partial_name(name: str, process: int | str) -> str:
+    """The temporary name that a process writes the file `name` under."""
+    return f".{name}.{process}.partial"
 
 
 @contextmanager
@@ -20,7 +32,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises StgaError where the folder cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(partial_name(path.name, os.getpid()))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
@@ -34,8 +46,22 @@ def replacing(path: Path) -> Iterator[Path]:
             partial.unlink()
 
 
+def file_size(path: Path) -> int:
+    """Size in bytes. Raises StgaError where there is no regular file: reading a pipe or a device need never end."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        raise StgaError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if not stat.S_ISREG(found.st_mode):
+        raise StgaError(f"{path}: cannot be read (is not a regular file)")
+    return found.st_size
+
+
 def read_json(path: Path) -> Any:
-    """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing or malformed."""
+    """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or above 256 MiB."""
+    size = file_size(path)
+    if size > MAX_JSON_BYTES:
+        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_JSON_BYTES} allowed")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -50,28 +76,60 @@ def write_json(path: Path, value: Any) -> None:
         partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
-def read_npz(path: Path, max_bytes: int = 4 << 30) -> dict[str, np.ndarray]:
+def read_npz(path: Path, max_bytes: int | None = None) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle.
 
-    `max_bytes` bounds the unpacked size, so that a small hostile file cannot fill the memory.
-    Raises StgaError naming the file where it is missing, truncated, too large or holds objects.
+    `max_bytes` bounds the unpacked size, so that a small hostile file cannot fill the memory; by default in proportion
+    to the file's own size. Raises StgaError naming the file where it is missing, truncated, too large or holds objects.
     """
+    size = file_size(path)
+    allowed = FREE_BYTES + MAX_PACKING * size if max_bytes is None else max_bytes
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > max_bytes:
-            raise StgaError(f"{path}: unpacks to {unpacked} bytes, more than the {max_bytes} allowed")
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        strangers = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
-        if strangers:
-            raise StgaError(f"{path}: is not a readable npz file (entry '{strangers[0]}' is no array)")
-        return arrays
+            if unpacked > allowed:
+                raise StgaError(f"{path}: unpacks to {unpacked} bytes, more than the {allowed} allowed")
+            return {entry.filename.removesuffix(".npy"): _read_entry(archive, entry) for entry in archive.infolist()}
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, MemoryError) as error:
-        # RuntimeError: encrypted entries and unknown compression; MemoryError: an array header that promises too much.
-        raise StgaError(f"{path}: is not a readable npz file ({error})") from error
+    except StgaError:
+        raise
+    except Exception as error:
+        # A damaged archive can make its decompressor or the parser of an array header raise nearly anything.
+        raise StgaError(f"{path}: is not a readable npz file ({error or type(error).__name__})") from error
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Read the array of a npy file without pickle. Raises StgaError naming the file, as `read_npz` does."""
+    size = file_size(path)
+    try:
+        with path.open("rb") as stream:
+            return _read_array(stream, size)
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # as above
+        raise StgaError(f"{path}: is not a readable npy file ({error or type(error).__name__})") from error
+
+
+def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    if not entry.filename.endswith(".npy"):
+        raise ValueError(f"entry '{entry.filename}' is no array")
+    with archive.open(entry) as stream:
+        return _read_array(stream, entry.file_size)
+
+
+def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
+    """The array of a npy stream of `size` bytes; numpy alone would allocate whatever the header promises."""
+    version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"npy format {version} is not supported")
+    shape, _, dtype = readers[version](stream)  # type: ignore[no-untyped-call]
+    promised = stream.tell() + math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or not dtype.itemsize or min(shape, default=0) < 0 or promised != size:
+        raise ValueError(f"an array of {dtype} {shape} in {size} bytes")
+    stream.seek(0)
+    return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))  # type: ignore[no-untyped-call]
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:

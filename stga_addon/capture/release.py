@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import read_json
+from ..files import read_json, read_npy
 from .mesh_capture import rigid_free
 from .meshes import checked_mesh, tracked_meshes
 from .model import Capture, View
@@ -64,13 +64,8 @@ def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def read_face_ids(path: Path, faces: int) -> np.ndarray:
     """(F,) bool from a npy file of triangle numbers. Raises StgaError where they are no whole numbers below `faces`."""
-    try:
-        ids = np.load(path, allow_pickle=False)
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError) as error:
-        raise StgaError(f"{path}: is not a readable npy file ({error})") from error
-    if not isinstance(ids, np.ndarray) or ids.dtype.kind not in "iu" or ids.ndim != 1:
+    ids = read_npy(path)
+    if ids.dtype.kind not in "iu" or ids.ndim != 1:
         raise StgaError(f"{path}: expected a list of triangle numbers")
     if ids.size and not 0 <= int(ids.min()) <= int(ids.max()) < faces:
         raise StgaError(f"{path}: names triangles {ids.min()} to {ids.max()}, but the mesh has 0 to {faces - 1}")

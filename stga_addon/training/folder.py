@@ -8,22 +8,27 @@ metrics.jsonl   one line per evaluation
 """
 
 import json
+import math
 import os
+import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import IO, Any
 
 import numpy as np
 import torch
 
+from ..avatar.file import SH_SIZES
 from ..errors import StgaError
-from ..files import read_json, read_npz, replacing, write_json, write_npz
+from ..files import file_size, partial_name, read_json, read_npz, replacing, write_json, write_npz
 from .settings import Settings, from_json, to_json
 from .state import TrainState, state_of, tensors_of
 
 FORMAT, VERSION = "stga-run", 1
+FILES = ("run.json", "selection.npz", "checkpoint.npz", "avatar.npz", "metrics.jsonl")
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ def read_selection(folder: Path, faces: int) -> dict[int, np.ndarray]:
     path = folder / "selection.npz"
     selection = {}
     for name, mask in read_npz(path).items():
-        if not name.isdigit() or mask.dtype != bool or mask.shape != (faces,):
+        if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
             raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep")
         selection[int(name)] = mask
     return selection
@@ -120,7 +125,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     path = folder / "checkpoint.npz"
     arrays = read_npz(path)
     try:
-        meta: dict[str, Any] = json.loads(arrays.pop("meta").tobytes())
+        meta = _meta(arrays.pop("meta"))
         if meta.pop("version") != VERSION:
             raise StgaError(f"{path}: was written by another version")
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
@@ -131,13 +136,33 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         state = state_of(tensors)
         _check_state(path, state)
         return Checkpoint(state=state, **meta)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
+
+
+def _meta(packed: np.ndarray) -> dict[str, Any]:
+    """Everything of a checkpoint that is no array. Raises ValueError for what training could not go on with."""
+    meta = json.loads(packed.tobytes())
+    if not isinstance(meta, dict):
+        raise ValueError("meta is no object")
+    counts = [meta.get(name) for name in ("iteration", "visit", "initial_count", "evaluations")]
+    last = meta.get("last_timestep")
+    if any(type(count) is not int or not -1 <= count < 1 << 62 for count in counts) or type(last) not in (
+        int,
+        NoneType,
+    ):
+        raise ValueError(f"meta counts {counts}, last timestep {last!r}")
+    numbers = [meta.get("elapsed_s"), meta.get("best_psnr"), *meta.get("losses", [None])]
+    if any(type(number) not in (int, float) or math.isnan(number) for number in numbers):
+        raise ValueError("meta holds a time, a quality or a loss that is no number")
+    return meta
 
 
 def _check_state(path: Path, state: TrainState) -> None:
     """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the array."""
     n, coefficients = len(state), state.parameters.sh.shape[1]
+    if coefficients not in SH_SIZES:
+        raise StgaError(f"{path}: parameters/sh has {coefficients} coefficients, expected one of {SH_SIZES}")
     tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "opacity": (), "sh": (coefficients, 3)}
     whole = {"steps": torch.int32, "face": torch.int32, "loose": torch.bool}
     for name, tensor in tensors_of(state).items():
@@ -145,6 +170,8 @@ def _check_state(path: Path, state: TrainState) -> None:
         shape = (n, *tails.get(name.rpartition("/")[2], ()))
         if tensor.dtype != dtype or tuple(tensor.shape) != shape:
             raise StgaError(f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {shape}")
+        if dtype == torch.float32 and not tensor.isfinite().all():
+            raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 
 def append_metrics(folder: Path, line: dict[str, Any]) -> None:
@@ -156,14 +183,26 @@ def append_metrics(folder: Path, line: dict[str, Any]) -> None:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All complete lines; a last line cut off by a kill is left out."""
+    """All complete lines, up to the first that is none: a kill may have cut it off.
+
+    Raises StgaError where there is something else than a file, or one that cannot be read.
+    """
     path = folder / "metrics.jsonl"
-    lines = []
-    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
-        try:
-            lines.append(json.loads(text))
-        except ValueError:
-            break
+    lines: list[dict[str, Any]] = []
+    if not path.exists():
+        return lines
+    try:
+        file_size(path)
+        with path.open(encoding="utf-8") as texts:
+            for text in texts:
+                line = json.loads(text)
+                if not isinstance(line, dict) or type(line.get("iteration")) is not int:
+                    break
+                lines.append(line)
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, RecursionError):
+        pass
     return lines
 
 
@@ -176,25 +215,73 @@ def cut_metrics(folder: Path, iteration: int) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder for one process. Raises StgaError while another, living one does."""
+    """Hold the folder for one process, and clear away what a killed one left half written.
+
+    The system's own lock on run.lock ends with its process, however that ends; the file's content, the process, is
+    for people. Raises StgaError while another process holds the folder.
+    """
     path = folder / "run.lock"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StgaError(f"{folder}: cannot be written as a folder ({error.strerror or error})") from error
-    try:
-        if path.exists() and not _alive(path):
-            path.unlink(missing_ok=True)
-        with path.open("x", encoding="ascii") as out:
-            out.write(str(os.getpid()))
-    except FileExistsError as error:
+        held = _hold(path)
+    except BlockingIOError as error:
         raise StgaError(f"{folder}: another run is working in this folder (process {_owner(path)})") from error
     except OSError as error:
         raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
     try:
+        for litter in (path for name in FILES for path in folder.glob(partial_name(name, "*"))):
+            with suppress(OSError):
+                litter.unlink()
         yield
     finally:
-        path.unlink(missing_ok=True)
+        if os.name == "nt":  # where an open file cannot be removed; elsewhere its name goes before the lock does
+            held.close()
+        with suppress(OSError):
+            path.unlink()
+        held.close()
+
+
+def _hold(path: Path) -> IO[str]:
+    """The open and locked lock file. Raises BlockingIOError where another process has locked it."""
+    while True:
+        file = path.open("a+", encoding="ascii")
+        try:
+            _lock(file)
+            # Its last owner may have removed the name between our opening and locking it: then it guards nothing.
+            if os.name == "nt" or _is_named(path, file):
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
+                return file
+        except BaseException:
+            file.close()
+            raise
+        file.close()
+
+
+def _is_named(path: Path, file: IO[str]) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+if os.name == "nt":
+    import msvcrt
+
+    def _lock(file: IO[str]) -> None:
+        file.seek(1 << 30)  # far behind the content, which stays readable
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+        except OSError as error:
+            raise BlockingIOError(error.errno, error.strerror) from error
+        file.seek(0)
+
+else:
+    import fcntl
+
+    def _lock(file: IO[str]) -> None:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _owner(path: Path) -> int:
@@ -202,18 +289,3 @@ def _owner(path: Path) -> int:
         return int(path.read_text(encoding="ascii"))
     except (OSError, ValueError):
         return 0
-
-
-def _alive(path: Path) -> bool:
-    owner = _owner(path)
-    if owner in (0, os.getpid()):
-        return owner != 0
-    try:
-        # Signal 0 only asks whether the process exists; Windows has no such question, so there a lock counts.
-        if os.name == "posix":
-            os.kill(owner, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True

@@ -195,18 +195,26 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
             pass
         assert (target / "run.lock").exists()  # the refused one must not take the lock away
     assert not (target / "run.lock").exists()
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        (target / "run.lock").write_text(str(other.pid))
+    hold = (
+        "import sys; from pathlib import Path; from stga_addon.training.folder import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", hold, str(target)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
         with pytest.raises(StgaError, match=f"process {other.pid}"), folder.locked(target):
             pass
-        other.communicate(b"\n")
+        other.kill()
+    assert (target / "run.lock").read_text() == str(other.pid)
     with folder.locked(target):  # its process is gone
         assert (target / "run.lock").read_text() == str(os.getpid())
 
 
-@pytest.mark.parametrize("content", ["", "hello", "0"])
-def test_a_lock_that_names_nobody_is_taken_over(tmp_path: Path, content: str) -> None:
-    """Catches a folder locked for ever by a process killed while it wrote its lock."""
+@pytest.mark.parametrize("content", ["", "hello", "0", "1", str(os.getpid())])
+def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path, content: str) -> None:
+    """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number lives on in
+    another process (1 always does)."""
     (tmp_path / "run.lock").write_text(content)
     with folder.locked(tmp_path):
         pass
