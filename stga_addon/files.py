@@ -134,6 +134,9 @@ def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:
     """Write arrays as npz, atomically."""
-    save = np.savez_compressed if compressed else np.savez
-    with replacing(path) as partial, partial.open("wb") as out:
-        save(out, **arrays)
+    packing = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    # Not numpy's own savez: where the disk is full, it leaves an archive behind that complains when it is collected.
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w", packing) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
+                np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)  # type: ignore[no-untyped-call]

@@ -8,6 +8,13 @@ from .splats import Splats
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 TINY = 1e-30
+SLIVER = 1e-4
+"""A triangle whose area is below this share of its longest edge's square counts as a line.
+
+Vertices on a line, rounded to float32, still span 1e-6 to 1e-5; what such a triangle says of its normal, or of how
+much it grew, is the rounding's.
+"""
+UPRIGHT = 0.8  # a unit vector with a larger z counts as upright when a perpendicular to it is sought
 
 
 @dataclass(frozen=True)
@@ -34,22 +41,25 @@ def face_frames(vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, co
     "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit metres of the neutral mesh
     (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
     unit the triangle (GaussianAvatars' released code).
-    A triangle without area keeps a proper rotation and a finite scale.
+    A triangle without area (see SLIVER) keeps a proper rotation and a finite scale.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     p0, p1, p2 = corners[:, 0], corners[:, 1], corners[:, 2]
     origin = corners.mean(1)
     if convention == "stga":
-        first, normal = _orthonormal(p0 - origin, _normal(p0, p1, p2))
+        # p0 − origin without the origin, which rounds: it must vanish where the corners coincide.
+        first, normal = _orthonormal(((p0 - p1) + (p0 - p2)) / 3, corners)
         rotation = np.stack([first, np.cross(normal, first), normal], axis=-1)
-        scale = np.sqrt(face_areas(vertices, faces) / np.maximum(face_areas(neutral, faces), TINY))
+        before = neutral_areas(neutral, faces)
         # A triangle that had no area in the neutral mesh has no meaningful ratio: keep the local metres as they are.
-        scale = np.where(face_areas(neutral, faces) > TINY, scale, 1.0)
+        scale = np.where(before > 0, np.sqrt(face_areas(vertices, faces) / np.maximum(before, TINY)), 1.0)
     elif convention == "gaussian_avatars":
-        first, normal = _orthonormal(p1 - p0, _normal(p0, p1, p2))
-        height = np.cross(first, normal)
-        rotation = np.stack([first, normal, height], axis=-1)
-        scale = (np.linalg.norm(p1 - p0, axis=-1) + np.abs(np.sum(height * (p2 - p0), axis=-1))) / 2
+        edge = np.linalg.norm(p1 - p0, axis=-1)
+        first, normal = _orthonormal(p1 - p0, corners)
+        rotation = np.stack([first, normal, np.cross(first, normal)], axis=-1)
+        no_edge = edge <= SLIVER * np.sqrt(_longest_squared(corners))
+        height = np.linalg.norm(_normal(p0, p1, p2), axis=-1) / np.where(no_edge, 1.0, edge)
+        scale = (edge + np.where(no_edge, np.linalg.norm(p2 - p0, axis=-1), height)) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     return FaceFrames(origin, rotation, quaternion_from_matrix(rotation), scale)
@@ -59,6 +69,13 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) in square metres of every triangle."""
     corners = np.asarray(vertices, np.float64)[faces]
     return np.asarray(np.linalg.norm(_normal(corners[:, 0], corners[:, 1], corners[:, 2]), axis=-1) / 2)
+
+
+def neutral_areas(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area (F,) in square metres of every triangle of the neutral mesh; exactly 0 where it counts as a line."""
+    area = face_areas(neutral, faces)
+    longest = _longest_squared(np.asarray(neutral, np.float64)[faces])
+    return np.where(area > np.maximum(SLIVER * longest, TINY), area, 0.0)
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
@@ -136,16 +153,28 @@ def _normal(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray) -> np.ndarray:
     return np.asarray(np.cross(p1 - p0, p2 - p0))
 
 
-def _orthonormal(first: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two perpendicular unit vectors along `first` and `normal` (F, 3), also where either has no length."""
+def _longest_squared(corners: np.ndarray) -> np.ndarray:
+    """Square (F,) of the longest edge of triangles (F, 3, 3)."""
+    return np.asarray(np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=-1), axis=-1))
+
+
+def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors along `first` (F, 3) and the normals of the triangles (F, 3, 3), perpendicular to each other.
+
+    Where the triangle is a line, any perpendicular of `first` stands for the normal; where `first` has no length
+    beside the longest edge, x stands for it. `scene.nodes` follows the same rules.
+    """
+    longest = _longest_squared(corners)[:, None]
     length = np.linalg.norm(first, axis=-1, keepdims=True)
-    first = np.where(length > TINY, first / np.maximum(length, TINY), np.array([1.0, 0.0, 0.0]))
+    no_first = length <= SLIVER * np.sqrt(longest)
+    first = np.where(no_first, np.array([1.0, 0.0, 0.0]), first / np.where(no_first, 1.0, length))
+    normal = _normal(corners[:, 0], corners[:, 1], corners[:, 2])
+    no_normal = np.linalg.norm(normal, axis=-1, keepdims=True) <= 2 * SLIVER * longest
+    upright = np.abs(first[:, 2:]) > UPRIGHT
+    substitute = np.cross(first, np.where(upright, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
+    normal = np.where(no_normal, substitute, normal)
     normal = normal - np.sum(normal * first, axis=-1, keepdims=True) * first
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    least = np.eye(3)[np.argmin(np.abs(first), axis=-1)]
-    substitute = np.cross(first, least)
-    substitute /= np.linalg.norm(substitute, axis=-1, keepdims=True)
-    return first, np.where(length > TINY, normal / np.maximum(length, TINY), substitute)
+    return first, np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
 
 def _unit_quaternion(q: np.ndarray) -> np.ndarray:

@@ -18,9 +18,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
+from ..files import file_size
 
 MAX_FILE_BYTES = 2 << 30
-MAX_DENSE_ELEMENTS = 1 << 28
+MAX_DENSE_ELEMENTS = 1 << 22
+"""Of a sparse matrix or a list of numbers; FLAME's joint regressor has 25,115."""
+MAX_INSTRUCTIONS = 1 << 18
+"""FLAME's own files have a few thousand."""
+FREE_BYTES = 64 << 20
+MAX_COPIES = 8
+"""Bytes of arrays beyond 64 MiB that a byte of the file may stand for: a pickle can name the same data many times."""
 SPARSE_CLASS = re.compile(r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)")
 
 
@@ -76,34 +83,12 @@ class _Chumpy(_Inert):
     source = "chumpy"
 
 
-def _array_shell(kind: Any, shape: Any, dtype: Any) -> _Array:
-    # numpy's own reconstructor would allocate `shape` at once; the contents arrive with the state.
-    return _Array()
-
-
-def _reconstructor(kind: Any, base: Any, state: Any) -> _Inert:
-    if not (isinstance(kind, type) and issubclass(kind, _Inert)):
-        raise pickle.UnpicklingError("rebuilds an object that is not an array")
-    return kind()
-
-
-def _encode(text: str, encoding: str = "latin1") -> bytes:
-    if encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"encodes bytes as {encoding}")
-    return text.encode("latin1")
-
-
-GLOBALS: dict[str, Callable[..., Any]] = {
+GLOBALS: dict[str, type] = {
     "numpy.ndarray": _Array,
     "numpy.dtype": _Dtype,
-    "_codecs.encode": _encode,
-    "collections.OrderedDict": OrderedDict,
-    **{f"{core}.multiarray._reconstruct": _array_shell for core in ("numpy.core", "numpy._core")},
     **{f"{core}.multiarray.scalar": _Scalar for core in ("numpy.core", "numpy._core")},
     **{f"{core}.numeric._frombuffer": _Buffer for core in ("numpy.core", "numpy._core")},
-    **{f"{module}._reconstructor": _reconstructor for module in ("copy_reg", "copyreg")},
     **{f"{module}.object": _Inert for module in ("__builtin__", "builtins")},
-    **{f"{module}.set": set for module in ("__builtin__", "builtins")},
 }
 
 
@@ -112,8 +97,23 @@ class _Refused(Exception):
 
 
 class _RestrictedUnpickler(pickle.Unpickler):
+    """Functions are methods here: a pickle can set attributes of a plain function, which outlive its reading."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(io.BytesIO(data), encoding="latin1")
+        self.room = len(data)
+        self.functions: dict[str, Callable[..., Any]] = {
+            "_codecs.encode": self.encode,
+            "collections.OrderedDict": self.ordered,
+            **{f"{core}.multiarray._reconstruct": self.array_shell for core in ("numpy.core", "numpy._core")},
+            **{f"{module}._reconstructor": self.rebuild for module in ("copy_reg", "copyreg")},
+            **{f"{module}.set": self.collect for module in ("__builtin__", "builtins")},
+        }
+
     def find_class(self, module: str, name: str) -> Any:
         wanted = f"{module}.{name}"
+        if wanted in self.functions:
+            return self.functions[wanted]
         if wanted in GLOBALS:
             return GLOBALS[wanted]
         if sparse := SPARSE_CLASS.fullmatch(wanted):
@@ -125,6 +125,35 @@ class _RestrictedUnpickler(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> Any:
         raise pickle.UnpicklingError("asks for objects outside the file")
 
+    def array_shell(self, kind: Any, shape: Any, dtype: Any) -> _Array:
+        # numpy's own reconstructor would allocate `shape` at once; the contents arrive with the state.
+        return _Array()
+
+    def rebuild(self, kind: Any, base: Any, state: Any) -> _Inert:
+        if not (isinstance(kind, type) and issubclass(kind, _Inert)):
+            raise pickle.UnpicklingError("rebuilds an object that is not an array")
+        return kind()
+
+    def encode(self, text: str, encoding: str = "latin1") -> bytes:
+        if encoding not in ("latin1", "latin-1"):
+            raise pickle.UnpicklingError(f"encodes bytes as {encoding}")
+        self.take(len(text))
+        return text.encode("latin1")
+
+    def ordered(self, *items: Any) -> OrderedDict[Any, Any]:
+        self.take(sum(len(part) for part in items))
+        return OrderedDict(*items)
+
+    def collect(self, *items: Any) -> set[Any]:
+        self.take(sum(len(part) for part in items))
+        return set(*items)
+
+    def take(self, count: int) -> None:
+        """Whoever copies each thing once has room enough; one thing copied a thousand times would fill the memory."""
+        self.room -= count
+        if self.room < 0:
+            raise pickle.UnpicklingError("copies more than the file holds")
+
 
 def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
     """The arrays of a pickled dictionary, dense, by key; `names` limits which entries are looked at.
@@ -132,7 +161,7 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     scipy.sparse matrices are densified and chumpy objects replaced by their value. Raises StgaError where the file is
     missing, truncated, too large, no dictionary of arrays, or asks for any other class (named in the message).
     """
-    loaded = _load(path)
+    loaded, room = _load(path)
     if not isinstance(loaded, dict):
         raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
     arrays = {}
@@ -142,19 +171,27 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
                 arrays[key] = _dense(loaded[key])
             except _Stray as error:
                 raise StgaError(f"{path}: {key} is {error}, expected an array of numbers") from error
+            except Exception as error:
+                # Shapes, indices and states are whatever the file says, of any type and size.
+                raise StgaError(f"{path}: {key} is malformed ({error}), expected an array of numbers") from error
+            room -= arrays[key].nbytes
+            if room < 0:
+                raise StgaError(f"{path}: {key} and the arrays before it are larger than the file can hold")
     return arrays
 
 
-def _load(path: Path) -> Any:
+def _load(path: Path) -> tuple[Any, int]:
+    """What the pickle holds, and how many bytes its arrays may have."""
+    size = file_size(path)
+    if size > MAX_FILE_BYTES:
+        raise StgaError(f"{path}: is {size} bytes, more than the {MAX_FILE_BYTES} allowed")
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise StgaError(f"{path}: is {path.stat().st_size} bytes, more than the {MAX_FILE_BYTES} allowed")
         data = path.read_bytes()
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     try:
-        _check_memo(data)
-        return _RestrictedUnpickler(io.BytesIO(data), encoding="latin1").load()
+        _check_instructions(data)
+        return _RestrictedUnpickler(data).load(), FREE_BYTES + MAX_COPIES * size
     except _Refused as error:
         raise StgaError(f"{path}: asks for the class {error}, refused: only arrays are read") from error
     except Exception as error:
@@ -163,11 +200,13 @@ def _load(path: Path) -> Any:
         raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
 
 
-def _check_memo(data: bytes) -> None:
-    """Refuse memo slots beyond the file's length: the C unpickler would allocate a table that large."""
-    for opcode, argument, _ in pickletools.genops(data):
+def _check_instructions(data: bytes) -> None:
+    """Refuse memo slots beyond the file's length, for which the C unpickler would allocate a table, and programs."""
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
         if argument is not None and "PUT" in opcode.name and not 0 <= int(argument) <= len(data):
             raise pickle.UnpicklingError(f"memo slot {argument} in a file of {len(data)} bytes")
+        if count > MAX_INSTRUCTIONS:
+            raise pickle.UnpicklingError(f"more than {MAX_INSTRUCTIONS} instructions")
 
 
 def _dense(value: Any) -> np.ndarray:
@@ -182,6 +221,8 @@ def _dense(value: Any) -> np.ndarray:
     if isinstance(value, _Chumpy):
         return _chumpy(value)
     if isinstance(value, list | tuple | int | float):
+        if _leaves(value, {}) > MAX_DENSE_ELEMENTS:
+            raise _Stray(f"a list of more than {MAX_DENSE_ELEMENTS} numbers")
         try:
             plain = np.asarray(value)
         except (ValueError, OverflowError) as error:
@@ -189,6 +230,16 @@ def _dense(value: Any) -> np.ndarray:
         if plain.dtype.kind in "biuf":
             return plain
     raise _Stray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
+
+
+def _leaves(value: Any, known: dict[int, int]) -> int:
+    """How many numbers a nested list stands for; it may hold the same list twice, or itself."""
+    if not isinstance(value, list | tuple):
+        return 1
+    if id(value) not in known:
+        known[id(value)] = MAX_DENSE_ELEMENTS + 1
+        known[id(value)] = max(1, sum(_leaves(item, known) for item in value))
+    return known[id(value)]
 
 
 def _array(value: _Array) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from .. import __version__
-from ..avatar.embedding import TINY
+from ..avatar.embedding import SLIVER, UPRIGHT
 from . import tags
 from .materials import DISPLAY_COLOR, EXTENT, OPACITY, ellipsoid_material, point_material
 
@@ -123,6 +123,9 @@ class _Nodes:
     def vector(self, operation: str, *values: Any) -> bpy.types.NodeSocket:
         return self.out("ShaderNodeVectorMath", {"Vector": list(values)}, operation=operation)
 
+    def compare(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
+        return self.out("FunctionNodeCompare", {"A": a, "B": b}, data_type="FLOAT", operation=operation)
+
     def scaled(self, vector: Any, factor: Any) -> bpy.types.NodeSocket:
         return self.out("ShaderNodeVectorMath", {"Vector": vector, "Scale": factor}, operation="SCALE")
 
@@ -193,10 +196,7 @@ def _sampled_frames(nodes: _Nodes, mesh: Any, convention: str) -> tuple[Any, Any
         neutral = nodes.attribute(NEUTRAL_AREA, "FLOAT")
         ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
         # No neutral area, no meaningful ratio: the local metres stay as they are.
-        has_area = nodes.out(
-            "FunctionNodeCompare", {"A": neutral, "B": TINY}, data_type="FLOAT", operation="GREATER_THAN"
-        )
-        size = nodes.switch("FLOAT", has_area, 1.0, ratio)
+        size = nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
     return sample("stga_frame_origin", "FLOAT_VECTOR"), sample("stga_frame_rotation", "QUATERNION"), size
 
 
@@ -204,8 +204,10 @@ def _stga_frames(nodes: _Nodes) -> tuple[Any, Any, Any]:
     """Centroid; axes [n(p0−o), ·, normal]; the triangle's area (its ratio to the neutral area is the square of k)."""
     p0, p1, p2 = (_corner(nodes, index) for index in range(3))
     origin = nodes.scaled(nodes.vector("ADD", nodes.vector("ADD", p0, p1), p2), 1 / 3)
-    normal = nodes.vector("CROSS_PRODUCT", nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0))
-    turn = _axes_to_rotation(nodes, nodes.vector("SUBTRACT", p0, origin), normal, "Z")
+    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    # p0 − origin without the origin, which rounds: it must vanish where the corners coincide.
+    first = nodes.scaled(nodes.vector("ADD", edge, side), -1 / 3)
+    turn, normal, _ = _axes_to_rotation(nodes, first, edge, side, "Z")
     return origin, turn, nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
 
 
@@ -214,11 +216,11 @@ def _gaussian_avatars_frames(nodes: _Nodes) -> tuple[Any, Any, Any]:
     p0, p1, p2 = (_corner(nodes, index) for index in range(3))
     origin = nodes.scaled(nodes.vector("ADD", nodes.vector("ADD", p0, p1), p2), 1 / 3)
     edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    normal = nodes.vector("CROSS_PRODUCT", edge, side)
-    turn = _axes_to_rotation(nodes, edge, normal, "Y")
-    # Height over the edge = |edge × side| / |edge|; the node's division by zero gives zero.
+    turn, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
+    # Height over the edge = |edge × side| / |edge|, or the side where the edge has no length.
     length = nodes.vector("LENGTH", edge)
     height = nodes.math("DIVIDE", nodes.vector("LENGTH", normal), length)
+    height = nodes.switch("FLOAT", no_edge, height, nodes.vector("LENGTH", side))
     return origin, turn, nodes.math("MULTIPLY", nodes.math("ADD", length, height), 0.5)
 
 
@@ -240,10 +242,28 @@ def _corner(nodes: _Nodes, index: int) -> bpy.types.NodeSocket:
     )
 
 
-def _axes_to_rotation(nodes: _Nodes, first: Any, normal: Any, normal_axis: str) -> bpy.types.NodeSocket:
-    """Rotation whose x axis is `first` exactly; proper also where either vector has no length."""
-    axes = {"Primary Axis": nodes.vector("NORMALIZE", first), "Secondary Axis": nodes.vector("NORMALIZE", normal)}
-    return nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="X", secondary_axis=normal_axis)
+def _axes_to_rotation(
+    nodes: _Nodes, first: Any, edge: Any, side: Any, normal_axis: str
+) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """Rotation whose x axis is `first` exactly, of a triangle with two edges from its first corner.
+
+    Where `first` or the normal is missing, it takes what `avatar.embedding` takes; the node's own substitutes differ.
+    Returns the rotation, the normal (its length twice the area) and whether `first` is missing.
+    """
+    normal = nodes.vector("CROSS_PRODUCT", edge, side)
+    lengths = [nodes.vector("LENGTH", v) for v in (edge, side, nodes.vector("SUBTRACT", edge, side))]
+    longest = nodes.math("MAXIMUM", nodes.math("MAXIMUM", lengths[0], lengths[1]), lengths[2])
+    no_first = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", first), nodes.math("MULTIPLY", longest, SLIVER))
+    limit = nodes.math("MULTIPLY", nodes.math("MULTIPLY", longest, longest), 2 * SLIVER)
+    no_normal = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", normal), limit)
+    first = nodes.switch("VECTOR", no_first, nodes.vector("NORMALIZE", first), (1, 0, 0))
+    z = nodes.math("ABSOLUTE", nodes.vector("DOT_PRODUCT", first, (0, 0, 1)))
+    helper = nodes.switch("VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT), (0, 0, 1), (1, 0, 0))
+    second = nodes.vector("CROSS_PRODUCT", first, helper)
+    second = nodes.switch("VECTOR", no_normal, nodes.vector("NORMALIZE", normal), second)
+    axes = {"Primary Axis": first, "Secondary Axis": second}
+    turn = nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="X", secondary_axis=normal_axis)
+    return turn, normal, no_first
 
 
 def _points(nodes: _Nodes, splats: Any) -> bpy.types.NodeSocket:
@@ -276,17 +296,10 @@ def _ellipsoids(nodes: _Nodes, splats: Any) -> bpy.types.NodeSocket:
 def _shown(nodes: _Nodes) -> bpy.types.NodeSocket:
     """Which splats are displayed: opaque enough, and in the random part."""
     group = nodes.tree.nodes.new("NodeGroupInput").outputs
-    opaque = nodes.out(
-        "FunctionNodeCompare",
-        {"A": nodes.attribute(OPACITY, "FLOAT"), "B": group[OPACITY_THRESHOLD]},
-        data_type="FLOAT",
-        operation="GREATER_EQUAL",
-    )
+    opaque = nodes.compare("GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), group[OPACITY_THRESHOLD])
     # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
     draw = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
-    drawn = nodes.out(
-        "FunctionNodeCompare", {"A": draw, "B": group[PERCENTAGE]}, data_type="FLOAT", operation="LESS_EQUAL"
-    )
+    drawn = nodes.compare("LESS_EQUAL", draw, group[PERCENTAGE])
     return nodes.out("FunctionNodeBooleanMath", {"Boolean": [opaque, drawn]}, operation="AND")
 
 
@@ -296,12 +309,7 @@ def _frozen(nodes: _Nodes, mesh: Any, show: Any) -> bpy.types.NodeSocket:
     name = nodes.out("FunctionNodeReplaceString", {"String": f"{tags.GROUP_PREFIX}#", "Find": "#", "Replace": frame})
     group = nodes.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
     weight, exists = (socket for socket in group.outputs if socket.enabled)
-    chosen = nodes.out(
-        "FunctionNodeCompare",
-        {"A": weight, "B": tags.SELECTED_WEIGHT},
-        data_type="FLOAT",
-        operation="GREATER_EQUAL",
-    )
+    chosen = nodes.compare("GREATER_EQUAL", weight, tags.SELECTED_WEIGHT)
     # Compared on the vertices: from there to a face, a boolean holds where all the face's vertices hold.
     chosen = nodes.out("GeometryNodeFieldOnDomain", {"Value": chosen}, data_type="BOOLEAN", domain="POINT")
     frozen = nodes.out("FunctionNodeBooleanMath", {"Boolean": [exists, chosen]}, operation="NIMPLY")

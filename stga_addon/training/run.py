@@ -127,8 +127,8 @@ class _Loop:
         with ViewLoader(order, background=background) as loader:  # type: ignore[arg-type]
             while (share := self._share()) < 1:
                 begin = perf_counter()
-                view, image, _ = next(loader)
-                loss = trainer.step(view, image, share)
+                view, image, mask = next(loader)
+                loss = trainer.step(view, image, share, mask)
                 self.elapsed += perf_counter() - begin
                 if loss is not None:
                     self.losses.append(loss)

@@ -56,7 +56,9 @@ class Settings:
     seeds          add hull seeds for what the mesh does not cover
     density_every  iterations between density control, 0 never; it works during `density_span` of the budget
     growth         most splats that density control may add, as a share of the initial number
-    background     colour behind the head
+    background     colour behind the head in the capture's images, and behind transparent ones
+    any_background  where there are masks, put another random colour behind the head in every iteration, so that
+                   splats in the background's colour cannot hide in it and alpha becomes right
     """
 
     strategy: str = "global"
@@ -86,6 +88,7 @@ class Settings:
     density_span: tuple[float, float] = (0.1, 0.6)
     growth: float = 0.25
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    any_background: bool = True
 
 
 PAPER = {

@@ -7,6 +7,7 @@ from ..avatar.embedding import face_areas
 from ..avatar.lattice import lattice_splats
 from ..avatar.splats import Splats
 from ..capture.model import Capture, View
+from ..raster.kernels.image_loss import change_background
 from ..raster.kernels.rows import distance_limit, scale_limit
 from ..raster.render import (
     Parameters,
@@ -57,8 +58,11 @@ class Trainer:
         self.state, self.iteration, self.visit = checkpoint.state, checkpoint.iteration, checkpoint.visit
         self.last_timestep, self.initial_count = checkpoint.last_timestep, checkpoint.initial_count
 
-    def step(self, view: View, target: np.ndarray, progress: float) -> float | None:
-        """Train one view; target (H, W, 3) uint8; progress is the share of the budget spent.
+    def step(self, view: View, target: np.ndarray, progress: float, mask: np.ndarray | None = None) -> float | None:
+        """Train one view.
+
+        target (H, W, 3) uint8 over the settings' background; progress is the share of the budget spent; mask (H, W)
+        uint8, with which the background may be exchanged.
 
         Returns the image loss of a global iteration; a local one sees only part of the image and returns None.
         """
@@ -66,7 +70,14 @@ class Trainer:
         self.visit += view.timestep != self.last_timestep
         self.last_timestep = view.timestep
         focus = None if trains_globally(settings, self.iteration, self.visit, progress) else self._focus(view.timestep)
-        rows, screen, loss = self._differentiate(view, target, sh_degree(settings, progress), focus)
+        background = self._background
+        if mask is not None and settings.any_background:
+            background = np.random.default_rng([settings.seed, self.iteration]).random(3, np.float32)
+            over = self._scratch.take("target", target.shape, np.uint8)
+            change_background(target, mask, 255 * self._background, 255 * background, over)
+            target = over
+        degree = sh_degree(settings, progress)
+        rows, screen, loss = self._differentiate(view, target, background, degree, focus)
         self._limit(rows)
         adam.step(state, rows, learning_rates(settings.rates, progress))
         if focus is None:
@@ -78,14 +89,14 @@ class Trainer:
 
     def draw(self, view: View, progress: float = 1.0) -> np.ndarray:
         """The view as the splats show it now: a new (3, H, W) float32 image over the background."""
-        return self._render(view, sh_degree(self.settings, progress)).image.copy()
+        return self._render(view, self._background, sh_degree(self.settings, progress)).image.copy()
 
     def _differentiate(
-        self, view: View, target: np.ndarray, degree: int, focus: np.ndarray | None
+        self, view: View, target: np.ndarray, background: np.ndarray, degree: int, focus: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the gradients of the rows that matter; returns those rows, their screen pull and the loss."""
         settings, height, width = self.settings, view.camera.height, view.camera.width
-        rendering = self._render(view, degree, focus)
+        rendering = self._render(view, background, degree, focus)
         if focus is None:
             rectangles = whole_image(height, width)
         else:
@@ -100,10 +111,10 @@ class Trainer:
         loss = (1 - settings.ssim_weight) * l1 + settings.ssim_weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
 
-    def _render(self, view: View, degree: int, focus: np.ndarray | None = None) -> Rendering:
+    def _render(self, view: View, background: np.ndarray, degree: int, focus: np.ndarray | None = None) -> Rendering:
         self._seen = camera_frames(self.frames.of(view.timestep), view.camera)
         return render_forward(
-            self.state.arrays(), self.state.face.numpy(), self._seen, degree, self._background, focus, REACH,
+            self.state.arrays(), self.state.face.numpy(), self._seen, degree, background, focus, REACH,
             scratch=self._scratch,
         )  # fmt: skip
 

@@ -5,6 +5,7 @@ import numpy as np
 from ..avatar.embedding import WORLD
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
+from ..raster.kernels.image_loss import change_background
 from ..raster.kernels.rows import distance_limit, scale_limit
 from ..raster.render import Parameters, camera_frames, render_backward, render_forward, touched_tiles
 from . import adam
@@ -32,7 +33,11 @@ def compile_kernels() -> None:
     gradient = np.empty_like(rendering.image)
     target = np.zeros((16, 16, 3), np.uint8)
     target.setflags(write=False)  # as the loader's are; Numba compiles for that
-    image_gradient(rendering.image, target, whole_image(16, 16), 0.2, gradient)
+    mask, over = np.zeros((16, 16), np.uint8), np.empty((16, 16, 3), np.uint8)
+    mask.setflags(write=False)
+    change_background(target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), over)
+    for image in (target, over):
+        image_gradient(rendering.image, image, whole_image(16, 16), 0.2, gradient)
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     rows, _ = render_backward(rendering, state.arrays(), face, seen, gradient, gradients)
     limits = rows, state.parameters.log_scale.numpy(), face, state.loose.numpy(), np.ones(1, np.float32), 1.0

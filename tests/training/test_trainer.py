@@ -21,6 +21,8 @@ from stga_addon.training.trainer import Trainer, initial_splats
 
 from .toys import bits, quick_settings
 
+WHITE = np.ones(3, np.float32)
+
 
 def lower_part(capture: Capture) -> dict[int, np.ndarray]:
     """The capture's mouth selected in timesteps 1 and 3, nothing in 0, and 4 left out."""
@@ -82,7 +84,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    rows, screen, loss = trainer._differentiate(view, target, degree, None)
+    rows, screen, loss = trainer._differentiate(view, target, WHITE, degree, None)
     full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
     pull, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
@@ -90,7 +92,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for tensor in trainer.state.gradients:
         tensor.fill_(7.0)
-    rows, screen, loss = trainer._differentiate(view, target, degree, focus)
+    rows, screen, loss = trainer._differentiate(view, target, WHITE, degree, focus)
     assert loss is None
     np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)
@@ -107,8 +109,8 @@ def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
     trainer = make_trainer(toy)
     view, _ = large(view_of(toy, 1))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    everything = len(trainer._render(view, 0).tiles)
-    assert 0 < len(trainer._render(view, 0, focus).tiles) < 0.8 * everything
+    everything = len(trainer._render(view, WHITE, 0).tiles)
+    assert 0 < len(trainer._render(view, WHITE, 0, focus).tiles) < 0.8 * everything
 
 
 @pytest.mark.parametrize("timestep", [0, 4])

@@ -163,3 +163,18 @@ def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
             difference += absolute
         sums[job, 0] = difference
         sums[job, 1] = similarity
+
+
+@parallel_jit
+def change_background(image, mask, before, after, out):
+    """Write image (H, W, 3) uint8, composited over the colour `before`, as it looks over `after`.
+
+    mask (H, W) uint8: the foreground's coverage; before, after (3,) float32 in 0…255; out as image.
+    image = coverage · foreground + (1 − coverage) · before, so only the second term has to be exchanged.
+    """
+    for y in prange(image.shape[0]):
+        for x in range(image.shape[1]):
+            clear = np.float32(255 - mask[y, x]) * np.float32(1 / 255)
+            for c in range(3):
+                value = np.float32(image[y, x, c]) + clear * (after[c] - before[c])
+                out[y, x, c] = np.uint8(min(np.float32(255.0), max(ZERO, value)) + np.float32(0.5))
