@@ -4,6 +4,7 @@ import json
 import math
 import os
 import stat
+import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,10 +16,11 @@ import numpy as np
 from .errors import StgaError
 
 MAX_JSON_BYTES = 256 << 20
-MAX_PACKING = 256
-"""Unpacked bytes that a byte of an npz may stand for; Deflate's best is 1030, real parameters and masks reach 230."""
+MAX_PACKING = 16
+"""Unpacked bytes that a byte of an npz may stand for; Deflate's best is 1030, arrays of numbers reach 5."""
 FREE_BYTES = 128 << 20
 """What any npz may unpack to, however small it is."""
+MAX_HEADER_BYTES = 1 << 16
 
 
 def partial_name(name: str, process: int | str) -> str:
@@ -76,14 +78,15 @@ def write_json(path: Path, value: Any) -> None:
         partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
-def read_npz(path: Path, max_bytes: int | None = None) -> dict[str, np.ndarray]:
+def read_npz(path: Path, max_bytes: int | None = None, max_packing: int = MAX_PACKING) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle.
 
-    `max_bytes` bounds the unpacked size, so that a small hostile file cannot fill the memory; by default in proportion
-    to the file's own size. Raises StgaError naming the file where it is missing, truncated, too large or holds objects.
+    `max_bytes` bounds the unpacked size, so that a small hostile file cannot fill the memory; by default 128 MiB and
+    `max_packing` times the file's own size.
+    Raises StgaError naming the file where it is missing, truncated, too large or holds objects.
     """
     size = file_size(path)
-    allowed = FREE_BYTES + MAX_PACKING * size if max_bytes is None else max_bytes
+    allowed = FREE_BYTES + max_packing * size if max_bytes is None else max_bytes
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
@@ -114,12 +117,19 @@ def read_npy(path: Path) -> np.ndarray:
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
     if not entry.filename.endswith(".npy"):
         raise ValueError(f"entry '{entry.filename}' is no array")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("is packed as no npz is")  # LZMA's own header makes it allocate gigabytes
     with archive.open(entry) as stream:
         return _read_array(stream, entry.file_size)
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
     """The array of a npy stream of `size` bytes; numpy alone would allocate whatever the header promises."""
+    start = stream.read(12).ljust(12, b"\0")
+    length = struct.unpack("<H" if start[6] == 1 else "<L", start[8 : 10 if start[6] == 1 else 12])[0]
+    if length > MAX_HEADER_BYTES:
+        raise ValueError(f"an array header of {length} bytes")
+    stream.seek(0)
     version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:

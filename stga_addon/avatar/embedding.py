@@ -50,32 +50,25 @@ def face_frames(vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, co
         # p0 − origin without the origin, which rounds: it must vanish where the corners coincide.
         first, normal = _orthonormal(((p0 - p1) + (p0 - p2)) / 3, corners)
         rotation = np.stack([first, np.cross(normal, first), normal], axis=-1)
-        before = neutral_areas(neutral, faces)
+        before = face_areas(neutral, faces)
         # A triangle that had no area in the neutral mesh has no meaningful ratio: keep the local metres as they are.
-        scale = np.where(before > 0, np.sqrt(face_areas(vertices, faces) / np.maximum(before, TINY)), 1.0)
+        scale = np.where(before > 0, np.sqrt(_length(_normal(corners)) / 2 / np.maximum(before, TINY)), 1.0)
     elif convention == "gaussian_avatars":
-        edge = np.linalg.norm(p1 - p0, axis=-1)
+        edge, side = _length(p1 - p0), _length(p2 - p0)
         first, normal = _orthonormal(p1 - p0, corners)
         rotation = np.stack([first, normal, np.cross(first, normal)], axis=-1)
         no_edge = edge <= SLIVER * np.sqrt(_longest_squared(corners))
-        height = np.linalg.norm(_normal(p0, p1, p2), axis=-1) / np.where(no_edge, 1.0, edge)
-        scale = (edge + np.where(no_edge, np.linalg.norm(p2 - p0, axis=-1), height)) / 2
+        scale = (edge + np.where(no_edge, side, _length(_normal(corners)) / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     return FaceFrames(origin, rotation, quaternion_from_matrix(rotation), scale)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area (F,) in square metres of every triangle."""
+    """Area (F,) in square metres of every triangle; exactly 0 where it counts as a line (see SLIVER)."""
     corners = np.asarray(vertices, np.float64)[faces]
-    return np.asarray(np.linalg.norm(_normal(corners[:, 0], corners[:, 1], corners[:, 2]), axis=-1) / 2)
-
-
-def neutral_areas(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area (F,) in square metres of every triangle of the neutral mesh; exactly 0 where it counts as a line."""
-    area = face_areas(neutral, faces)
-    longest = _longest_squared(np.asarray(neutral, np.float64)[faces])
-    return np.where(area > np.maximum(SLIVER * longest, TINY), area, 0.0)
+    area = _length(_normal(corners)) / 2
+    return np.where(area > np.maximum(SLIVER * _longest_squared(corners), TINY), area, 0.0)
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
@@ -149,8 +142,13 @@ def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
 
 
-def _normal(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray) -> np.ndarray:
-    return np.asarray(np.cross(p1 - p0, p2 - p0))
+def _normal(corners: np.ndarray) -> np.ndarray:
+    """Normals (F, 3) of triangles (F, 3, 3), as long as twice their area."""
+    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
+def _length(v: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(v, axis=-1))
 
 
 def _longest_squared(corners: np.ndarray) -> np.ndarray:
@@ -165,16 +163,16 @@ def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
     beside the longest edge, x stands for it. `scene.nodes` follows the same rules.
     """
     longest = _longest_squared(corners)[:, None]
-    length = np.linalg.norm(first, axis=-1, keepdims=True)
+    length = _length(first)[:, None]
     no_first = length <= SLIVER * np.sqrt(longest)
     first = np.where(no_first, np.array([1.0, 0.0, 0.0]), first / np.where(no_first, 1.0, length))
-    normal = _normal(corners[:, 0], corners[:, 1], corners[:, 2])
-    no_normal = np.linalg.norm(normal, axis=-1, keepdims=True) <= 2 * SLIVER * longest
+    normal = _normal(corners)
+    no_normal = _length(normal)[:, None] <= 2 * SLIVER * longest
     upright = np.abs(first[:, 2:]) > UPRIGHT
     substitute = np.cross(first, np.where(upright, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
     normal = np.where(no_normal, substitute, normal)
     normal = normal - np.sum(normal * first, axis=-1, keepdims=True) * first
-    return first, np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+    return first, normal / _length(normal)[:, None]
 
 
 def _unit_quaternion(q: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ..errors import StgaError
-from ..files import replacing
+from ..files import file_size, replacing
 from .splats import MAX_SH_DEGREE, Splats
 
 MAX_HEADER_BYTES = 1 << 16
@@ -117,10 +117,10 @@ def read_vertices(path: Path) -> np.ndarray:
     Raises StgaError where the file is missing, malformed or shorter than its header says. Nothing is allocated
     before the file is known to hold it.
     """
+    size = file_size(path)
     try:
         with path.open("rb") as file:
             header = _read_header(path, file)
-            size = file.seek(0, 2)
             file.seek(header.offset)
             return _read_ascii(path, file, header, size) if header.ascii else _read_binary(path, file, header, size)
     except OSError as error:
@@ -195,6 +195,8 @@ def _read_ascii(path: Path, file: BinaryIO, header: _Header, size: int) -> np.nd
     # A number takes two bytes with its separator: a header that promises more rows than the file has is refused first.
     if size < header.offset + 2 * (header.count * len(names) + header.skipped) - 1:
         raise StgaError(f"{path}: is cut off: {size} bytes cannot hold {header.count} vertices")
+    if not header.count:
+        return np.empty(0, header.dtype)
     try:
         table = np.loadtxt(file, np.float64, skiprows=header.skipped, max_rows=header.count, ndmin=2, comments=None)
     except (ValueError, UnicodeDecodeError) as error:

@@ -1,5 +1,6 @@
 """Images and masks of a view, decoded with Pillow and checked against the camera."""
 
+import stat
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +20,12 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the file's header. Raises StgaError where it is no image or has more than 2^27 pixels."""
     try:
+        _require_regular(path)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore")
             with Image.open(path, formats=FORMATS) as image:
                 width, height = image.size
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+    except Exception as error:  # Pillow's decoders raise more than they promise.
         raise _unreadable(path, error) from error
     if width * height > MAX_PIXELS:
         raise StgaError(f"{path}: claims {width} x {height} pixels, more than the {MAX_PIXELS} allowed")
@@ -89,14 +91,15 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
     """Pixels (H, W) grey or (H, W, 2 to 4) uint8, the last of an even number of channels alpha."""
     expected = view.camera.width, view.camera.height
     try:
+        _require_regular(path)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore")
             with Image.open(path, formats=FORMATS) as image:
                 # Checked before a single pixel is unpacked: a file cannot claim more memory than its camera does.
                 if image.size == expected:
                     return _as_uint8(image)
                 size = image.size
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+    except Exception as error:  # Pillow's decoders raise more than they promise.
         raise _unreadable(path, error) from error
     camera = f"the camera of {view.name} has {expected[0]} x {expected[1]}"
     if kind == "mask":
@@ -144,6 +147,12 @@ def _transparency(pixels: np.ndarray) -> np.ndarray | None:
     if pixels.ndim == 2 or pixels.shape[2] == 3 or (pixels[..., -1] == 255).all():
         return None
     return pixels[..., -1]
+
+
+def _require_regular(path: Path) -> None:
+    """Raise OSError for a pipe or device: reading one need never end."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError("not a regular file")
 
 
 def _unreadable(path: Path, error: Exception) -> StgaError:

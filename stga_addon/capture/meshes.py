@@ -1,6 +1,9 @@
 """Tracked meshes on disk: OBJ, PLY, GLB and STL with the file's own order of vertices and triangles."""
 
 import io
+import json
+import re
+import struct
 import warnings
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -10,11 +13,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import read_json
+from ..files import file_size, read_json
 from ..flame.masks import faces_within
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 64 << 20
+MAX_MESH_BYTES = 512 << 20
+GLB_JSON = b"JSON"
+MAX_NODES, MAX_CORNERS = 1000, 1 << 22
+"""Of a GLB, whose nodes may repeat a mesh: a tracked head has a skeleton's nodes and 10^4 to 10^5 vertices."""
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -26,6 +33,9 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise StgaError(f"{path}: is not a mesh; expected one of {', '.join(MESH_SUFFIXES)}")
+    size = file_size(path)
+    if size > MAX_MESH_BYTES:
+        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_MESH_BYTES} allowed")
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -113,13 +123,52 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
     except ImportError as error:
         raise StgaError(f"{path}: reading {file_type.upper()} needs the Python package trimesh") from error
     try:
+        if file_type == "ply":
+            _check_ply(data)
+        if file_type == "glb":
+            _check_glb(data)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             # From memory, so that a mesh cannot name further files (textures, buffers) to be read.
-            mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False)
+            options = {"skip_materials": True} if file_type == "glb" else {}
+            mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False, **options)
             return np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except Exception as error:  # trimesh's parsers fail with whatever they stumble on; all of it means a bad file.
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
+
+
+def _check_ply(data: bytes) -> None:
+    """trimesh allocates what the header promises. Raises ValueError where the file cannot hold it."""
+    header = data[: max(0, data.find(b"end_header"))]
+    for name, count in re.findall(rb"^element\s+(\S+)\s+(\S+)", header, re.MULTILINE):
+        if not 0 <= int(count) <= len(data):
+            raise ValueError(f"its {len(data)} bytes cannot hold {int(count)} of {name.decode('latin-1')}")
+
+
+def _check_glb(data: bytes) -> None:
+    """trimesh allocates what accessors promise and copies a mesh for each node. Raises ValueError where that is more
+    than the file can hold, and where nodes are no trees."""
+    length, kind = struct.unpack("<L4s", data[12:20])
+    if kind != GLB_JSON or length > len(data):
+        raise ValueError("no JSON chunk where a GLB has it")
+    document = json.loads(data[20 : 20 + length])
+    nodes, meshes, accessors = (document.get(key, []) for key in ("nodes", "meshes", "accessors"))
+    counts = [accessor["count"] for accessor in accessors]
+    if any(type(count) is not int or not 0 <= count <= len(data) for count in counts):
+        raise ValueError("an accessor counts more than the file can hold")
+    children = [child for node in nodes for child in node.get("children", [])]
+    if len(nodes) > MAX_NODES or len(set(children)) < len(children):
+        raise ValueError(f"its nodes are no trees of at most {MAX_NODES}")
+    parts = [part for node in nodes if "mesh" in node for part in meshes[node["mesh"]]["primitives"]]
+    named = [index for part in parts for index in (*part["attributes"].values(), part.get("indices"))]
+    if sum(counts[index] for index in named if index is not None) > MAX_CORNERS + len(data):
+        raise ValueError("its nodes repeat their meshes too often")
+    waiting = [root for scene in document.get("scenes", []) for root in scene.get("nodes", [])]
+    for _ in range(len(nodes) + len(waiting)):
+        if waiting:
+            waiting += nodes[waiting.pop()].get("children", [])
+    if waiting:
+        raise ValueError("its nodes form a ring")
 
 
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from .camera import Camera
 
 @dataclass(frozen=True)
 class View:
-    """One image: a camera at a timestep. `name` is its `file_path` as the capture wrote it."""
+    """One image: a camera at a timestep. `name` is its `file_path` with forward slashes."""
 
     timestep: int
     camera_index: int

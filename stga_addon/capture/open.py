@@ -64,9 +64,16 @@ def _require_files(transforms: Transforms) -> None:
     for frame in transforms.frames:
         for field, path in _files(frame).items():
             if path is not None and path not in seen:
-                if not path.is_file():
+                if not _is_file(path):
                     raise StgaError(f"{path}: does not exist, but {frame.where} names it as its {field}")
                 seen.add(path)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name longer than names can be
+        return False
 
 
 def _files(frame: Frame) -> dict[str, Path | None]:

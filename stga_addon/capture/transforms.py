@@ -3,6 +3,7 @@
 import itertools
 import math
 import posixpath
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
@@ -19,6 +20,8 @@ SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "centre")
 MAX_PIXELS = 1 << 27  # No studio camera takes larger images; a larger claim would let a small file fill the memory.
 ROTATION_TOLERANCE = 1e-3  # Exporters write float32 poses, some of them rounded to a few decimals.
+MAX_NUMBER = sys.float_info.max  # JSON's whole numbers know no limit.
+MAX_NATURAL = 1 << 31
 MATRIX = "a 4x4 matrix of finite numbers"
 
 
@@ -147,17 +150,22 @@ class _Record:
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
         """A finite number strictly between the bounds."""
         value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not low < value < high
+            or abs(value) > MAX_NUMBER
+        ):
             bounds = (
                 "" if low == -math.inf else f" above {low:g}" + ("" if high == math.inf else f" and below {high:g}")
             )
-            raise StgaError(f"{self.where(key)}: expected a finite number{bounds}, not {value!r}")
+            raise StgaError(f"{self.where(key)}: expected a finite number{bounds}, not {value!r:.40}")
         return float(value)
 
     def natural(self, key: str) -> int:
         value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, not {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < MAX_NATURAL:
+            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {value!r:.40}")
         return value
 
     def path_of(self, key: str) -> Path | None:
@@ -210,7 +218,8 @@ def _frame(record: _Record, shared: _Record, timed: bool, principal_point: str) 
         timestep=record.natural(key) if key else 0,
         camera_index=record.natural("camera_index") if record.has("camera_index") else -1,
         camera=with_principal_point(camera, written, principal_point),
-        name=record.values["file_path"],
+        # Forward slashes everywhere: what is named after a view must not become a path on Windows alone.
+        name=record.values["file_path"].replace("\\", "/"),
         image=image,
         mask=record.path_of("fg_mask_path"),
     )

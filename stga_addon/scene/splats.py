@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..avatar.embedding import neutral_areas
+from ..avatar.embedding import face_areas
 from ..avatar.file import Avatar
 from ..avatar.splats import Splats
 from ..errors import StgaError
@@ -24,7 +24,7 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None) -> Any:
     """
     check_head(avatar, head)
     shown = _splat_object(name or f"{head.name} splats", avatar.splats, head.users_collection[0])
-    area = neutral_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
+    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
     _attribute(shown.data, nodes.FACE, "INT", "value", avatar.splats.face, np.int32)
     _attribute(shown.data, nodes.NEUTRAL_AREA, "FLOAT", "value", area)
     _add_modifier(shown, avatar.convention)

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +21,12 @@ from typing import IO, Any
 import numpy as np
 import torch
 
+from ..avatar.embedding import CONVENTIONS
 from ..avatar.file import SH_SIZES
+from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
 from ..files import file_size, partial_name, read_json, read_npz, replacing, write_json, write_npz
-from .settings import Settings, from_json, to_json
+from .settings import SCHEDULES, STRATEGIES, Settings, from_json, to_json
 from .state import TrainState, state_of, tensors_of
 
 FORMAT, VERSION = "stga-run", 1
@@ -87,14 +89,47 @@ def read_run(folder: Path) -> Run:
         raise StgaError(f"{path}: was written by run format {values.get('version')!r}, this version reads {VERSION}")
     try:
         flame = values["flame"]
+        settings = from_json(values["settings"])
+        _check_settings(settings)
         return Run(
-            Path(values["capture"]),
-            None if flame is None else Path(flame),
-            str(values["principal_point"]),
-            from_json(values["settings"]),
+            Path(values["capture"]), None if flame is None else Path(flame), str(values["principal_point"]), settings
         )
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
+
+
+def _check_settings(settings: Settings) -> None:
+    """Raise ValueError for a number that training could not work with, or that would fill the memory."""
+    budget = settings.iterations if settings.seconds is None else settings.seconds
+    if budget is None or not 0 < budget < math.inf or (settings.seconds is None) == (settings.iterations is None):
+        raise ValueError(f"budget of {settings.seconds} seconds and {settings.iterations} iterations")
+    for name, allowed in _CHOICES.items():
+        if getattr(settings, name) not in allowed:
+            raise ValueError(f"{name} is {getattr(settings, name)!r}")
+    for name, (low, high) in _RANGES.items():
+        value = getattr(settings, name)
+        if not all(low <= number <= high for number in (value if isinstance(value, tuple) else (value,))):
+            raise ValueError(f"{name} is {value!r}, expected {low} to {high}")
+    if len(settings.density_span) != 2 or len(settings.background) != 3:
+        raise ValueError("density_span or background has another length")
+
+
+_CHOICES: dict[str, Collection[str]] = {"strategy": STRATEGIES, "schedule": SCHEDULES, "convention": CONVENTIONS}
+_RANGES: dict[str, tuple[float, float]] = {
+    "seed": (0, math.inf),
+    "lattice": (0, 16),
+    "sh_degree": (0, MAX_SH_DEGREE),
+    "views_per_visit": (0, math.inf),
+    "global_every": (1, math.inf),
+    "density_every": (0, math.inf),
+    "stray_every": (0, math.inf),
+    "growth": (0, 100),
+    "warm_up": (0, 1),
+    "ssim_weight": (0, 1),
+    "sh_steps": (0, math.inf),
+    "density_span": (0, math.inf),
+    "background": (0, 1),
+}
 
 
 def write_selection(folder: Path, selection: dict[int, np.ndarray]) -> None:
@@ -105,7 +140,7 @@ def read_selection(folder: Path, faces: int) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh."""
     path = folder / "selection.npz"
     selection = {}
-    for name, mask in read_npz(path).items():
+    for name, mask in read_npz(path, max_packing=faces // 100 + 16).items():  # an entry of a zip has some 200 bytes
         if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
             raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep")
         selection[int(name)] = mask
@@ -193,9 +228,9 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         return lines
     try:
         file_size(path)
-        with path.open(encoding="utf-8") as texts:
+        with path.open("rb") as texts:
             for text in texts:
-                line = json.loads(text)
+                line = json.loads(text.decode("utf-8"))
                 if not isinstance(line, dict) or type(line.get("iteration")) is not int:
                     break
                 lines.append(line)

@@ -99,6 +99,7 @@ PAPER = {
     "stray_limit": 1.0,
     "lattice": 4,
     "seeds": False,
+    "any_background": False,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
 """The paper's letter, where it differs from the defaults, which are what measured best (docs/results.md)."""
@@ -113,6 +114,7 @@ GAUSSIAN_AVATARS = {
     "distance_weight": 0.01,
     "stray_every": 0,
     "seeds": False,
+    "any_background": False,
     "growth": 8.0,
 }
 """GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and released settings)."""

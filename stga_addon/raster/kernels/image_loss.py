@@ -125,14 +125,17 @@ def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
                     mx, my = moments[n], moments[np.uint64(stride) + n]
                     squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
                     mxy, mm = mx * my, mx * mx + my * my
-                    a, b = TWO * mxy + C1, TWO * (product - mxy) + C2
-                    d, e = mm + C1, squares - mm + C2
-                    over = ONE / (d * e)
-                    ssim = a * b * over
+                    # Differences of blurred squares: in bright, flat images rounding makes the variances negative and
+                    # the covariance larger than their mean, which it can never be.
+                    variance = max(ZERO, squares - mm)
+                    covariance = min(variance, max(-variance, TWO * (product - mxy)))
+                    over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
+                    luminance, structure = (TWO * mxy + C1) * over_d, (covariance + C2) * over_e
+                    ssim = luminance * structure
                     # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
-                    by_product = TWO * a * over
-                    by_squares = -ssim * d * over
-                    by_mean = TWO * my * (b - a) * over - TWO * mx * ssim * (e - d) * over
+                    by_product = TWO * luminance * over_e
+                    by_squares = -ssim * over_e
+                    by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
                     slopes[np.uint64(RADIUS) + n] = by_mean
                     slopes[np.uint64(stride + RADIUS) + n] = by_squares
                     slopes[np.uint64(2 * stride + RADIUS) + n] = by_product

@@ -9,6 +9,8 @@ from . import jit, parallel_jit
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 CHUNK = 256
+LARGEST = np.float32(1e18)
+"""A gradient beyond this counts as broken: its square would make the second moment infinite, and the row NaN."""
 
 
 @parallel_jit
@@ -17,7 +19,7 @@ def adam_rows(rows, steps, parameters, gradients, firsts, seconds, rates, beta1,
 
     parameters, gradients, firsts, seconds: equally long tuples of (N, D) arrays; steps (N,) int32; rates (P, max D):
     learning rate by parameter and column. Rows that are not listed are not touched: neither parameters, moments nor
-    count. A row whose gradient is not finite keeps that parameter and its moments.
+    count. A row whose gradient is not finite, or beyond LARGEST, keeps that parameter and its moments.
     All parameters in one parallel loop: on a busy machine every further one waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
@@ -44,7 +46,7 @@ def _adam_block(rows, parameter, gradient, first, second, correct1, correct2, ra
         i = rows[n]
         unsound = ZERO
         for c in range(width):
-            unsound += gradient[i, c] * ZERO
+            unsound += ZERO if abs(gradient[i, c]) < LARGEST else ONE
         if unsound != ZERO:
             continue
         scale1, scale2 = correct1[n], correct2[n]

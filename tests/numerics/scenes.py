@@ -1,0 +1,119 @@
+"""Hard scenes for the float32 kernels, and how far they are from the float64 reference."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from raster.test_kernels import NAMES, Scene, cloud, kernel_gradients, random_cotangents
+
+from stga_addon.capture.camera import Camera
+from stga_addon.raster import reference
+
+
+def facing(
+    count: int, seed: int = 0, size: tuple[int, int] = (37, 29), focal: float = 40.0, degree: int = 1, **changes: object
+) -> Scene:
+    """`count` splats two metres before a camera at the origin that looks along +z; `changes` replaces parameters."""
+    rng = np.random.default_rng(seed)
+    width, height = size
+    splats = {
+        "xyz": np.c_[rng.uniform(-0.8, 0.8, (count, 2)), rng.uniform(1.5, 2.5, count)],
+        "rotation": rng.normal(size=(count, 4)),
+        "log_scale": rng.normal(-2.5, 0.4, (count, 3)),
+        "opacity": rng.normal(0, 1.5, count),
+        "sh": rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)),
+    } | changes
+    camera = Camera(width, height, focal, focal * 1.1, width / 2 - 0.3, height / 2 + 0.2, np.eye(4))
+    return Scene({name: np.asarray(value, np.float32) for name, value in splats.items()}, camera, degree)
+
+
+def rows(scene: Scene, keep: np.ndarray) -> Scene:
+    return replace(scene, splats={name: value[keep] for name, value in scene.splats.items()})
+
+
+def reference_gradients(
+    scene: Scene, cotangents: list[torch.Tensor], near: float = 0.01
+) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+    """Images and gradients of the float64 reference for the very numbers that the kernels get."""
+    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
+    images = reference.render(*tensors, scene.camera, sh_degree=scene.degree, near=near)
+    loss = sum((image * v).sum() for image, v in zip(images, cotangents, strict=True))
+    gradients = torch.autograd.grad(loss, tensors)
+    return [image.detach().numpy() for image in images], {n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)}
+
+
+def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
+    """(H, W) bool: pixels where no splat is within `margin` (relative) of one of the renderer's jumps.
+
+    They are alpha at 1/255 and at the clamp 0.999, and transmittance at the stop 1e-4. On which side a float32 lies
+    there is chance, and both sides are right.
+    """
+    tensors = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
+    xyz, rotation, log_scale, opacity, _ = tensors
+    view = torch.as_tensor(scene.camera.world_to_camera)
+    points = xyz @ view[:3, :3].T + view[:3, 3]
+    order = torch.argsort(points[:, 2], stable=True)
+    order = order[points[order, 2] >= 0.0099]
+    covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
+    centre, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    shape = (scene.camera.height, scene.camera.width)
+    steady, transmittance = torch.ones(shape, dtype=torch.bool), torch.ones(shape, dtype=torch.float64)
+    running = torch.ones(shape, dtype=torch.bool)
+    # The same with the cut-offs moved by the margin, by making each splat a little more or less opaque.
+    logit = torch.sigmoid(opacity[order])
+    kept = reference._alpha(centre, projected, logit, scene.camera)
+    for other in (logit * (1 - margin), logit * (1 + margin)):
+        moved = reference._alpha(centre, projected, other, scene.camera)
+        steady &= (((moved > 0) == (kept > 0)) & ((moved < 0.999) == (kept < 0.999))).all(0)
+    for alpha in kept:
+        after = transmittance * (1 - alpha)
+        steady &= ~running | ((after - 1e-4).abs() > margin * 1e-4)
+        running &= after > 1e-4
+        transmittance = torch.where(running, after, transmittance)
+    return steady.numpy()
+
+
+def compare(scene: Scene, near: float = 0.01) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Largest differences between kernels and reference on steady pixels, and the kernels' gradients.
+
+    Images: absolute for rgb and alpha, relative to the largest for depth and for colours above one. Gradients: under
+    random cotangents, over the largest of the quantity. Fails if anything is not finite.
+    """
+    steady = steady_pixels(scene)
+    cotangents = [v * torch.from_numpy(steady) for v in random_cotangents(scene.camera)]
+    images, gradients = kernel_gradients(scene, cotangents)
+    expected_images, expected = reference_gradients(scene, cotangents, near)
+    for name, value in (*zip(("rgb", "alpha", "depth"), images, strict=True), *gradients.items()):
+        assert np.isfinite(value).all(), f"{name} is not finite"
+    errors = {}
+    for name, got, want in zip(("rgb", "alpha", "depth"), images, expected_images, strict=True):
+        errors[name] = float(np.abs((got - want) * steady).max() / max(1, np.abs(want).max()))
+    scales = {name: np.abs(want).max() for name, want in expected.items()}
+    # Turning a ball changes nothing: what would be its gradient cancels, and float32 leaves the rounding of its parts.
+    length = np.linalg.norm(scene.splats["rotation"].astype(np.float64), axis=1, keepdims=True)
+    scales["rotation"] = max(scales["rotation"], np.abs(expected["log_scale"] / length).max())
+    for name, want in expected.items():
+        errors[name] = float(np.abs(gradients[name] - want).max() / max(scales[name], 1e-6))
+    return errors, gradients
+
+
+def assert_close(errors: dict[str, float], image: float, gradient: float) -> None:
+    """Every error below its tolerance; the message names those that are not."""
+    limits = dict.fromkeys(("rgb", "alpha", "depth"), image)
+    bad = {name: f"{value:.1e}" for name, value in errors.items() if not value < limits.get(name, gradient)}
+    assert not bad, bad
+
+
+__all__ = [
+    "NAMES",
+    "Scene",
+    "assert_close",
+    "cloud",
+    "compare",
+    "facing",
+    "kernel_gradients",
+    "random_cotangents",
+    "reference_gradients",
+    "rows",
+    "steady_pixels",
+]

@@ -1,0 +1,133 @@
+"""Scenes nobody thought of: the kernels against the float64 reference and against finite differences."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stga_addon.raster import reference
+
+from .scenes import NAMES, Scene, assert_close, compare, facing, kernel_gradients, random_cotangents, steady_pixels
+
+BOUNDED = {"deadline": None, "derandomize": True, "database": None, "suppress_health_check": list(HealthCheck)}
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """Up to 30 splats, each quantity from nothing to far beyond what training produces, in images up to 40 pixels."""
+
+    def between(low: float, high: float) -> float:
+        return draw(st.floats(low, high, width=32))
+
+    count, seed = draw(st.integers(1, 30)), draw(st.integers(0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
+    size = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    focal = max(size) * 10 ** between(-1.5, 1.5)
+    nearest = 10 ** between(-2, 1)
+    depth = nearest * 10 ** rng.uniform(0, between(0, 2), count)
+    degree = draw(st.integers(0, 3))
+    return facing(
+        count,
+        seed,
+        size,
+        focal,
+        degree,
+        xyz=np.c_[rng.normal(0, 10 ** between(-3, 0.5), (count, 2)) * depth[:, None] * max(size) / focal, depth],
+        rotation=rng.normal(size=(count, 4)) * 10 ** between(-10, 10),
+        log_scale=np.clip(rng.normal(between(-12, 3), between(0, 5), (count, 3)), -27, 7),
+        opacity=rng.normal(between(-8, 12), between(0, 20), count),
+        sh=rng.normal(0, 10 ** between(-3, 4), (count, (degree + 1) ** 2, 3)),
+    )
+
+
+def steady_colours(scene: Scene) -> bool:
+    """Whether no colour lies so near zero, where it is cut, that float32 may take the other side."""
+    direction = torch.from_numpy(scene.splats["xyz"]).double()
+    basis = reference.sh_basis(torch.nn.functional.normalize(direction, dim=-1))[:, : (scene.degree + 1) ** 2]
+    sh = torch.from_numpy(scene.splats["sh"]).double()
+    colour = 0.5 + torch.einsum("nk,nkc->nc", basis, sh)
+    return bool((colour.abs() > 1e-5 * (0.5 + sh.abs().sum((1,)))).all())
+
+
+def steady_order(scene: Scene) -> bool:
+    """Whether no two depths round to neighbouring float32 values in another order."""
+    depths = np.sort(scene.splats["xyz"][:, 2].astype(np.float64))
+    return bool((np.diff(depths) > 1e-6 * depths[1:]).all())
+
+
+def check(scene: Scene) -> None:
+    if not (steady_colours(scene) and steady_order(scene)):
+        return
+    errors, _ = compare(scene, near=float(np.float32(0.01)))
+    assert_close(errors, image=2e-5, gradient=1e-3)
+
+
+@settings(max_examples=60, **BOUNDED)
+@given(scenes())
+def test_any_scene_is_the_references(scene: Scene) -> None:
+    """Catches NaN, infinity and disagreement that no listed scene provokes."""
+    check(scene)
+
+
+@pytest.mark.slow
+@settings(max_examples=1500, **(BOUNDED | {"derandomize": False}))
+@given(scenes())
+def test_any_scene_is_the_references_at_length(scene: Scene) -> None:
+    """The same, with other scenes every time."""
+    check(scene)
+
+
+WILD = st.sampled_from([0.0, 1e-45, 1e-38, 1e-20, 1.0, 50.0, 90.0, 1e4, 1e8, 1e20, 3e38, np.inf, np.nan])
+
+
+@settings(max_examples=60, **BOUNDED)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 19), st.sampled_from(NAMES), st.integers(0, 11), st.booleans(), WILD), max_size=12
+    )
+)
+def test_any_number_in_any_place_harms_only_its_splat(places: list[tuple[int, str, int, bool, float]]) -> None:
+    """Catches overflow, 0/0 and NaN from any combination of extreme entries in up to a dozen places.
+
+    The image and every gradient stay finite, except that a colour beyond float32 may exceed it where it is blended:
+    so harmonics beyond 1e20 are left out.
+    """
+    scene = facing(20)
+    for row, name, column, negative, value in places:
+        if name == "sh" and 1e20 < value < np.inf:
+            continue
+        flat = scene.splats[name].reshape(20, -1)
+        flat[row, column % flat.shape[1]] = -value if negative else value
+    images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
+    for image in images:
+        assert np.isfinite(image).all()
+    for name, gradient in gradients.items():
+        assert np.isfinite(gradient).all(), name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradient_is_the_central_difference(name: str) -> None:
+    """Catches an error that reference and kernels share, which comparing the two would not show.
+
+    Differences of the float64 image in random directions, weighted by cotangents that vanish on every pixel where the
+    step crosses one of the renderer's jumps (alpha 1/255 and 0.999, transmittance 1e-4).
+    """
+    scene, step = facing(25, log_scale=np.random.default_rng(5).normal(-1.8, 0.6, (25, 3))), 1e-6
+    steady = torch.from_numpy(steady_pixels(scene, margin=1e-3))
+    assert steady.float().mean() > 0.8
+    cotangents = [v * steady for v in random_cotangents(scene.camera)]
+    _, gradients = kernel_gradients(scene, cotangents)
+    base = {n: torch.from_numpy(v).double() for n, v in scene.splats.items()}
+    rng = np.random.default_rng(6)
+    for _ in range(4):
+        direction = rng.normal(size=base[name].shape)
+        ends = []
+        for sign in (1, -1):
+            moved = base | {name: base[name] + sign * step * torch.from_numpy(direction)}
+            images = reference.render(*(moved[n] for n in NAMES), scene.camera, sh_degree=scene.degree)
+            ends.append(sum(float((image * v).sum()) for image, v in zip(images, cotangents, strict=True)))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        scale = np.abs(gradients[name] * direction).sum()
+        assert scale > 0
+        assert abs(slope - (gradients[name] * direction).sum()) < 1e-5 * scale

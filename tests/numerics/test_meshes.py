@@ -1,0 +1,183 @@
+"""Degenerate, flipping and turning triangles, and poses out of range: frames, lattice and what is rendered of them."""
+
+import numpy as np
+import pytest
+import torch
+from flame.conftest import model_of, random_arrays, random_frame
+from raster.test_kernels import embed
+from scipy.spatial.transform import Rotation
+
+from stga_addon.avatar.embedding import CONVENTIONS, face_frames, quaternion_from_matrix, to_local, to_world
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.camera import Camera
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
+from stga_addon.flame.forward_torch import flame_forward as torch_forward
+from stga_addon.raster import reference
+from stga_addon.raster.render import Parameters, render
+
+from .meshes import DEGENERATE, WHOLE, mesh_of
+from .scenes import NAMES, random_cotangents
+
+FACES = np.array([[0, 1, 2]])
+
+
+def assert_proper(rotation: np.ndarray) -> None:
+    np.testing.assert_allclose(
+        rotation.transpose(0, 2, 1) @ rotation, np.tile(np.eye(3), (len(rotation), 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_line_in_the_neutral_mesh_does_not_grow(convention: str, name: str, dtype: type) -> None:
+    """Catches a ratio of areas whose denominator is rounding: three corners on a line, in float32 as in a file, have
+    1e-13 m², and when the triangle opens its splats would be drawn 20,000 times too large, a hundred metres away."""
+    neutral = DEGENERATE[name].astype(dtype).astype(float)
+    splats = lattice_splats(neutral, FACES, convention=convention)
+    frames = face_frames(WHOLE, FACES, neutral, convention)
+    assert_proper(frames.rotation)
+    world = to_world(splats, frames)
+    assert np.linalg.norm(world.xyz - frames.origin, axis=1).max() < 0.04
+    assert np.exp(world.log_scale).max() < 0.02
+    for field in ("xyz", "rotation", "log_scale"):
+        assert np.isfinite(getattr(world, field)).all(), field
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_triangle_that_collapses_in_one_frame(convention: str, name: str) -> None:
+    """Catches an improper rotation, splats that leave the triangle, and an inverse that divides by a zero scale."""
+    splats = lattice_splats(WHOLE, FACES, convention=convention)
+    posed = DEGENERATE[name].astype(np.float32).astype(float)
+    frames = face_frames(posed, FACES, WHOLE, convention)
+    assert_proper(frames.rotation)
+    world = to_world(splats, frames)
+    assert np.linalg.norm(world.xyz - frames.origin, axis=1).max() < 0.02
+    back = to_local(world, frames, splats.face)
+    for field in ("xyz", "rotation", "log_scale"):
+        assert np.isfinite(getattr(world, field)).all(), field
+        assert np.isfinite(getattr(back, field)).all(), field
+
+
+@pytest.mark.parametrize("name", [name for name in DEGENERATE if name != "point"])
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_rounding_does_not_turn_a_line(convention: str, name: str) -> None:
+    """Catches a normal made of rounding: the same line, rounded in 20 other ways, must keep its rotation.
+
+    Without the threshold the frame of a closed eyelid turns at random from one frame to the next.
+    """
+    posed = DEGENERATE[name]
+    noise = np.random.default_rng(0).uniform(-2e-9, 2e-9, (20, 3, 3))
+    triangles = [posed, *(posed + noise)]
+    vertices, faces = np.concatenate(triangles), np.arange(63).reshape(-1, 3)
+    frames = face_frames(vertices, faces, np.tile(WHOLE, (21, 1)), convention)
+    np.testing.assert_allclose(frames.rotation[1:], np.broadcast_to(frames.rotation[0], (20, 3, 3)), atol=2e-5)
+
+
+def test_collapsed_triangles_render_and_train_in_float32() -> None:
+    """Catches NaN from scales of e^−60 and smaller, and gradients that differ from the float64 reference's."""
+    flat = list(DEGENERATE.values())
+    posed, faces = mesh_of([*flat, *(WHOLE + 0.02 * n for n in range(len(flat)))])
+    neutral, _ = mesh_of([WHOLE] * len(flat) + flat)
+    for convention in CONVENTIONS:
+        splats = lattice_splats(neutral, faces, 1, 1, opacity_logit=1.0, convention=convention)
+        rng = np.random.default_rng(1)
+        values = {name: getattr(splats, name) for name in NAMES}
+        values["rotation"] = rng.normal(size=values["rotation"].shape).astype(np.float32)
+        values["sh"] = rng.normal(0, 0.5, values["sh"].shape).astype(np.float32)
+        frames = face_frames(posed, faces, neutral, convention)
+        pose = np.eye(4)
+        pose[:3, 3] = [-0.09, -0.09, 0.5]
+        camera = Camera(40, 40, 80.0, 80.0, 20.0, 20.0, pose)
+        cotangents = random_cotangents(camera)
+
+        tensors = [torch.from_numpy(values[name]).clone().requires_grad_() for name in NAMES]
+        images = render(Parameters(*tensors), camera, frames, splats.face, degree=1)
+        gradients = torch.autograd.grad(
+            sum((i * v.float()).sum() for i, v in zip(images, cotangents, strict=True)), tensors
+        )
+        frames.scale[:] = np.maximum(frames.scale, 1e-30)  # the reference wants its logarithm
+        tensors = [torch.from_numpy(values[name]).double().requires_grad_() for name in NAMES]
+        expected_images = reference.render(*embed(tensors, frames, splats.face), camera, sh_degree=1)
+        expected = torch.autograd.grad(
+            sum((i * v).sum() for i, v in zip(expected_images, cotangents, strict=True)), tensors
+        )
+        assert expected_images[1].max() > 0.3
+        for image, want in zip(images, expected_images, strict=True):
+            np.testing.assert_allclose(image.detach(), want.detach(), atol=5e-6)
+        for name, gradient, want in zip(NAMES, gradients, expected, strict=True):
+            np.testing.assert_allclose(gradient, want, atol=2e-5 * float(want.abs().max()), err_msg=name)
+
+
+def test_a_triangle_that_flips_between_frames() -> None:
+    """Catches a frame that is mirrored instead of turned: a flip is half a turn about the first axis."""
+    for convention in CONVENTIONS:
+        before = face_frames(WHOLE, FACES, WHOLE, convention)
+        axis = before.rotation[0][:, 0]
+        flipped = WHOLE.mean(0) + Rotation.from_rotvec(np.pi * axis).apply(WHOLE - WHOLE.mean(0))
+        after = face_frames(flipped, FACES, WHOLE, convention)
+        turn = Rotation.from_matrix(after.rotation[0] @ before.rotation[0].T)
+        assert turn.magnitude() == pytest.approx(np.pi, abs=1e-9)
+        assert after.scale == pytest.approx(before.scale)
+        assert_proper(after.rotation)
+
+
+def test_quaternions_near_half_turns_from_float32_matrices() -> None:
+    """Catches a square root of a negative number, or 0/0, where rounding leaves the trace a little below −1."""
+    rng = np.random.default_rng(2)
+    axes = rng.normal(size=(500, 3))
+    axes[:30] = np.repeat(np.eye(3), 10, axis=0)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.pi + rng.normal(size=500) * 10.0 ** rng.uniform(-9, -3, 500)
+    matrices = Rotation.from_rotvec(axes * angles[:, None]).as_matrix().astype(np.float32)
+    assert (np.trace(matrices, axis1=1, axis2=2) < -1).any()
+    quaternions = quaternion_from_matrix(matrices)
+    expected = Rotation.from_matrix(matrices.astype(float))
+    error = (Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]) * expected.inv()).magnitude()
+    assert error.max() < 1e-6
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-30, 1e-8, 1e-4, np.pi - 1e-6, np.pi, np.pi + 1e-6, 2 * np.pi, 4 * np.pi])
+def test_axis_angle_in_float32(angle: float) -> None:
+    """Catches 0/0 at no turn and the loss of the axis at a full one: matrix and Jacobian of float32 and float64 agree.
+
+    `flame/test_forward.py` holds the float64 ones against scipy and finite differences.
+    """
+    direction = torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
+    jacobians, matrices = [], []
+    for dtype in (torch.float32, torch.float64):
+        axis_angle = (angle * direction).float().to(dtype)
+        matrices.append(axis_angle_matrices(axis_angle).double())
+        jacobians.append(torch.autograd.functional.jacobian(axis_angle_matrices, axis_angle).double())
+    for values in (matrices, jacobians):
+        assert torch.isfinite(values[0]).all()
+        np.testing.assert_allclose(values[0], values[1], atol=2e-6)
+    expected = Rotation.from_rotvec((angle * direction).float().double().numpy()).as_matrix()
+    np.testing.assert_allclose(matrices[1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("jaw", [[0.9, 0, 0], [np.pi, 0, 0], [-2.0, 1.0, 3.0], [40.0, 0, 0]])
+def test_a_jaw_past_its_range(jaw: list[float]) -> None:
+    """Catches poses that leave float32's precision: torch's vertices in float32 against numpy's, and sound frames.
+
+    FLAME's jaw opens by about 0.5 rad; a tracker that fails delivers anything.
+    """
+    model = model_of(random_arrays(vertices=60), n_identity=8)
+    frame = FlameFrame(**(vars(random_frame(1, 4)) | {"jaw_pose": np.array(jaw)}))
+    shape = np.random.default_rng(3).normal(size=8)
+    expected = flame_forward(model, shape, frame)
+    pose = torch.tensor(frame.pose[None], dtype=torch.float32).requires_grad_()
+    rest = [torch.tensor(a[None], dtype=torch.float32) for a in (frame.expr, frame.translation)]
+    vertices = torch_forward(flame_tensors(model), torch.tensor(shape, dtype=torch.float32), rest[0], pose, rest[1])
+    # An angle of 40 rad is itself rounded to 4e-6.
+    assert np.abs(vertices[0].detach().numpy() - expected).max() < 2e-6
+    (gradient,) = torch.autograd.grad(vertices.square().sum(), pose)
+    assert torch.isfinite(gradient).all()
+    neutral = flame_forward(model, shape, random_frame(1, 4))
+    for convention in CONVENTIONS:
+        frames = face_frames(expected, model.faces, neutral, convention)
+        assert_proper(frames.rotation)
+        assert np.isfinite(frames.scale).all()

@@ -1,0 +1,218 @@
+"""Losses and the optimiser at the edge of float32, against their formulas in float64."""
+
+import numpy as np
+import pytest
+import torch
+from training.test_losses import reference as loss_reference
+from training.toys import bits, random_splats
+
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.raster.kernels.rows import distance_limit, scale_limit
+from stga_addon.raster.render import Parameters, camera_frames, render_backward, render_forward
+from stga_addon.training import adam
+from stga_addon.training.losses import REACH, image_gradient, tile_rectangles, whole_image
+from stga_addon.training.state import new_state
+
+from .scenes import NAMES, facing, random_cotangents
+
+HEIGHT, WIDTH = 30, 33
+RATE = dict.fromkeys((*NAMES, "sh_rest"), 1e-3)
+
+
+def image_of(kind: str, value: float) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    noise = rng.random((3, HEIGHT, WIDTH))
+    if kind == "constant":
+        noise = np.ones_like(noise)
+    if kind == "nearly constant":
+        noise = 1 + 1e-3 * noise
+    if kind == "sparks":
+        noise = (noise < 0.01).astype(float)
+    return (value * noise).astype(np.float32)
+
+
+def loss_errors(image: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+    """Errors of the gradient, relative to its largest entry, and of SSIM."""
+    out = np.full_like(image, np.nan)
+    _, ssim = image_gradient(image, target, whole_image(HEIGHT, WIDTH), 0.2, out)
+    assert np.isfinite(out).all()
+    gradient, _, similar = loss_reference(image, target, 0.2)
+    return float(np.abs(out - gradient).max() / np.abs(gradient).max()), abs(ssim - float(similar.mean()))
+
+
+def random_target() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+EXTREMES = [(kind, value) for kind in ("noise", "sparks") for value in (0.0, 1.0, 10.0, 1e4, 1e8)]
+EXTREMES += [("constant", value) for value in (0.0, 1.0, 10.0)]
+
+
+@pytest.mark.parametrize(("kind", "value"), EXTREMES)
+def test_loss_of_extreme_images(kind: str, value: float) -> None:
+    """Catches overflow of the product of two variances, and 0/0 where image or target does not vary.
+
+    Harmonics of 1e4 do make images of 1e4. The target is noise: where both are constant SSIM is flat, and what is left
+    of its gradient is rounding (`training/test_losses.py::test_constant_images`).
+    """
+    gradient, ssim = loss_errors(image_of(kind, value), random_target())
+    assert gradient < 5e-4
+    assert ssim < 1e-4
+
+
+@pytest.mark.parametrize("value", [1.0, 2.0, 10.0, 100.0, 1e4, 1e8, 1e15, 1e18])
+@pytest.mark.parametrize("kind", ["constant", "nearly constant", "noise", "sparks"])
+def test_loss_never_runs_away(kind: str, value: float) -> None:
+    """Catches a variance that rounding makes negative, which turns SSIM's gradient round and inflates it, and NaN.
+
+    An image is training's to change, so what counts is that every pixel is pulled towards the target no harder than
+    the loss can: by about one per pixel from L1 and a few more from SSIM.
+    """
+    image, target = image_of(kind, value), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    out = np.full_like(image, np.nan)
+    _, ssim = image_gradient(image, target, whole_image(HEIGHT, WIDTH), 0.2, out)
+    assert np.isfinite(out).all()
+    assert -1 <= ssim <= 1 + 1e-5
+    limit = 3 * max(1.0, float(np.abs(loss_reference(image, target, 0.2)[0]).max()) * image.size)
+    assert np.abs(out).max() * image.size < limit
+
+
+def test_limits_where_every_norm_is_zero() -> None:
+    """Catches 0/0 in the gradients of |x| at the origin and of a norm of nothing but zeros."""
+    count = 4
+    rows, face, loose = np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.zeros(count, bool)
+    for limit in (0.0, 1.0):
+        gradient = np.zeros((count, 3), np.float32)
+        norm = distance_limit(rows, np.zeros((count, 3), np.float32), face, loose, np.float32([limit]), 0.1, gradient)
+        assert norm == 0
+        assert not gradient.any()
+        flat = np.full((count, 3), -200, np.float32)  # scales of e^−200 are zero in float32
+        assert scale_limit(rows, flat, face, loose, np.float32([limit]), 0.1, gradient) == 0
+        assert not gradient.any()
+
+
+def test_limit_of_one_enormous_splat() -> None:
+    """Catches squares that overflow: the other rows' gradients must stay what the formula says."""
+    log_scale = np.log(np.float32([[1, 1, 1], [2, 2, 2], [1e15, 1, 1]]))
+    rows, face, loose = np.arange(3, dtype=np.int32), np.zeros(3, np.int32), np.zeros(3, bool)
+    gradient = np.zeros((3, 3), np.float32)
+    norm = scale_limit(rows, log_scale, face, loose, np.float32([0.5]), 1.0, gradient)
+    scale = np.exp(log_scale.astype(np.float64))
+    expected = np.linalg.norm(scale - 0.5)
+    assert norm == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(gradient, (scale - 0.5) / expected * scale, rtol=1e-5)
+
+
+def test_nothing_and_everything_selected() -> None:
+    """Catches an empty list of tiles, rectangles or rows, and a full selection that is not a global iteration."""
+    scene = facing(40, size=(70, 50), focal=60.0)
+    splats, face = Parameters(*(scene.splats[n] for n in NAMES)), np.zeros(40, np.int32)
+    seen = camera_frames(WORLD, scene.camera)
+    v_image = random_cotangents(scene.camera)[0].float().numpy()
+    results = []
+    for focus in (None, np.ones(40, bool), np.zeros(40, bool)):
+        rendering = render_forward(splats, face, seen, 1, focus=focus, reach=REACH)
+        gradients = Parameters(*(np.full_like(a, 7) for a in splats))
+        rows, _ = render_backward(rendering, splats, face, seen, v_image, gradients, focus=focus)
+        results.append((rows, gradients))
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(results[0][1], name), getattr(results[1][1], name), err_msg=name)
+        assert (getattr(results[2][1], name) == 7).all(), name
+    assert len(results[2][0]) == 0
+    no_tiles = tile_rectangles(np.zeros((4, 5), bool), 50, 70)
+    out = np.full((3, 50, 70), 7, np.float32)
+    assert image_gradient(np.zeros_like(out), np.zeros((50, 70, 3), np.uint8), no_tiles, 0.2, out) == (0, 0)
+    assert (out == 7).all()
+    state = new_state(random_splats(5, 3))
+    before = bits(state)
+    adam.step(state, np.zeros(0, np.int32), RATE)
+    for name, value in bits(state).items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+def float64_adam(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
+    """Total movement, in units of the rate, after each gradient of one entry's history."""
+    mean = square = moved = 0.0
+    path = []
+    for n, g in enumerate(gradients.astype(np.float64), steps + 1):
+        mean, square = 0.9 * mean + 0.1 * g, 0.999 * square + 0.001 * g * g
+        moved -= (mean / (1 - 0.9**n)) / (np.sqrt(square / (1 - 0.999**n)) + 1e-15)
+        path.append(moved)
+    return np.array(path)
+
+
+def adam_path(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
+    """The same for the opacity of one of three rows, by the kernel; the other two have gradients of one."""
+    state = new_state(random_splats(3, 3))
+    state.steps[1] = steps
+    state.parameters.opacity[:] = 0
+    for tensor in state.gradients:
+        tensor.fill_(1)
+    path = []
+    for g in gradients:
+        state.gradients.opacity[1] = float(g)
+        adam.step(state, np.arange(3, dtype=np.int32), RATE | {"opacity": 1.0})
+        path.append(float(state.parameters.opacity[1]))
+    for name, value in state.parameters._asdict().items():
+        assert torch.isfinite(value).all(), name
+    return np.array(path)
+
+
+@pytest.mark.parametrize("size", [1e-8, 1e-12, 1e-15, 1e-17, 1e-20, 1e-25, 1e-38, 0.0])
+def test_adam_with_vanishing_moments(size: float) -> None:
+    """Catches 0/0 once the square underflows (below 1e-19 it is zero), and an ε in the wrong place.
+
+    Second moments of 1e-30 and less: there ε = 1e-15 decides, and the step tends to nothing.
+    """
+    gradients = size * np.random.default_rng(2).normal(size=30)
+    # Where squares are subnormal, only their order of magnitude is left, beside an ε that outweighs them.
+    np.testing.assert_allclose(adam_path(gradients), float64_adam(gradients), atol=1e-4 if size != 1e-20 else 1e-3)
+
+
+@pytest.mark.parametrize("spike", [1e8, 1e15, 1e17])
+def test_adam_after_a_spike(spike: float) -> None:
+    """Catches a spike that overflows the second moment: as in float64, it moves by a few rates and is forgotten."""
+    gradients = np.random.default_rng(3).normal(size=40)
+    gradients[10] = spike
+    np.testing.assert_allclose(adam_path(gradients), float64_adam(gradients), atol=1e-4)
+
+
+@pytest.mark.parametrize("spike", [1e20, 1e30, -3e38])
+def test_adam_after_a_spike_whose_square_overflows(spike: float) -> None:
+    """Catches a second moment of infinity: from that step on the row is NaN.
+
+    Such a gradient counts as broken, like NaN: the row keeps its value and moments for that step.
+    """
+    gradients = np.random.default_rng(3).normal(size=40)
+    gradients[10] = spike
+    path = adam_path(gradients)
+    assert path[10] == path[9]
+    assert np.abs(np.diff(path[10:])).min() > 1e-4
+
+
+def test_a_row_that_is_stepped_once_in_ten_thousand() -> None:
+    """Catches bias correction by iterations instead of the row's own steps: after three rare ones its moments are
+    still corrected by 1 − β³, while its neighbour's are not any more."""
+    state = new_state(random_splats(2, 3))
+    state.parameters.opacity[:] = 0
+    for tensor in state.gradients:
+        tensor.zero_()
+    rng = np.random.default_rng(4)
+    rare = rng.normal(size=3)
+    for g in rare:
+        state.gradients.opacity[1] = float(g)
+        adam.step(state, np.array([0, 1], np.int32), RATE)
+        for _ in range(20):
+            state.gradients.opacity[:] = float(rng.normal())
+            adam.step(state, np.array([0], np.int32), RATE)
+        state.steps[0] += 10_000 - 21  # the steps in between do nothing to row 1, however many they are
+    assert state.steps.tolist() == [30_000, 3]
+    assert float(state.parameters.opacity[1]) == pytest.approx(1e-3 * float64_adam(rare)[-1], rel=1e-5)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 10_000, 10_000_000, 2**31 - 50])
+def test_adam_of_any_age(steps: int) -> None:
+    """Catches 1 − β^n that cancels at the first steps or overflows a count at the last."""
+    gradients = np.random.default_rng(5).normal(size=20)
+    np.testing.assert_allclose(adam_path(gradients, steps), float64_adam(gradients, steps), atol=1e-4, rtol=1e-5)
