@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: demo test test-fast lint zip clean
+.PHONY: demo test test-fast lint fuzz zip clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -17,6 +17,9 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+fuzz: .venv/ready
+	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} $(BIN)/python -m pytest tests/fuzz
 
 zip: .venv/ready
 	$(BIN)/python -m stga_addon.package --out dist

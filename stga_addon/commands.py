@@ -23,6 +23,8 @@ def train(options: Namespace) -> None:
     from .training.progress import ProgressBar
     from .training.run import train as train_run
 
+    if not options.capture.is_dir():
+        raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
     if options.resume:
         run = read_run(options.out)
         _refuse_changes(options, run)

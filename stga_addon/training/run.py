@@ -107,6 +107,9 @@ class _Loop:
         face = checkpoint.state.face
         if len(face) and not 0 <= int(face.min()) <= int(face.max()) < len(self.capture.faces):
             raise StgaError(f"{self.out}: its splats stand on triangles that {self.capture.root} does not have")
+        degree = checkpoint.state.splats().sh_degree
+        if degree != self.settings.sh_degree:
+            raise StgaError(f"{self.out}: its splats have SH degree {degree}, run.json says {self.settings.sh_degree}")
         self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state)
         self.trainer.continue_from(checkpoint)
         self.losses.extend(checkpoint.losses)

@@ -1,0 +1,234 @@
+"""One target a reader: a good file, damaged as hypothesis likes, either loads or raises StgaError.
+
+Catches any other exception, a crash, a hang and memory out of proportion, on inputs that nobody thought of. Quick
+in the normal suite; `STGA_FUZZ_SECONDS=600 pytest tests/fuzz` shares that time among the targets.
+"""
+
+import json
+import pickle
+import time
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+from avatar.conftest import random_mesh, random_splats
+from capture import factory
+from flame.conftest import model_of, random_arrays
+from hypothesis import given, seed, settings
+from hypothesis import strategies as st
+from PIL import Image
+from training.test_folder import make_checkpoint, make_run
+
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars
+from stga_addon.avatar.ply import PROPERTIES, read_ply, splat_columns, write_columns, write_ply
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.images import read_image, read_mask
+from stga_addon.capture.meshes import read_mesh, read_regions
+from stga_addon.capture.model import View
+from stga_addon.capture.release import read_face_ids, read_soup
+from stga_addon.capture.transforms import read_transforms
+from stga_addon.errors import StgaError
+from stga_addon.flame.model import read_flame
+from stga_addon.flame.sequence import read_frame, read_identity, read_motion
+from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.training import folder as run_folder
+
+from .conftest import SECONDS
+
+LONGEST_S, MOST_BYTES = 2.0, 200e6
+MODEL = model_of(random_arrays(), 9)
+FACES = np.arange(12).reshape(4, 3)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file's name, how a good one is written, and its reader."""
+
+    name: str
+    write: Callable[[Path], Any]
+    read: Callable[[Path], Any]
+
+
+def small_avatar() -> Avatar:
+    neutral, faces = random_mesh(1, 20)
+    splats = random_splats(2, 6, len(faces))
+    return Avatar(splats, "stga", neutral.astype(np.float32), faces, regions={"nose": np.ones(len(faces), bool)})
+
+
+def bound_splats(path: Path) -> None:
+    splats = random_splats(3, 5, 4)
+    write_columns(path, [*PROPERTIES, "binding_0"], np.column_stack([splat_columns(splats), np.arange(5)]))
+
+
+def ascii_splats(path: Path) -> None:
+    rows = splat_columns(random_splats(4, 3, 1))
+    head = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {n}" for n in PROPERTIES), "end_header"]
+    path.write_text("\n".join([*head, *(" ".join(f"{v:g}" for v in row) for row in rows), ""]))
+
+
+def flame_frame(path: Path) -> None:
+    sizes = {"expr": 3, "shape": 9, "rotation": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
+    np.savez(path, **{name: np.ones((1, size), np.float32) for name, size in sizes.items()})
+
+
+def flame_motion(path: Path) -> None:
+    sizes = {"expr": 3, "rotation": 3, "translation": 3}
+    arrays = {name: np.ones((4, size), np.float32) for name, size in sizes.items()}
+    np.savez_compressed(path, shape=np.ones(9), dynamic_offset=np.zeros((4, 40, 3)), **arrays)
+
+
+def flame_pickle(protocol: int) -> Callable[[Path], Any]:
+    arrays: dict[str, Any] = random_arrays(vertices=6)
+    arrays["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
+    return lambda path: path.write_bytes(pickle.dumps(arrays, protocol))
+
+
+def flame_masks(path: Path) -> None:
+    path.write_bytes(pickle.dumps({"nose": np.arange(5), "lips": [1, 2, 3]}, 2))
+
+
+def transforms(path: Path) -> None:
+    frames = [factory.frame(0, camera, mesh_path="meshes/0.obj") for camera in range(2)]
+    path.write_text(json.dumps({"frames": frames, "w": 40, "h": 60, "camera_angle_x": 0.5}))
+
+
+def soup(path: Path) -> None:
+    path.write_text(json.dumps({"triangles": [{"Vertices": np.eye(3).tolist()}] * 3}))
+
+
+def mesh(path: Path) -> None:
+    factory.write_mesh(path, np.random.default_rng(0).normal(size=(12, 3)), FACES)
+
+
+def picture(path: Path) -> None:
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (6, 5, 4), np.uint8)).convert(
+        "RGB" if path.suffix == ".jpg" else "RGBA"
+    ).save(path)
+
+
+def seen(path: Path) -> None:
+    view = View(0, 0, Camera(5, 6, 10.0, 10.0, 2.0, 2.0, np.eye(4)), "x", path)
+    read_mask(view)
+    read_image(view)
+
+
+def metrics(path: Path) -> None:
+    for n in range(3):
+        run_folder.append_metrics(path.parent, {"iteration": n, "psnr": 20.5})
+
+
+TARGETS = {
+    "avatar": Target("a.npz", lambda path: write_avatar(path, small_avatar()), read_avatar),
+    "splats": Target("a.ply", lambda path: write_ply(path, random_splats(1, 4, 1)), read_ply),
+    "splats as text": Target("a.ply", ascii_splats, read_ply),
+    "gaussian avatars": Target("a.ply", bound_splats, read_gaussian_avatars),
+    "flame npz": Target("a.npz", lambda path: np.savez(path, **random_arrays(vertices=6)), read_flame),
+    "flame pickle 2": Target("a.pkl", flame_pickle(2), read_flame),
+    "flame pickle 5": Target("a.pkl", flame_pickle(5), read_flame),
+    "flame masks": Target("a.pkl", flame_masks, read_pickled_arrays),
+    "flame frame": Target("a.npz", flame_frame, lambda path: (read_frame(path, MODEL), read_identity(path, MODEL))),
+    "flame motion": Target("a.npz", flame_motion, lambda path: read_motion(path, MODEL)),
+    "transforms": Target("transforms.json", transforms, read_transforms),
+    "regions": Target(
+        "r.json", lambda path: path.write_text('{"nose": [0, 1, 2], "lips": []}'), lambda p: read_regions(p, FACES, 12)
+    ),
+    "soup": Target("a.json", soup, read_soup),
+    "face ids": Target("a.npy", lambda path: np.save(path, np.arange(4)), lambda path: read_face_ids(path, 5)),
+    **{f"mesh {kind}": Target(f"a.{kind}", mesh, read_mesh) for kind in ("obj", "ply", "glb", "stl")},
+    **{f"image {kind}": Target(f"a.{kind}", picture, seen) for kind in ("png", "jpg", "webp", "tiff", "bmp")},
+    "run": Target(
+        "run.json", lambda p: run_folder.write_run(p.parent, make_run()), lambda p: run_folder.read_run(p.parent)
+    ),
+    "checkpoint": Target(
+        "checkpoint.npz",
+        lambda path: run_folder.write_checkpoint(path.parent, make_checkpoint()),
+        lambda path: run_folder.read_checkpoint(path.parent),
+    ),
+    "selection": Target(
+        "selection.npz",
+        lambda path: run_folder.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}),
+        lambda path: run_folder.read_selection(path.parent, 5),
+    ),
+    "metrics": Target("metrics.jsonl", metrics, lambda path: run_folder.read_metrics(path.parent)),
+}
+
+INTERESTING = [b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\0" * 8, b"-1", b"1e999", b"99999999999", b"NaN", b"[", b"]"]
+INTERESTING += [b'"', b"\xff\xfe", b"../", b"null", b"{}", b"true", b"\n", b"."]
+
+
+def damaged(draw: Callable[[st.SearchStrategy[Any]], Any], content: bytes) -> bytes:
+    """A few replacements, insertions, deletions and repetitions, and sometimes an early end."""
+    for _ in range(draw(st.integers(0, 4))):
+        at = draw(st.integers(0, len(content)))
+        length = draw(st.sampled_from([0, 1, 2, 4, 8, 40]))
+        kind = draw(st.integers(0, 3))
+        if kind == 0:
+            content = content[:at] + draw(st.binary(min_size=1, max_size=4)) + content[at + length :]
+        elif kind == 1:
+            content = content[:at] + draw(st.sampled_from(INTERESTING)) + content[at + length :]
+        elif kind == 2:
+            content = (
+                content[:at] + content[at : at + length] * draw(st.sampled_from([0, 2, 50])) + content[at + length :]
+            )
+        elif at < len(content):
+            content = content[:at] + bytes([content[at] ^ (1 << draw(st.integers(0, 7)))]) + content[at + 1 :]
+    return content[: draw(st.integers(0, len(content)))] if draw(st.integers(0, 9)) == 0 else content
+
+
+def rewrap(draw: Callable[[st.SearchStrategy[Any]], Any], path: Path) -> bytes:
+    """A good archive around damaged arrays: a checksum would otherwise stop nearly all damage."""
+    out = path.with_suffix(".wrapped")
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(out, "w") as new:
+        victim = draw(st.sampled_from(old.namelist()))
+        for name in old.namelist():
+            content = old.read(name)
+            new.writestr(name, damaged(draw, content) if name == victim else content)
+    return out.read_bytes()
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_reader(tmp_path: Path, name: str) -> None:
+    """Catches what a reader does besides loading and raising StgaError."""
+    target = TARGETS[name]
+    path, broken = tmp_path / "good" / target.name, tmp_path / "broken" / target.name
+    path.parent.mkdir()
+    broken.parent.mkdir()
+    target.write(path)
+    target.read(path)
+    whole = path.read_bytes()
+    end = time.monotonic() + SECONDS / len(TARGETS)
+    fuzz(target, whole, path, broken, 0)
+    while time.monotonic() < end:
+        fuzz(target, whole, path, broken, time.monotonic_ns())
+
+
+def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) -> None:
+    """One profile's worth of examples; `number` seeds those of the bounded run."""
+
+    @seed(number)
+    @settings(settings.get_profile("stga-fuzz" if SECONDS else "stga-quick"))
+    @given(data=st.data())
+    def once(data: st.DataObject) -> None:
+        wrapped = path.suffix == ".npz" and data.draw(st.booleans())
+        broken.write_bytes(rewrap(data.draw, path) if wrapped else damaged(data.draw, whole))
+        begin = time.monotonic()
+        tracemalloc.start()
+        try:
+            with suppress(StgaError):
+                target.read(broken)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert time.monotonic() - begin < LONGEST_S
+        assert peak < MOST_BYTES
+        assert [entry.name for entry in broken.parent.iterdir()] == [broken.name]
+
+    once()

@@ -1,0 +1,148 @@
+"""Disks that are full or cannot be written: one sentence, and the last good checkpoint stays."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture import factory
+from training.toys import quick_settings
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.open import open_capture
+from stga_addon.errors import StgaError
+from stga_addon.files import read_json, write_json
+from stga_addon.training import run as run_module
+from stga_addon.training.folder import Run, append_metrics, locked, read_checkpoint
+from stga_addon.training.run import Progress, train
+
+from .disk_driver import FULL_AT, ITERATIONS
+
+# In a namespace of its own a process may mount a disk without being root, and nobody else sees it.
+PRIVATE = ["unshare", "-rm"]
+SMALL_DISK = 'mount -t tmpfs -o size=2m small "$1" && exec "$2" "$3" "$1" "$4"'
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return factory.write_mesh_capture(tmp_path_factory.mktemp("disk"), (0, 1, 3), range(3))
+
+
+def can_mount() -> bool:
+    try:
+        return subprocess.run([*PRIVATE, "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode == 0
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+def test_a_full_and_a_read_only_disk(root: Path, tmp_path: Path) -> None:
+    """Catches a checkpoint destroyed by the one that did not fit, a traceback, and a run that cannot go on when there
+    is room again; on a real file system of 2 MB."""
+    if not can_mount():
+        pytest.skip("private mounts (unshare -rm) are not available")
+    driver = str(Path(__file__).with_name("disk_driver.py"))
+    command = [*PRIVATE, "sh", "-c", SMALL_DISK, "sh", str(tmp_path), sys.executable, driver, str(root)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    run = tmp_path / "run"
+    no_space = f"cannot be written ({os.strerror(errno.ENOSPC)})"
+    assert found["full"] == f"{run / 'checkpoint.npz'}: {no_space}"
+    assert found["kept"] == FULL_AT
+    assert found["avatar"] > 0
+    assert found["litter"] == []
+    assert found["still full"].endswith(no_space)
+    assert found["read-only"] == f"{run}: cannot be written ({os.strerror(errno.EROFS)})"
+    assert found["read-only kept"] == FULL_AT
+    assert (found["resumed"], found["end"]) == ("", ITERATIONS)
+
+
+def test_no_room_for_a_checkpoint(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches the same where no disk can be mounted: the system refuses every file above a size from one moment on."""
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr(run_module, "CHECKPOINT_S", 0.0)
+    capture = open_capture(root)
+    run = Run(capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, lattice=1))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def no_more(progress: Progress) -> bool:
+        if progress.iteration == FULL_AT:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+        return False
+
+    try:
+        with pytest.raises(StgaError, match=r"checkpoint\.npz: cannot be written \(File too large\)"):
+            train(capture, tmp_path, run, report=no_more)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert read_checkpoint(tmp_path).iteration == FULL_AT
+    assert len(read_avatar(tmp_path / "avatar.npz").splats)
+    assert not list(tmp_path.glob(".*"))
+    train(capture, tmp_path, run, resume=True)
+    assert read_checkpoint(tmp_path).iteration == ITERATIONS
+
+
+def test_an_error_when_the_data_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a rename before the data is known to be on the disk: network drives report a full one only then."""
+    write_json(tmp_path / "a.json", [1])
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StgaError, match=r"a\.json: cannot be written"):
+        write_json(tmp_path / "a.json", [2])
+    assert read_json(tmp_path / "a.json") == [1]
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_metrics_that_cannot_be_written(tmp_path: Path) -> None:
+    """Catches a traceback from the one file that is not replaced but grows."""
+    (tmp_path / "metrics.jsonl").mkdir()
+    with pytest.raises(StgaError, match=r"metrics\.jsonl: cannot be written"):
+        append_metrics(tmp_path, {"iteration": 1})
+
+
+CROWD = """
+import os, sys, time
+from pathlib import Path
+from stga_addon.errors import StgaError
+from stga_addon.training.folder import locked
+folder = Path(sys.argv[1])
+children = []
+for n in range(8):
+    children.append(os.fork())
+    if children[-1] == 0:
+        code, held = 0, 0
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            try:
+                with locked(folder):
+                    held += 1
+                    os.close(os.open(folder / "inside", os.O_CREAT | os.O_EXCL))
+                    (folder / "inside").unlink()
+                    if held % 3 == 0:
+                        (folder / "run.lock").write_text("999999999")
+            except StgaError:
+                pass
+            except FileExistsError:
+                code = 1
+        os._exit(code if held else 2)
+print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that start within a microsecond")
+def test_never_two_in_one_folder(tmp_path: Path) -> None:
+    """Catches two runs that both take over the lock of a third at the same moment."""
+    with locked(tmp_path):
+        pass
+    (tmp_path / "run.lock").write_text("999999999")
+    done = subprocess.run([sys.executable, "-c", CROWD, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == str([0] * 8), done.stderr

@@ -1,0 +1,718 @@
+"""Files made to break readers, beyond those of each reader's own tests: bombs, lies about size, impossible values.
+
+Every case either loads or raises StgaError, in under a second and 200 MB, executes nothing and writes nothing.
+"""
+
+import io
+import json
+import os
+import pickle
+import struct
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from capture import factory
+from flame.conftest import model_of, random_arrays
+from PIL import Image
+from training.test_folder import make_checkpoint, make_run
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars
+from stga_addon.avatar.ply import read_ply
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.images import read_image
+from stga_addon.capture.meshes import read_mesh, read_regions
+from stga_addon.capture.model import View
+from stga_addon.capture.open import open_capture
+from stga_addon.capture.release import read_face_ids, read_soup
+from stga_addon.capture.summary import describe
+from stga_addon.capture.transforms import read_transforms
+from stga_addon.files import read_json, read_npz
+from stga_addon.flame.model import read_flame
+from stga_addon.flame.sequence import read_frame, read_motion
+from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.training import folder as run_folder
+
+from .limits import behaves
+
+GIGA = 10**9
+
+
+def npy(descr: Any = "<f4", shape: Any = (GIGA,), data: bytes = b"", header: str = "") -> bytes:
+    """A npy file that says what it likes about its content."""
+    text = header or repr({"descr": descr, "fortran_order": False, "shape": shape})
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n" + data
+
+
+def archive(path: Path, entries: dict[str, bytes], packing: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", packing) as out:
+        for name, content in entries.items():
+            out.writestr(name, content)
+    return path
+
+
+def bomb(path: Path, name: str, megabytes: int) -> Path:
+    """An npz with one honest array of zeros, a thousandth of its size."""
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as out,
+        out.open(f"{name}.npy", "w", force_zip64=True) as entry,
+    ):
+        entry.write(npy(shape=(megabytes << 18,)))
+        for _ in range(megabytes):
+            entry.write(bytes(1 << 20))
+    return path
+
+
+@pytest.fixture(scope="session")
+def zip_bomb(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """340 kB that unpack to 350 MB."""
+    return bomb(tmp_path_factory.mktemp("bomb") / "bomb.npz", "expr", 350)
+
+
+MODEL = model_of(random_arrays(), 9)
+NPZ_READERS: dict[str, Callable[[Path], Any]] = {
+    "npz": read_npz,
+    "avatar": read_avatar,
+    "flame model": read_flame,
+    "flame frame": lambda path: read_frame(path, MODEL),
+    "flame motion": lambda path: read_motion(path, MODEL),
+    "checkpoint": lambda path: run_folder.read_checkpoint(path.parent),
+    "selection": lambda path: run_folder.read_selection(path.parent, 5),
+}
+FILE_NAMES = {"checkpoint": "checkpoint.npz", "selection": "selection.npz"}
+
+
+@pytest.mark.parametrize("reader", NPZ_READERS)
+def test_zip_bombs(tmp_path: Path, zip_bomb: Path, reader: str) -> None:
+    """Catches a small file that unpacks until the memory is full, in every reader of npz."""
+    path = tmp_path / FILE_NAMES.get(reader, "bomb.npz")
+    os.link(zip_bomb, path)
+    assert "more than the" in behaves(lambda: NPZ_READERS[reader](path), tmp_path)
+
+
+LYING_ARRAYS = {
+    "gigabytes promised": npy(),
+    "product wraps around": npy(shape=(2**32, 2**32)),
+    "beyond 64 bits": npy(shape=(10**30,)),
+    "negative": npy(shape=(-1, 3)),
+    "true": npy(shape=(True,), data=bytes(4)),
+    "no size": npy("|V0", (10**12,)),
+    "one huge string": npy("<U1000000000", (1,)),
+    "objects": npy("|O", (1,), pickle.dumps([1])),
+    "nested type": npy([("a", "<f4", (10**6, 10**6))], (1,)),
+    "type of itself": npy([("a", [("b", "O")])], (1,)),
+    "half a header": b"\x93NUMPY\x01\x00\xff\xff{",
+    "header of gigabytes": b"\x93NUMPY\x02\x00\xff\xff\xff\xff{",
+    "header cut in a string": npy(header="{'descr': '''<f4"),
+    "header of brackets": npy(header="[" * 5000),
+    "header of minus signs": npy(header="-" * 9000 + "1"),
+    "header of a number": npy(header="9" * 9000),
+    "header runs code": npy(header="{'descr': __import__('os').system('touch witness')}"),
+    "format 9": b"\x93NUMPY\x09\x00" + npy()[8:],
+    "trailing bytes": npy(shape=(1,), data=bytes(8)),
+}
+
+
+@pytest.mark.parametrize("lie", LYING_ARRAYS)
+def test_arrays_that_lie(tmp_path: Path, lie: str) -> None:
+    """Catches memory allocated on the word of a header, and header parsers that fail with errors of their own."""
+    path = archive(tmp_path / "a.npz", {"a.npy": LYING_ARRAYS[lie]})
+    assert "a.npz: is not a readable npz" in behaves(lambda: read_npz(path), tmp_path)
+    path = tmp_path / "a.npy"
+    path.write_bytes(LYING_ARRAYS[lie])
+    assert "a.npy: is not a readable npy" in behaves(lambda: read_face_ids(path, 5), tmp_path)
+
+
+@pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED])
+def test_damaged_packing(tmp_path: Path, packing: int) -> None:
+    """Catches each decompressor's own exceptions."""
+    path = archive(tmp_path / "a.npz", {"a.npy": npy(shape=(9,), data=bytes(range(36)))}, packing)
+    whole = path.read_bytes()
+    for position in range(30, 120):
+        path.write_bytes(whole[:position] + bytes([whole[position] ^ 0xFF]) + whole[position + 1 :])
+        behaves(lambda: read_npz(path), tmp_path)
+
+
+def test_names_that_lead_outside(tmp_path: Path) -> None:
+    """Catches an archive unpacked to disk by the names that its entries have."""
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    path = archive(inner / "a.npz", {"../outside.npy": npy(shape=(1,), data=bytes(4)), "/tmp/x.npy": b""})
+    behaves(lambda: read_npz(path), inner)
+
+
+def link_to_itself(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    "json": ("a.json", read_json),
+    "npz": ("a.npz", read_npz),
+    "npy": ("a.npy", lambda path: read_face_ids(path, 5)),
+    "transforms": ("transforms.json", read_transforms),
+    "soup": ("a.json", read_soup),
+    "regions": ("regions.json", lambda path: read_regions(path, np.zeros((1, 3), int), 3)),
+    "obj": ("a.obj", read_mesh),
+    "ply mesh": ("a.ply", read_mesh),
+    "glb": ("a.glb", read_mesh),
+    "splats": ("a.ply", read_ply),
+    "gaussian avatars": ("a.ply", read_gaussian_avatars),
+    "avatar": ("a.npz", read_avatar),
+    "flame pickle": ("a.pkl", read_flame),
+    "flame npz": ("a.npz", read_flame),
+    "masks": ("a.pkl", read_pickled_arrays),
+    "run": ("run.json", lambda path: run_folder.read_run(path.parent)),
+    "checkpoint": ("checkpoint.npz", lambda path: run_folder.read_checkpoint(path.parent)),
+    "selection": ("selection.npz", lambda path: run_folder.read_selection(path.parent, 5)),
+    "metrics": ("metrics.jsonl", lambda path: run_folder.read_metrics(path.parent)),
+    "image": ("a.png", lambda path: read_image(view_of(path, 4, 4))),
+}
+
+
+def view_of(path: Path, width: int, height: int) -> View:
+    return View(0, 0, Camera(width, height, 10.0, 10.0, 2.0, 2.0, np.eye(4)), path.name, path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs links, pipes and devices of a POSIX system")
+@pytest.mark.parametrize("make", [link_to_itself, pipe, device, Path.mkdir])
+@pytest.mark.parametrize("reader", READERS)
+def test_what_is_no_file(tmp_path: Path, reader: str, make: Callable[[Path], None]) -> None:
+    """Catches readers that wait for ever on a pipe, fill the memory from a device, or trip over a link to itself."""
+    name, read = READERS[reader]
+    make(tmp_path / name)
+    message = behaves(lambda: read(tmp_path / name), tmp_path)
+    assert message or (reader == "metrics" and make is link_to_itself)
+
+
+@pytest.mark.parametrize(
+    "reader", [name for name in READERS if name not in ("run", "checkpoint", "selection", "metrics")]
+)
+@pytest.mark.parametrize("stem", ["nul\0byte", "\ud800", "x" * 5000])
+def test_names_no_file_can_have(tmp_path: Path, reader: str, stem: str) -> None:
+    """Catches ValueError and UnicodeEncodeError from names that a capture's JSON may hold."""
+    name, read = READERS[reader]
+    assert behaves(lambda: read(tmp_path / (stem + name)), tmp_path)
+
+
+JUNK = {
+    "empty": b"",
+    "zeros": bytes(10_000),
+    "not utf-8": b'{"format": "\xff\xfe"}',
+    "utf-16": '{"a": 1}'.encode("utf-16"),
+    "byte order mark": b"\xef\xbb\xbf{}",
+    "brackets": b"[" * 100_000,
+    "objects": b'{"a":' * 100_000,
+    "digits": b"9" * 100_000,
+    "nan": b"NaN",
+    "string": b'"text"',
+    "zip": b"PK\x05\x06" + bytes(18),
+    "zip of millions": b"PK\x05\x06" + struct.pack("<4H2LH", 0, 0, 65535, 65535, 2**31, 0, 0),
+    "pickle": pickle.dumps({"a": 1}),
+}
+
+
+@pytest.mark.parametrize("junk", JUNK)
+@pytest.mark.parametrize("reader", READERS)
+def test_junk(tmp_path: Path, reader: str, junk: str) -> None:
+    """Catches a reader that trusts a file because of its name."""
+    name, read = READERS[reader]
+    (tmp_path / name).write_bytes(JUNK[junk])
+    behaves(lambda: read(tmp_path / name), tmp_path)
+
+
+# Captures
+
+
+def capture_with(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """A mesh capture whose first training frame and top level were changed."""
+    factory.write_mesh_capture(root, (0, 1), (0, 1))
+    factory.edit(root / "transforms_train.json", change)
+    return root
+
+
+FRAME_VALUES: dict[str, Any] = {
+    "path of nul": {"file_path": "a\0b.png"},
+    "path of half a character": {"mesh_path": "\ud800.obj"},
+    "long path": {"file_path": "x" * 5000 + ".png"},
+    "deep path": {"mesh_path": "a/" * 5000 + "x.obj"},
+    "path out": {"mesh_path": "../../../etc/passwd"},
+    "path out by backslashes": {"file_path": "a\\..\\..\\..\\x.png"},
+    "absolute path": {"fg_mask_path": "/etc/passwd"},
+    "home": {"fg_mask_path": "~/x.png"},
+    "path of a folder": {"file_path": "."},
+    "drive": {"file_path": "C:\\x.png"},
+    "huge focal length": {"fl_x": 10**400},
+    "huge size": {"w": 10**400},
+    "size of gigapixels": {"w": 10**6, "h": 10**6},
+    "huge centre": {"cx": 10**400},
+    "huge timestep": {"timestep_index": 10**400},
+    "far timestep": {"timestep_index": 10**15},
+    "huge camera": {"camera_index": 10**400},
+    "huge matrix": {"transform_matrix": [[10**400] * 4] * 4},
+    "matrix of lists": {"transform_matrix": [[[]] * 4] * 4},
+    "matrix of text": {"transform_matrix": [["1"] * 4] * 4},
+    "number as text": {"fl_x": "200"},
+    "number as list": {"w": [40]},
+    "true": {"timestep_index": True},
+    "camera of lists": {"camera_id": [[["x"]]], "camera_index": None},
+}
+
+
+@pytest.mark.parametrize("name", FRAME_VALUES)
+def test_frames(tmp_path: Path, name: str) -> None:
+    """Catches values that are valid JSON and nonsense: numbers beyond floats, paths beyond names, jumps in time."""
+    root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(FRAME_VALUES[name]))
+    behaves(lambda: describe(open_capture(root)), tmp_path)
+
+
+@pytest.mark.parametrize("key", ["canonical_mesh_path", "regions_path"])
+@pytest.mark.parametrize("value", ["a\0b", "\ud800.obj", "x" * 5000 + ".obj", "../..", "/etc/passwd", ".", 3, ["a"]])
+def test_files_of_the_top_level(tmp_path: Path, key: str, value: Any) -> None:
+    """Catches the same in the paths that are not a frame's."""
+    root = capture_with(tmp_path / "capture", lambda document: document.update({key: value}))
+    assert behaves(lambda: open_capture(root), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["images/00000_00.png", "meshes/00000.obj", "meshes/neutral.obj", "regions.json"])
+def test_pipes_in_a_capture(tmp_path: Path, name: str) -> None:
+    """Catches a capture that is never opened because it waits for a pipe."""
+    root = factory.write_mesh_capture(tmp_path / "capture", (0, 1), (0, 1))
+    (root / name).unlink()
+    pipe(root / name)
+    assert name in behaves(lambda: open_capture(root), tmp_path)
+
+
+def test_view_names_hold_no_backslashes(tmp_path: Path) -> None:
+    """Catches a rendering, named after its view, written outside its folder on Windows, where these are paths."""
+    change = {"file_path": "a\\..\\images\\00000_00.png"}
+    root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(change))
+    assert "\\" not in open_capture(root).views["train"][0].name
+
+
+# Meshes
+
+
+def glb(document: dict[str, Any], data: bytes = b"") -> bytes:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<2L", len(text), 0x4E4F534A) + text
+    if data:
+        chunks += struct.pack("<2L", len(data), 0x004E4942) + data
+    return struct.pack("<3L", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def gltf(**changes: Any) -> bytes:
+    """One triangle; `changes` replace parts of the document."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    data = points + np.array([0, 1, 2], "<u4").tobytes()
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 12}],
+        "buffers": [{"byteLength": 48}],
+    }
+    return glb({**document, **changes}, data)
+
+
+def accessors(**changes: Any) -> list[dict[str, Any]]:
+    first = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **changes}
+    kept = {key: value for key, value in first.items() if value is not None}
+    return [kept, {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"}]
+
+
+def bomb_picture() -> bytes:
+    """A PNG of 12,000 x 12,000 white pixels in 140 kB."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">L", len(data)) + kind + data + struct.pack(">L", zlib.crc32(kind + data))
+
+    size = 12_000
+    rows = zlib.compress(bytes(size * (size // 8 + 1)), 1)
+    head = struct.pack(">2L5B", size, size, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def with_texture() -> bytes:
+    picture = bomb_picture()
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    data = points + np.array([0, 1, 2], "<u4").tobytes() + np.zeros((3, 2), "<f4").tobytes() + picture
+    data += bytes(-len(data) % 4)
+    views = [(0, 36), (36, 12), (48, 24), (72, len(picture))]
+    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
+    return glb(
+        {
+            "asset": {"version": "2.0"},
+            "scenes": [{"nodes": [0, 1]}],
+            "nodes": [{"mesh": 0}, {"mesh": 1}],
+            "meshes": [{"primitives": [{"attributes": attributes, "indices": 1, "material": n}]} for n in (0, 1)],
+            "accessors": [*accessors(), {"bufferView": 2, "componentType": 5126, "count": 3, "type": "VEC2"}],
+            "bufferViews": [{"buffer": 0, "byteOffset": at, "byteLength": size} for at, size in views],
+            "buffers": [{"byteLength": len(data)}],
+            "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": n}}} for n in (0, 1)],
+            "textures": [{"source": 0}, {"source": 0}],
+            "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        },
+        data,
+    )
+
+
+PLY_LIST = "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+MESHES: dict[str, tuple[str, bytes]] = {
+    "glb": ("glb", gltf()),
+    "glb of a billion points": ("glb", gltf(accessors=accessors(count=GIGA))),
+    "glb of a billion points without data": ("glb", gltf(accessors=accessors(count=GIGA, bufferView=None))),
+    "glb of negative counts": ("glb", gltf(accessors=accessors(count=-3))),
+    "glb of a count as text": ("glb", gltf(accessors=accessors(count="3"))),
+    "glb of matrices": ("glb", gltf(accessors=accessors(type="MAT4"))),
+    "glb that repeats one mesh": ("glb", gltf(nodes=[{"mesh": 0}] * 30_000, scenes=[{"nodes": list(range(30_000))}])),
+    "glb whose nodes form a ring": ("glb", gltf(nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}])),
+    "glb whose node is its child": ("glb", gltf(nodes=[{"mesh": 0, "children": [0]}])),
+    "glb that doubles itself": (
+        "glb",
+        gltf(nodes=[*({"children": [n + 1, n + 1]} for n in range(30)), {"mesh": 0}]),
+    ),
+    "glb of a distant buffer": ("glb", gltf(buffers=[{"byteLength": 48, "uri": "../../etc/passwd"}])),
+    "glb of a server": ("glb", gltf(buffers=[{"byteLength": 48, "uri": "http://127.0.0.1:9/x"}])),
+    "glb of huge matrices": ("glb", gltf(nodes=[{"mesh": 0, "matrix": [1e308] * 16}])),
+    "glb of few matrices": ("glb", gltf(nodes=[{"mesh": 0, "matrix": [1] * 3}])),
+    "glb of a huge chunk": ("glb", struct.pack("<5L", 0x46546C67, 2, 100, 2**32 - 1, 0x4E4F534A)),
+    "glb with bombs as textures": ("glb", with_texture()),
+    "ply of a billion vertices": (
+        "ply",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000\nproperty float x\nproperty float y\n"
+        b"property float z\nend_header\n" + bytes(36),
+    ),
+    "ply of a billion lines": (
+        "ply",
+        b"ply\nformat ascii 1.0\nelement vertex 1000000000\nproperty float x\nproperty float y\nproperty float z\n"
+        + PLY_LIST.format(GIGA).encode()
+        + b"0 0 0\n" * 3,
+    ),
+    "ply of a billion triangles": (
+        "ply",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        b"property float z\n" + PLY_LIST.format(GIGA).encode() + bytes(36) + b"\x03" + bytes(12),
+    ),
+    "ply of long polygons": (
+        "ply",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        b"property float z\nelement face 2\nproperty list uint int vertex_indices\nend_header\n"
+        + bytes(36)
+        + b"\xff\xff\xff\x7f",
+    ),
+    "stl of a billion triangles": ("stl", bytes(80) + struct.pack("<L", GIGA) + bytes(50)),
+    "stl of text": ("stl", b"solid x\n" + b"facet normal 0 0 1\nouter loop\n" * 1000),
+    "obj of huge indices": ("obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + b"9" * 5000 + b"\n"),
+    "obj of huge numbers": ("obj", b"v 0 0 1e400\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "obj of one polygon": ("obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 " * 150_000 + b"\n"),
+    "obj of nothing but lines": ("obj", b"\n" * 1_000_000),
+    "obj that includes": ("obj", b"mtllib /etc/passwd\ncall x.obj\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_meshes(tmp_path: Path, name: str) -> None:
+    """Catches memory allocated on a header's word, meshes multiplied by references, textures that are unpacked though
+    nobody looks at them, files read or servers asked because a mesh names them, and parsers that do not end."""
+    suffix, content = MESHES[name]
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(content)
+    message = behaves(lambda: read_mesh(path), tmp_path)
+    loads = ("glb", "glb of huge matrices", "glb with bombs as textures", "obj that includes", "obj of one polygon")
+    assert (message == "") == (name in loads)
+
+
+# Images
+
+
+def test_images_that_unpack_elsewhere(tmp_path: Path) -> None:
+    """Catches bombs beside the pixels: text and colour profiles of a PNG, which Pillow unpacks as well."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">L", len(data)) + kind + data + struct.pack(">L", zlib.crc32(kind + data))
+
+    out = io.BytesIO()
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(out, "PNG")
+    plain = out.getvalue()
+    packed = zlib.compress(bytes(300 << 20), 1)
+    for kind, head in ((b"zTXt", b"Comment\0\0"), (b"iTXt", b"Comment\0\1\0\0\0"), (b"iCCP", b"profile\0\0")):
+        path = tmp_path / "x.png"
+        path.write_bytes(plain[:33] + chunk(kind, head + packed) + plain[33:])
+        behaves(lambda path=path: read_image(view_of(path, 4, 4)), tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tiff", "bmp"])
+def test_damaged_images(tmp_path: Path, suffix: str) -> None:
+    """Catches what Pillow's decoders raise besides the errors they promise."""
+    path = tmp_path / f"x.{suffix}"
+    random = np.random.default_rng(3)
+    Image.fromarray(random.integers(0, 255, (9, 8, 3), np.uint8)).save(path)
+    whole = path.read_bytes()
+    view = view_of(path, 8, 9)
+    for _ in range(50):
+        damaged = bytearray(whole)
+        for place in random.integers(0, min(len(whole), 400), random.integers(1, 4)):
+            damaged[place] = random.integers(256)
+        path.write_bytes(bytes(damaged))
+        behaves(lambda: read_image(view), tmp_path)
+
+
+# Pickles
+
+
+def doubled(inner: bytes, times: int) -> bytes:
+    """Pickle code of [[…[x, x], …], …]: a list that stands for 2^times things."""
+    code = inner
+    for slot in range(1, times + 1):
+        code += b"q" + bytes([slot]) + b"0]h" + bytes([slot]) + b"ah" + bytes([slot]) + b"a"
+    return code
+
+
+def pickled(value: bytes, key: bytes = b"v_template") -> bytes:
+    return b"\x80\x02}U" + bytes([len(key)]) + key + value + b"s."
+
+
+TEXT = b"X" + struct.pack("<L", 1_000_000) + b"x" * 1_000_000 + b"q\x01"
+PICKLES = {
+    "list of a billion numbers": pickled(doubled(b"]K\x01a", 30)),
+    "list of a billion lists": pickled(doubled(b"]", 30)),
+    "list of itself": pickled(b"]q\x01h\x01a"),
+    "text encoded ten thousand times": pickled(
+        b"c_codecs\nencode\nq\x02" + TEXT + b"0(" + b"h\x02h\x01X\x06\0\0\0latin1\x86R" * 10_000 + b"l"
+    ),
+    "set copied ten thousand times": pickled(
+        b"c__builtin__\nset\nq\x02](" + b"".join(b"M" + struct.pack("<H", n) for n in range(60_000)) + b"eq\x010("
+        + b"h\x02h\x01\x85R" * 10_000 + b"l"
+    ),
+    "changes a function": pickled(b"c_codecs\nencode\nN}U\x0c__defaults__K\x05\x85s\x86b"),
+    "millions of instructions": pickled(b"N0" * 3_000_000 + b"N"),
+    "bytes of gigabytes": pickled(b"\x8e" + struct.pack("<Q", 10**15)),
+    "array of gigabytes": pickled(b"\x96" + struct.pack("<Q", 10**12)),
+    "frame of gigabytes": b"\x80\x04\x95" + struct.pack("<Q", 10**15) + b"N.",
+    "number of megabytes": pickled(b"\x8b" + struct.pack("<L", 2_000_000) + b"\x7f" * 2_000_000),
+    "number as text": pickled(b"L" + b"9" * 1_000_000 + b"L\n"),
+    "runs a command": pickled(b"cos\nsystem\nU\x0dtouch witness\x85R"),
+    "runs a command by another name": pickled(b"cnumpy.core.multiarray\n_reconstruct.__globals__\n"),
+    "runs by inheritance": pickled(b"cposix\nsystem\nU\x0dtouch witness\x85\x81"),
+    "extension registry": pickled(b"\x82\x01"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PICKLES)
+def test_pickles(tmp_path: Path, name: str) -> None:
+    """Catches pickles that stand for far more than they hold, that run what they name, or that never end."""
+    path = tmp_path / "a.pkl"
+    path.write_bytes(PICKLES[name])
+    assert behaves(lambda: read_flame(path), tmp_path)
+    behaves(lambda: read_pickled_arrays(path), tmp_path)
+    assert not Path("witness").exists()
+
+
+class Sparse:
+    """Pickles as a scipy.sparse matrix of whatever state."""
+
+    __module__, __qualname__ = "scipy.sparse._csc", "csc_matrix"
+
+    def __init__(self, **state: Any) -> None:
+        self.__dict__.update(state)
+
+
+@pytest.mark.parametrize("shape", [(10**5, 10**5), (20_000, 10_000), (5, 10**18), (10**4, -1)])
+def test_sparse_matrices_that_would_be_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
+) -> None:
+    """Catches a matrix of a few entries filled in to gigabytes."""
+    import scipy.sparse
+
+    monkeypatch.setattr(scipy.sparse._csc, "csc_matrix", Sparse)
+    empty = np.zeros(0, np.int32)
+    matrix = Sparse(_shape=shape, data=empty, indices=empty, indptr=np.zeros(1, np.int32))
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps({"v_template": matrix}, 4))
+    assert "v_template" in behaves(lambda: read_pickled_arrays(path, ("v_template",)), tmp_path)
+
+
+def test_one_array_by_a_thousand_names(tmp_path: Path) -> None:
+    """Catches masks whose regions all name the same data: 1 MB that becomes 1 GB."""
+    array = np.zeros(1 << 17)
+    path = tmp_path / "masks.pkl"
+    path.write_bytes(pickle.dumps({f"region{n}": array for n in range(1000)}, 2))
+    assert "larger than the file can hold" in behaves(lambda: read_pickled_arrays(path), tmp_path)
+
+
+@pytest.mark.parametrize("shape", [(-1, -6), ("a",), (10**400,), (2, 3, None), (1,) * 70])
+def test_shapes_that_are_none(tmp_path: Path, shape: tuple[Any, ...]) -> None:
+    """Catches arithmetic on shapes that are not numbers, not positive or of too many axes."""
+    path = tmp_path / "a.pkl"
+    code = pickle.dumps({"v_template": np.arange(6.0)}, 2)
+    path.write_bytes(code.replace(pickle.dumps((6,), 2)[2:-1], pickle.dumps(shape, 2)[2:-1]))
+    behaves(lambda: read_flame(path), tmp_path)
+
+
+def test_a_pickle_leaves_nothing_behind(tmp_path: Path) -> None:
+    """Catches a file that changes how later files are read: pickles may set attributes of functions they name."""
+    good, bad = tmp_path / "good.pkl", tmp_path / "bad.pkl"
+    good.write_bytes(pickle.dumps(random_arrays(), 2))
+    bad.write_bytes(PICKLES["changes a function"])
+    before = read_flame(good)
+    behaves(lambda: read_flame(bad), tmp_path)
+    np.testing.assert_array_equal(read_flame(good).v_template, before.v_template)
+
+
+# Splats
+
+
+@pytest.mark.parametrize("count", ["1000000000", "9" * 30, "1e9", "-1", "1_0", "0"])
+@pytest.mark.parametrize("layout", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_splats_of_absurd_number(tmp_path: Path, count: str, layout: str) -> None:
+    """Catches memory allocated for a billion splats that the file does not have."""
+    path = tmp_path / "a.ply"
+    path.write_text(f"ply\nformat {layout} 1.0\nelement vertex {count}\nproperty float x\nend_header\n0 0 0\n")
+    for read in (read_ply, read_gaussian_avatars):
+        assert behaves(lambda read=read: read(path), tmp_path)
+
+
+# Runs
+
+
+META_VALUES: dict[str, Any] = {
+    "iteration": ["5", -2, 1.5, None, 10**40, True],
+    "visit": ["5", None],
+    "last_timestep": ["5", 1.5, [1]],
+    "elapsed_s": ["5", None, float("nan"), [], True],
+    "best_psnr": ["5", None, float("nan")],
+    "losses": ["5", None, [None], ["a"], [float("nan")], {"a": 1}, 7],
+    "evaluations": [None, "x"],
+    "initial_count": [None, "x"],
+}
+
+
+@pytest.mark.parametrize("key", META_VALUES)
+def test_checkpoints_of_wrong_kinds(tmp_path: Path, key: str) -> None:
+    """Catches a checkpoint that loads and then fails, or trains for ever, in the middle of the resumed run."""
+    run_folder.write_checkpoint(tmp_path, make_checkpoint())
+    arrays = read_npz(tmp_path / "checkpoint.npz")
+    for value in META_VALUES[key]:
+        meta = {**json.loads(arrays["meta"].tobytes()), key: value}
+        np.savez(tmp_path / "checkpoint.npz", **{**arrays, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
+        message = behaves(lambda: run_folder.read_checkpoint(tmp_path), tmp_path)
+        assert "checkpoint.npz: " in message, (key, value)
+
+
+@pytest.mark.parametrize("text", ['"text"', "3", "[]", "[" * 100_000, "null"])
+def test_meta_that_is_no_object(tmp_path: Path, text: str) -> None:
+    """Catches AttributeError and RecursionError where the header of a checkpoint is other JSON than an object."""
+    run_folder.write_checkpoint(tmp_path, make_checkpoint())
+    arrays = {**read_npz(tmp_path / "checkpoint.npz"), "meta": np.frombuffer(text.encode(), np.uint8)}
+    np.savez(tmp_path / "checkpoint.npz", **arrays)
+    assert "checkpoint.npz: " in behaves(lambda: run_folder.read_checkpoint(tmp_path), tmp_path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", ["parameters", "first", "second"])
+def test_checkpoints_that_are_not_finite(tmp_path: Path, part: str, value: float) -> None:
+    """Catches a broken number that a resumed run would keep for ever."""
+    checkpoint = make_checkpoint()
+    getattr(checkpoint.state, part).opacity[3] = value
+    run_folder.write_checkpoint(tmp_path, checkpoint)
+    assert f"{part}/opacity holds a value that is not finite" in behaves(
+        lambda: run_folder.read_checkpoint(tmp_path), tmp_path
+    )
+
+
+def test_a_checkpoint_of_an_odd_number_of_coefficients(tmp_path: Path) -> None:
+    """Catches spherical harmonics of no degree, which the kernels would read past their end."""
+    checkpoint = make_checkpoint()
+    for part in ("parameters", "gradients", "first", "second"):
+        old = getattr(checkpoint.state, part)
+        setattr(checkpoint.state, part, old._replace(sh=torch.zeros(len(checkpoint.state), 7, 3)))
+    run_folder.write_checkpoint(tmp_path, checkpoint)
+    assert "7 coefficients" in behaves(lambda: run_folder.read_checkpoint(tmp_path), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["²", "९", "-1", "9" * 5000, "", "1.5"])
+def test_selections_of_odd_timesteps(tmp_path: Path, name: str) -> None:
+    """Catches names that Python calls digits and cannot turn into a number."""
+    np.savez(tmp_path / "selection.npz", **{name: np.ones(5, bool)})
+    if name == "९":
+        assert "९" in behaves(lambda: run_folder.read_selection(tmp_path, 5), tmp_path)
+    else:
+        assert behaves(lambda: run_folder.read_selection(tmp_path, 5), tmp_path)
+
+
+SETTINGS: list[dict[str, Any]] = [
+    {"seconds": float("inf"), "iterations": None},
+    {"seconds": float("nan"), "iterations": None},
+    {"seconds": -5.0, "iterations": None},
+    {"seconds": None, "iterations": None},
+    {"lattice": 10**9},
+    {"lattice": -1},
+    {"sh_degree": 9},
+    {"sh_degree": -1},
+    {"strategy": "other"},
+    {"schedule": "other"},
+    {"convention": "other"},
+    {"seed": -1},
+    {"views_per_visit": -1},
+    {"global_every": 0},
+    {"density_every": -1},
+    {"stray_every": -1},
+    {"growth": 1e12},
+    {"growth": -2.0},
+    {"ssim_weight": float("nan")},
+    {"warm_up": float("nan")},
+    {"sh_steps": ["a"]},
+    {"sh_steps": [[]]},
+    {"density_span": [1.0]},
+    {"background": [0.5, 0.5]},
+    {"background": [float("nan")] * 3},
+    {"background": ["a", 0, 0]},
+]
+
+
+@pytest.mark.parametrize("change", SETTINGS, ids=repr)
+def test_runs_with_impossible_settings(tmp_path: Path, change: dict[str, Any]) -> None:
+    """Catches a run.json whose numbers would fill the memory, read past an array's end or train for ever."""
+    run_folder.write_run(tmp_path, make_run())
+    document = json.loads((tmp_path / "run.json").read_text())
+    document["settings"].update(change)
+    (tmp_path / "run.json").write_text(json.dumps(document))
+    assert "run.json: " in behaves(lambda: run_folder.read_run(tmp_path), tmp_path)
+
+
+METRICS = [b"3\n", b"{}\n", b'{"iteration": "x"}\n', b"\xff\xff\n", b"\0" * 100, b"[" * 100_000, b'{"iteration": null}']
+
+
+@pytest.mark.parametrize("damage", METRICS)
+def test_metrics_after_a_power_cut(tmp_path: Path, damage: bytes) -> None:
+    """Catches a run that cannot be resumed because of a line of its log: what was whole before it stays."""
+    run_folder.append_metrics(tmp_path, {"iteration": 10})
+    with (tmp_path / "metrics.jsonl").open("ab") as out:
+        out.write(damage)
+    assert not behaves(lambda: run_folder.read_metrics(tmp_path), tmp_path)
+    assert run_folder.read_metrics(tmp_path) == [{"iteration": 10}]
+    run_folder.cut_metrics(tmp_path, 20)
+    run_folder.append_metrics(tmp_path, {"iteration": 20})
+    assert [line["iteration"] for line in run_folder.read_metrics(tmp_path)] == [10, 20]

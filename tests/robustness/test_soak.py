@@ -1,0 +1,150 @@
+"""A long run at toy size with everything on: what only breaks after thousands of steps. STGA_SOAK sets how many."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+import pytest
+from capture import factory
+from training.toys import bits, quick_settings
+
+from stga_addon.capture.images import read_view
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.training.trainer import Trainer
+from stga_addon.training.warm import compile_kernels
+
+pytestmark = pytest.mark.slow
+ITERATIONS = int(os.environ.get("STGA_SOAK", 3000))
+STRAYS, DENSITY = 30, 40
+MARK = 250  # iterations between fingerprints
+RSS_GROWTH = 24 << 20
+
+
+@dataclass
+class Soak:
+    """What a run left behind: fingerprints every MARK iterations, losses of global ones, and what was checked."""
+
+    marks: list[str] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    memory: list[int] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+    local: int = 0
+    thawed: list[int] = field(default_factory=list)
+    broken: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return open_capture(factory.write_mesh_capture(tmp_path_factory.mktemp("soak"), (0, 1, 3), range(4)))
+
+
+@pytest.fixture(autouse=True)
+def threads() -> Iterator[None]:
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+def resident() -> int:
+    """Bytes of this process in memory."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def soak(capture: Capture, until: int, threads: int, seed: int = 0) -> Soak:
+    """Train `until` of ITERATIONS steps, each with another view and another random choice of triangles."""
+    numba.set_num_threads(threads)
+    settings = quick_settings(
+        "selective", iterations=ITERATIONS, seed=seed, lattice=1, warm_up=0.02, stray_every=STRAYS, stray_limit=0.5,
+        density_every=DENSITY, density_span=(0.0, 1.0), growth=0.5, scale_limit=1.0,
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    trainer = Trainer(capture, settings, {})
+    views = [read_view(view) for view in capture.views["train"]]
+    found = Soak()
+    for iteration in range(until):
+        view, image, _ = views[rng.integers(len(views))]
+        share = rng.choice([0.0, 0.01, 0.2, 0.7, 1.0])
+        trainer.selection = {view.timestep: rng.random(len(capture.faces)) < share}
+        _step(trainer, view, image, iteration, found)
+        if (iteration + 1) % MARK == 0:
+            _mark(trainer, found)
+    return found
+
+
+def _step(trainer: Trainer, view, image: np.ndarray, iteration: int, found: Soak) -> None:
+    face = trainer.state.face.numpy().copy()
+    before = bits(trainer.state)
+    loss = trainer.step(view, image, iteration / ITERATIONS)
+    if loss is not None:
+        found.losses.append(loss)
+        return
+    found.local += 1
+    if trainer.iteration % STRAYS and trainer.iteration % DENSITY:  # those two may touch every row
+        frozen = ~trainer.selection[view.timestep][face]
+        after = bits(trainer.state)
+        if any(not np.array_equal(before[name][frozen], after[name][frozen]) for name in before):
+            found.thawed.append(iteration)
+
+
+def _mark(trainer: Trainer, found: Soak) -> None:
+    state = bits(trainer.state)
+    found.marks.append(hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest())
+    found.memory.append(resident())
+    found.counts.append(len(trainer.state))
+    for part in ("parameters", "first", "second"):
+        tensors = getattr(trainer.state, part)._asdict()
+        found.broken += [f"{part}/{name}" for name, tensor in tensors.items() if not tensor.isfinite().all()]
+
+
+@pytest.fixture(scope="module")
+def long(capture: Capture) -> Soak:
+    compile_kernels()
+    return soak(capture, ITERATIONS, threads=2)
+
+
+def test_everything_was_on(long: Soak) -> None:
+    """Catches a soak that tests nothing: local and global steps, growth and pruning must all have happened."""
+    assert long.local > ITERATIONS // 3
+    assert len(long.losses) > ITERATIONS // 4
+    assert len(set(long.counts)) > 1
+
+
+def test_numbers_stay_finite(long: Soak) -> None:
+    """Catches NaN or infinity in parameters or moments."""
+    assert long.broken == []
+    assert np.isfinite(long.losses).all()
+
+
+def test_frozen_rows_stay_frozen(long: Soak) -> None:
+    """Catches a row that a local iteration changed though its triangle was not selected, by any bit, at any time."""
+    assert long.thawed == []
+
+
+def test_the_loss_does_not_diverge(long: Soak) -> None:
+    """Catches training that gets worse: each tenth is no worse than a quarter above the best one before it."""
+    tenths = [float(np.mean(part)) for part in np.array_split(long.losses, 10)]
+    assert tenths[-1] < 0.5 * tenths[0]
+    for n in range(1, 10):
+        assert tenths[n] < 1.25 * min(tenths[:n]) + 1e-3
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="resident memory is read from /proc")
+def test_memory_is_flat(long: Soak) -> None:
+    """Catches a buffer that grows with the number of steps; the first quarter may fill pools."""
+    settled = long.memory[len(long.memory) // 4 :]
+    assert max(settled[len(settled) // 2 :]) - min(settled) < RSS_GROWTH
+
+
+def test_same_seed_same_bits_with_one_thread(capture: Capture, long: Soak) -> None:
+    """Catches sums whose order depends on threads, and random numbers that do not come from the seed."""
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("this machine has one core")
+    third = ITERATIONS // 3 // MARK * MARK
+    assert soak(capture, third, threads=1).marks == long.marks[: third // MARK]
+    assert soak(capture, MARK, threads=2).marks == long.marks[:1]
+    assert soak(capture, MARK, threads=2, seed=1).marks != long.marks[:1]
