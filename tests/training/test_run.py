@@ -36,7 +36,9 @@ def stop_at(iteration: int) -> Callable[[Progress], bool]:
 
 
 def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [{k: v for k, v in line.items() if k not in ("seconds", "evaluation_s")} for line in lines]
+    """Metrics without wall times; loss and SSIM, whose rows are summed in float32, to seven digits."""
+    kept = [{k: v for k, v in line.items() if k not in ("seconds", "evaluation_s")} for line in lines]
+    return [{k: float(f"{v:.7g}") if k in ("loss", "ssim") else v for k, v in line.items()} for line in kept]
 
 
 def assert_same_state(folder: Path, expected: Path) -> None:
@@ -133,7 +135,8 @@ def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path
 def test_the_loss_in_the_metrics_survives_a_crash(unbroken: Path, continued: Path) -> None:
     """Catches a curve with a step in it where the run was interrupted: the mean is over the last iterations."""
     ours, theirs = ([line["loss"] for line in read_metrics(folder)] for folder in (continued, unbroken))
-    assert ours == theirs
+    # Not to the last bit: the value is summed in float32 along each row, for people to look at, and does not train.
+    assert ours == pytest.approx(theirs, rel=1e-6)
 
 
 def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
