@@ -30,6 +30,7 @@ from stga_addon.training.settings import make_settings
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "global": {"strategy": "global"},
+    "global, fixed background": {"strategy": "global", "any_background": False},
     "global, frame batches": {"strategy": "global", "views_per_visit": 0},
     "selective": {"strategy": "selective"},
     "selective, no warm-up": {"strategy": "selective", "warm_up": 0.0},
