@@ -7,8 +7,7 @@ from pathlib import Path
 
 from . import __version__
 from .errors import StgaError
-
-STRATEGIES = ("selective", "global", "gaussian-avatars")
+from .training.settings import SCHEDULES, STRATEGIES
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -50,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
         choices=STRATEGIES,
         help="default: global, which measured best (docs/results.md); selective with --schedule paper",
     )
-    train.add_argument("--schedule", choices=("default", "paper"), help="paper: by its letter")
+    train.add_argument("--schedule", choices=SCHEDULES, help="paper: by its letter")
     train.add_argument("--threshold", type=float, help="selection threshold in metres")
     train.add_argument("--resume", action="store_true", help="continue the run in the folder")
     train.add_argument("--device", choices=("auto", "cpu"), default="auto", help="auto takes the CPU in this version")

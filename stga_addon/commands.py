@@ -86,14 +86,14 @@ def render(options: Namespace) -> None:
     from tqdm import tqdm
 
     from .capture.transforms import read_transforms
+    from .raster.pictures import to_bytes
 
     draw = _drawer(options)
     frames = read_transforms(options.cameras, options.principal_point or "vhap")
     names = _unique_names([frame.view.name for frame in frames])
     for frame, name in zip(tqdm(frames, desc="rendering", unit="image"), names, strict=True):
-        pixels = np.rint(draw(frame.view).transpose(1, 2, 0) * 255).astype(np.uint8)
         with replacing(options.out / name) as partial:
-            Image.fromarray(pixels).save(partial, format="PNG")
+            Image.fromarray(to_bytes(draw(frame.view))).save(partial, format="PNG")
 
 
 def _drawer(options: Namespace) -> Callable[[View], np.ndarray]:

@@ -1,6 +1,6 @@
 """Which triangles really moved, and so which splats a frame trains (STGA, selective training)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,9 +42,7 @@ def select_faces(
     return np.asarray(selected | (~in_region & (offset > threshold)))
 
 
-def select_capture(
-    capture: Capture, options: SelectionOptions, progress: Callable[[int], None] = lambda timestep: None
-) -> dict[int, np.ndarray]:
+def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool for every timestep; a selection that came with the capture wins over the rule."""
     regions = {name: capture.regions[name] for name in options.regions if name in capture.regions}
     chosen = {}
@@ -54,5 +52,4 @@ def select_capture(
             mesh = capture.expression_mesh(timestep, options.zero_pose)
             faces = select_faces(mesh, capture.neutral, capture.faces, regions, options.threshold)
         chosen[timestep] = faces
-        progress(timestep)
     return chosen

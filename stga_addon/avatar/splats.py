@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 MAX_SH_DEGREE = 3
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2·sqrt(π)): what a degree-0 coefficient adds to the colour."""
 
 
 @dataclass(frozen=True)

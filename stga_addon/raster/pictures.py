@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..avatar.file import Avatar
+from ..avatar.splats import SH_C0
 from ..capture.camera import Camera
 from .draw import draw_avatar
-
-SH_C0 = 0.28209479177387814
 
 
 def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected: np.ndarray) -> np.ndarray:

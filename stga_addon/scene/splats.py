@@ -7,14 +7,11 @@ import numpy as np
 
 from ..avatar.embedding import face_areas
 from ..avatar.file import Avatar
-from ..avatar.splats import Splats
+from ..avatar.splats import SH_C0, Splats
 from ..errors import StgaError
 from . import nodes, tags
 from .compat import set_modifier_input
 from .materials import OPACITY
-
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic: 1 / (2·sqrt(π))."""
 
 
 def show_avatar(avatar: Avatar, head: Any, name: str | None = None) -> Any:

@@ -11,22 +11,22 @@ from .state import TrainState, join, keep_rows, new_state
 FAINT = 0.005
 """Opacity under which a splat is pruned."""
 SHRINK = np.log(1.6)
-"""How much smaller both halves of a split splat are along each axis (3D Gaussian splatting)."""
+"""How much smaller, as a logarithm, both halves of a split splat are along the axis it is split on."""
 
 
-def control_density(state: TrainState, faces: int, room: int, share: float, rng: np.random.Generator) -> TrainState:
+def control_density(state: TrainState, room: int, share: float, rng: np.random.Generator) -> TrainState:
     """Split the splats that the image pulls at hardest and prune the faint ones.
 
-    room: how many splats may still be added; share: at most this share of the splats is split at once; faces: number
-    of triangles, each of which keeps at least one splat. Children inherit triangle and looseness, lie within the
-    parent's Gaussian in local units, and start with fresh moments.
+    room: how many splats may still be added; share: at most this share of the splats is split at once. Every triangle
+    that has splats keeps one. Children inherit triangle and looseness, lie within the parent's Gaussian in local
+    units, and start with fresh moments.
     """
     pull = (state.pull / state.seen.clamp_min(1)).numpy()
-    count = min(room, int(share * len(state)))
+    count = max(0, min(room, int(share * len(state))))
     hardest = np.argsort(-pull, kind="stable")[:count]
     hardest = hardest[pull[hardest] > 0]
     children = new_state(_halves(state.splats().rows(hardest), rng))
-    keep = ~_dispensable(state, faces)
+    keep = ~_dispensable(state)
     keep[hardest] = False
     state = join(keep_rows(state, torch.from_numpy(keep)), children)
     return replace(state, pull=torch.zeros(len(state)), seen=torch.zeros(len(state)))
@@ -56,7 +56,7 @@ def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
     return Splats(*(np.concatenate(pair) for pair in zip(*(_values(s) for s in both), strict=True)))
 
 
-def _dispensable(state: TrainState, faces: int) -> np.ndarray:
+def _dispensable(state: TrainState) -> np.ndarray:
     """(N,) bool: faint splats, but never the last (most opaque) bound one of a triangle."""
     opacity, face, loose = state.parameters.opacity.numpy(), state.face.numpy(), state.loose.numpy()
     faint = _sigmoid(opacity) < FAINT

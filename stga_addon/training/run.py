@@ -73,6 +73,8 @@ def train(
         if resume and (out / "checkpoint.npz").exists():
             loop.resume()
         else:
+            if resume and selection is None and (out / "selection.npz").exists():
+                selection = run_folder.read_selection(out, len(capture.faces))
             loop.begin(selection)
         loop.work()
     return out / "avatar.npz"
@@ -95,8 +97,8 @@ class _Loop:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
         self.trainer = Trainer(self.capture, self.settings, selection)
-        run_folder.write_run(self.out, self.run)
         run_folder.write_selection(self.out, selection)
+        run_folder.write_run(self.out, self.run)
         run_folder.cut_metrics(self.out, -1)
 
     def resume(self) -> None:

@@ -15,7 +15,9 @@ from ..capture.images import read_image, read_mask
 from ..capture.model import Capture, View
 
 VOXEL = 0.004
-"""Metres between seeds."""
+"""Metres between seeds, on a mesh of a head's size."""
+FINEST = 1 / 200
+"""Seeds are at least this share of the mesh's diagonal apart: a mesh in millimetres must not fill the memory."""
 CLEARANCE = 0.006
 """Metres: nearer to the mesh than this, the mesh's own splats cover it."""
 MARGIN = 0.25
@@ -32,14 +34,16 @@ TRACKING_ERROR = 0.01
 def hull_seeds(capture: Capture, views: Sequence[View], convention: str, sh_degree: int) -> Splats:
     """Loose splats on the shell of the visual hull of one timestep, outside the mesh.
 
-    views: all of one timestep. The hull is carved on a grid of VOXEL metres from the masks (or, without masks, from
-    what differs from white); each seed is bound to the nearest triangle, so it follows the head.
+    views: all of one timestep. The hull is carved on a grid of VOXEL metres (coarser on a larger mesh) from the masks
+    (or, without masks, from what differs from white); each seed is bound to the nearest triangle, so it follows the
+    head.
     """
     mesh = capture.mesh(views[0].timestep)
-    points = _shell(mesh, capture.faces, views)
+    voxel = max(VOXEL, FINEST * float(np.linalg.norm(np.ptp(mesh, axis=0))))
+    points = _shell(mesh, capture.faces, views, voxel)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
     outside = distance > CLEARANCE
-    world = _seeds(points[outside], sh_degree)
+    world = _seeds(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(world, frames, face[outside])
 
@@ -52,11 +56,11 @@ def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -
     return distance, nearest // len(weights)
 
 
-def _shell(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> np.ndarray:
+def _shell(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float) -> np.ndarray:
     """Grid points (N, 3) on the surface of the visual hull that show beside the mesh."""
     low, high = mesh.min(0), mesh.max(0)
     margin = MARGIN * np.linalg.norm(high - low)
-    axes = [np.arange(a - margin, b + margin, VOXEL) for a, b in zip(low, high, strict=True)]
+    axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = np.ones(len(grid), bool)
     witnesses, exposed = np.zeros(len(grid), np.int32), np.zeros(len(grid), np.int32)
@@ -101,12 +105,12 @@ def _pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray,
     return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
 
 
-def _seeds(points: np.ndarray, sh_degree: int) -> Splats:
+def _seeds(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
     n = len(points)
     return Splats(
         xyz=points.astype(np.float32),
         rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        log_scale=np.full((n, 3), np.log(VOXEL / 2), np.float32),
+        log_scale=np.full((n, 3), np.log(voxel / 2), np.float32),
         opacity=np.zeros(n, np.float32),
         sh=np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
         face=np.zeros(n, np.int32),

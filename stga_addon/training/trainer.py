@@ -146,7 +146,7 @@ class Trainer:
         if settings.density_every and self.iteration % settings.density_every == 0 and start <= progress < end:
             room = round(self.initial_count * (1 + settings.growth)) - len(self.state)
             rng = np.random.default_rng([settings.seed, self.iteration])
-            self.state = control_density(self.state, len(self.capture.faces), room, SPLIT_SHARE, rng)
+            self.state = control_density(self.state, room, SPLIT_SHARE, rng)
 
 
 def initial_splats(capture: Capture, settings: Settings) -> Splats:

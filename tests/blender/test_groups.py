@@ -1,7 +1,5 @@
 """Selections written as vertex groups and read back."""
 
-from time import perf_counter
-
 import numpy as np
 import pytest
 
@@ -105,16 +103,3 @@ def test_edit_mode_and_wrong_sizes_are_refused(capture, head):
         write_selection(head, {})
     bpy.ops.object.mode_set(mode="OBJECT")
     assert all((before[timestep] == after).all() for timestep, after in read_selection(head).items())
-
-
-def test_three_hundred_groups_are_quick(tmp_path):
-    """Fails when vertices are added one at a time or read through Python objects."""
-    capture = mesh_capture(tmp_path, timesteps=(0,), vertices=5000)
-    head = import_head(capture)
-    mask = np.random.default_rng(0).random((300, len(capture.faces))) < 0.1
-    start = perf_counter()
-    write_selection(head, dict(enumerate(mask)))
-    assert perf_counter() - start < 1.5
-    start = perf_counter()
-    assert len(read_selection(head)) == 300
-    assert perf_counter() - start < 1.5

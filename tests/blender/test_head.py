@@ -1,7 +1,6 @@
 """The imported head against the capture's own meshes."""
 
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -146,12 +145,3 @@ def test_a_saved_file_shows_the_same(tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
     np.testing.assert_allclose(at_frame(bpy.data.objects[name], 7), capture.mesh(7), atol=1e-7)
-
-
-def test_three_hundred_frames_import_in_seconds(tmp_path):
-    """Fails when keys or keyframes are written one value at a time."""
-    capture = mesh_capture(tmp_path, timesteps=range(300), vertices=5000)
-    still = replace(capture, mesh=lambda timestep: capture.neutral)
-    start = perf_counter()
-    import_head(still)
-    assert perf_counter() - start < 3

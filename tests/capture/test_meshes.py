@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -39,17 +38,12 @@ def test_stl_is_a_soup_in_order(tmp_path: Path) -> None:
 
 
 def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
-    """Catches an error of the OBJ parser, against trimesh on a real tracked mesh, and parsing slower than 100 ms."""
+    """Catches an error of the OBJ parser, against trimesh on a real tracked mesh."""
     path = shared_data / "studio_head/meshes/00003.obj"
     reference = trimesh.load(path, process=False, maintain_order=True)
-    seconds = []
-    for _ in range(3):
-        start = perf_counter()
-        vertices, faces = read_mesh(path)
-        seconds.append(perf_counter() - start)
+    vertices, faces = read_mesh(path)
     np.testing.assert_array_equal(vertices, reference.vertices)
     np.testing.assert_array_equal(faces, reference.faces)
-    assert min(seconds) < 0.1
 
 
 def test_obj_dialects(tmp_path: Path) -> None:

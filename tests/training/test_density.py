@@ -29,7 +29,7 @@ def busy_state(pulled: list[int]) -> TrainState:
 
 
 def control(state: TrainState, room: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
-    return control_density(state, FACES, room, share, np.random.default_rng(seed))
+    return control_density(state, room, share, np.random.default_rng(seed))
 
 
 def test_survivors_keep_everything_and_children_start_anew() -> None:
@@ -96,7 +96,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     state = new_state(splats)
     parent = cover(state)
     state.pull[0], state.seen[0] = 1.0, 1.0
-    split = control_density(state, 1, 10, 1.0, np.random.default_rng(0))
+    split = control_density(state, 10, 1.0, np.random.default_rng(0))
     assert len(split) == 2
     children = cover(split)
     assert 0.6 < children.sum() / parent.sum() < 1.15

@@ -139,6 +139,23 @@ def test_the_loss_in_the_metrics_survives_a_crash(unbroken: Path, continued: Pat
     assert ours == pytest.approx(theirs, rel=1e-6)
 
 
+def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path) -> None:
+    """Catches what an artist painted replaced by the rule when a run resumes that had no checkpoint yet."""
+    painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
+
+    def crash(progress: Progress) -> bool:
+        if progress.iteration == 2:
+            raise Crash
+        return False
+
+    with pytest.raises(Crash):
+        train(toy, tmp_path, make_run(toy), painted, report=crash)
+    train(toy, tmp_path, make_run(toy), resume=True)
+    kept = read_selection(tmp_path, len(toy.faces))
+    assert kept.keys() == painted.keys()
+    assert all((kept[timestep] == painted[timestep]).all() for timestep in painted)
+
+
 def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
     """Catches a run that can neither be resumed nor started again because it was killed early."""
 

@@ -144,3 +144,9 @@ def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> Non
     Image.fromarray(np.zeros((SIZE, SIZE), np.uint8)).save(black)
     views[7] = replace(views[7], mask=black)
     assert len(hull_seeds(beside, views, "stga", 0)) == 0
+
+
+def test_a_mesh_in_millimetres_does_not_fill_the_memory(beside: Capture) -> None:
+    """Catches a grid of 4 mm laid through a mesh of 100 m: 10^13 points."""
+    huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
+    assert len(hull_seeds(huge, beside.views["train"], "stga", 0)) < 100_000

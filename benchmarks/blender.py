@@ -1,0 +1,98 @@
+"""What Blender spends on a head: import, selection groups and playback.
+
+    python benchmarks/blender.py [--repeats 3]
+
+Needs the module bpy. Medians over repeats, each in an empty file. Run it on an idle machine.
+"""
+
+import argparse
+import statistics
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import trimesh
+
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.model import Capture
+from stga_addon.demo.head import synthetic_flame
+from stga_addon.flame.forward import neutral_frame
+from stga_addon.flame.sequence import FlameSequence
+from stga_addon.scene.file import go_to_frame, new_file
+from stga_addon.scene.groups import read_selection, write_selection
+from stga_addon.scene.head import import_head, import_motion
+from stga_addon.scene.splats import show_avatar
+
+
+def moving_ball(folder: Path, timesteps: int, subdivisions: int) -> Capture:
+    """A mesh capture without cameras: a ball that grows a little every timestep."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.1)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces, np.int32)
+    meshes = [vertices * (1 + 1e-4 * t) for t in range(timesteps)]
+    return Capture(
+        folder, "mesh", faces, vertices, {}, tuple(range(timesteps)), {}, meshes.__getitem__, lambda t, zero: meshes[t]
+    )
+
+
+def median_s(work: Callable[[], object], repeats: int) -> float:
+    """Median wall time of `work` in seconds, each time in an empty file."""
+    times = []
+    for _ in range(repeats):
+        new_file()
+        begin = perf_counter()
+        work()
+        times.append(perf_counter() - begin)
+    return statistics.median(times)
+
+
+def playback_ms(folder: Path, order: int) -> tuple[int, float]:
+    """Splats on a ball of 20,480 triangles that changes shape, and median milliseconds to go to a frame."""
+    new_file()
+    capture = moving_ball(folder, 20, 5)
+    splats = lattice_splats(capture.neutral, capture.faces, order, sh_degree=0)
+    show_avatar(Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces), import_head(capture))
+    times = []
+    for frame in range(20):
+        begin = perf_counter()
+        go_to_frame(frame)
+        times.append(1e3 * (perf_counter() - begin))
+    return len(splats), statistics.median(times[2:])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=3)
+    repeats = parser.parse_args().repeats
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        frames = moving_ball(folder, 300, 4)
+        print(f"import 300 frames of {len(frames.neutral)} vertices: "
+              f"{median_s(lambda: import_head(frames), repeats):.2f} s")  # fmt: skip
+
+        model = synthetic_flame(0)
+        one = replace(neutral_frame(model), expr=np.full(model.n_expression, 0.1))
+        motion = FlameSequence(model, np.zeros(model.n_identity), None, tuple(range(1000)), lambda timestep: one)
+        print(f"import 1,000 FLAME frames, {model.n_expression} expressions, {len(model.v_template)} vertices: "
+              f"{median_s(lambda: import_motion(motion, folder), repeats):.2f} s")  # fmt: skip
+
+        still = moving_ball(folder, 1, 4)
+        chosen = dict(enumerate(np.random.default_rng(0).random((1000, len(still.faces))) < 0.1))
+        new_file()
+        head = import_head(still)
+        begin = perf_counter()
+        write_selection(head, chosen)
+        written = perf_counter()
+        read_selection(head)
+        print(f"1,000 groups, 10 % of {len(still.faces)} triangles: write {written - begin:.2f} s, "
+              f"read {perf_counter() - written:.2f} s")  # fmt: skip
+        for order in (1, 3):
+            count, ms = playback_ms(folder, order)
+            print(f"playback, {count} splats on 20,480 triangles: {ms:.1f} ms a frame")
+
+
+if __name__ == "__main__":
+    main()
