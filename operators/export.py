@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.avatar.embedding import face_frames, to_world
+from ..stga_addon.avatar.embedding import to_world
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
 from ..stga_addon.avatar.ply import write_ply
@@ -70,7 +70,7 @@ class Export(bpy.types.Operator):
 
 
 def _posed(avatar: Avatar, head: Any) -> Any:
-    frames = face_frames(evaluated_vertices(head), avatar.faces, avatar.neutral, avatar.convention)
+    frames = avatar.frames(evaluated_vertices(head))
     return to_world(avatar.splats, frames)
 
 

@@ -1,5 +1,6 @@
 """What each command does; `cli.py` parses, this module works and prints."""
 
+import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .avatar.embedding import face_frames, to_world
+from .avatar.embedding import to_world
 from .avatar.file import Avatar, read_avatar
 from .avatar.ply import read_ply, write_ply
 from .capture.model import Capture, View
@@ -38,6 +39,19 @@ def train(options: Namespace) -> None:
     with ProgressBar() as bar:
         avatar = train_run(capture, options.out, run, resume=options.resume, report=bar.report)
     print(f"avatar: {avatar}")
+
+
+def job(options: Namespace) -> None:
+    """Carry out the training job that Blender wrote into a run's folder; its panel shows the progress."""
+    from .job import work
+
+    if not sys.stderr.isatty():  # a worker of Blender's: its folder says it all
+        work(options.run)
+        return
+    from .training.progress import ProgressBar
+
+    with ProgressBar() as bar:
+        work(options.run, also=bar.report)
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:
@@ -132,8 +146,7 @@ def _unique_names(paths: list[str]) -> list[str]:
 def eval(options: Namespace) -> None:
     """Print the quality of a run's avatar on a split, and write it beside the run."""
     from .files import write_json
-    from .raster.draw import draw_avatar
-    from .training.metrics import evaluate
+    from .training.metrics import measure
 
     if not options.run.is_dir():
         raise StgaError(f"{options.run}: is not a folder; expected that of a run")
@@ -142,10 +155,7 @@ def eval(options: Namespace) -> None:
     views = capture.views.get(options.split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{options.split}'")
-    background = avatar.background
-    quality = evaluate(
-        lambda view: draw_avatar(avatar, capture.mesh(view.timestep), view.camera, background), views, perceptual=True
-    )
+    quality = measure(avatar, capture, options.split, perceptual=True)
     lpips = "not measured (package lpips is not installed)" if quality.lpips is None else f"{quality.lpips:.4f}"
     print(f"{options.split}: {len(views)} views, PSNR {quality.psnr:.3f} dB, SSIM {quality.ssim:.4f}, LPIPS {lpips}")
     write_json(options.run / f"quality_{options.split}.json", {"views": len(views), **quality.as_json()})
@@ -204,7 +214,7 @@ def export_avatar(
 
 
 def _baked(avatar: Avatar, mesh: np.ndarray) -> Any:
-    return to_world(avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral, avatar.convention))
+    return to_world(avatar.splats, avatar.frames(mesh))
 
 
 def info(options: Namespace) -> None:

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .splats import Splats
+from .splats import SH_C0, Splats, no_strain_color
+from .strain import StrainBasis, face_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 TINY = 1e-30
@@ -22,22 +23,32 @@ class FaceFrames:
     """Per triangle: world = scale · rotation @ local + origin.
 
     origin (F, 3) metres, rotation (F, 3, 3) proper, quaternion (F, 4) wxyz of the same rotation, scale (F,).
+    strain (F, S) float32: what colours follow (`avatar.strain`), S = 3, or 0 where nobody asked for it.
     """
 
     origin: np.ndarray
     rotation: np.ndarray
     quaternion: np.ndarray
     scale: np.ndarray
+    strain: np.ndarray
 
 
-WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 0, 0, 0]]), np.ones(1))
+NO_STRAIN = np.zeros((1, 0), np.float32)
+WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 0, 0, 0]]), np.ones(1), NO_STRAIN)
 """The single frame of a world-space set of splats (face 0)."""
 
 
-def face_frames(vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, convention: str = "stga") -> FaceFrames:
+def face_frames(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    neutral: np.ndarray,
+    convention: str = "stga",
+    strain: StrainBasis | None = None,
+) -> FaceFrames:
     """Local frame of every triangle of a posed mesh.
 
-    vertices, neutral (V, 3) metres; faces (F, 3). Computed and returned in float64.
+    vertices, neutral (V, 3) metres; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
+    basis where colours follow strain.
     "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit metres of the neutral mesh
     (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
     unit the triangle (GaussianAvatars' released code).
@@ -61,7 +72,8 @@ def face_frames(vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, co
         scale = (edge + np.where(no_edge, side, _length(_normal(corners)) / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
-    return FaceFrames(origin, rotation, quaternion_from_matrix(rotation), scale)
+    deformed = np.zeros((len(faces), 0), np.float32) if strain is None else face_strain(strain, vertices)
+    return FaceFrames(origin, rotation, quaternion_from_matrix(rotation), scale, deformed)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -72,7 +84,10 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
-    """Bake local splats into world space. SH keep their coefficients: their directions are world directions."""
+    """Bake local splats into world space. SH keep their coefficients: their directions are world directions.
+
+    Colour that follows strain becomes part of the constant coefficient; without strain in `frames` it is left out.
+    """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
     rotation = quaternion_multiply(frames.quaternion[face], _unit_quaternion(splats.rotation))
@@ -82,8 +97,19 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
         xyz=xyz.astype(np.float32),
         rotation=rotation.astype(np.float32),
         log_scale=log_scale.astype(np.float32),
+        sh=_strained(splats, frames),
         face=np.zeros_like(face),
+        strain_color=no_strain_color(len(xyz)),
     )
+
+
+def _strained(splats: Splats, frames: FaceFrames) -> np.ndarray:
+    """The splats' `sh` with the colour of their triangles' strain added."""
+    if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
+        return splats.sh
+    sh = splats.sh.copy()
+    sh[:, 0] += np.einsum("ns,nsc->nc", frames.strain[splats.face], splats.strain_color) / np.float32(SH_C0)
+    return sh
 
 
 def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_npz, write_npz
-from .embedding import CONVENTIONS
+from .embedding import CONVENTIONS, FaceFrames, face_frames
 from .splats import MAX_SH_DEGREE, Splats
+from .strain import STRAINS, StrainBasis, strain_basis
 
 FORMAT = "stga-avatar"
 VERSION = 1
@@ -29,6 +31,7 @@ class Avatar:
     settings    how it was trained; anything that JSON holds
     regions     name -> (F,) bool
     background  red, green, blue in 0…1 that it was trained against
+    antialiased  whether it was trained with opacity compensation (`render_forward`), and is to be drawn so
     """
 
     splats: Splats
@@ -38,6 +41,15 @@ class Avatar:
     settings: Mapping[str, Any] = field(default_factory=dict)
     regions: Mapping[str, np.ndarray] = field(default_factory=dict)
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    antialiased: bool = False
+
+    def frames(self, mesh: np.ndarray) -> FaceFrames:
+        """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colours follow it."""
+        return face_frames(mesh, self.faces, self.neutral, self.convention, self._strain)
+
+    @cached_property
+    def _strain(self) -> StrainBasis | None:
+        return strain_basis(self.neutral, self.faces) if self.splats.strain_color.shape[1] else None
 
 
 def write_avatar(path: Path, avatar: Avatar) -> None:
@@ -51,6 +63,7 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
         "version": VERSION,
         "convention": avatar.convention,
         "background": list(avatar.background),
+        "antialiased": avatar.antialiased,
         "regions": list(avatar.regions),
         "settings": dict(avatar.settings),
     }
@@ -65,20 +78,22 @@ def read_avatar(path: Path) -> Avatar:
     """Read an avatar file. Raises StgaError naming the file and the field that is missing or malformed."""
     arrays = read_npz(path)
     header = _read_header(path, arrays)
-    missing = [name for name in (*_SPLAT_FIELDS, "neutral", "faces", "region_faces") if name not in arrays]
+    needed = (*_SPLAT_FIELDS, "neutral", "faces", "region_faces")
+    missing = [name for name in needed if name not in arrays and name != "strain_color"]
     if missing:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
     names, masks = header["regions"], arrays["region_faces"]
     if masks.ndim != 2 or len(masks) != len(names):
         raise StgaError(f"{path}: region_faces has shape {masks.shape}, expected ({len(names)}, faces)")
     avatar = Avatar(
-        splats=Splats(**{name: arrays[name] for name in _SPLAT_FIELDS}),
+        splats=Splats(**{name: arrays[name] for name in _SPLAT_FIELDS if name in arrays}),
         convention=header["convention"],
         neutral=arrays["neutral"],
         faces=arrays["faces"],
         settings=header["settings"],
         regions=dict(zip(names, masks, strict=True)),
         background=tuple(header["background"]),
+        antialiased=header.get("antialiased", False) is True,
     )
     _check(path, avatar)
     return avatar
@@ -93,6 +108,7 @@ _SPLAT_FIELDS: dict[str, tuple[str, tuple[int, ...]]] = {
     "sh": ("float32", (-1, 3)),
     "face": ("int32", ()),
     "loose": ("bool", ()),
+    "strain_color": ("float32", (-1, 3)),
 }
 
 
@@ -128,6 +144,9 @@ def _check(path: Path, avatar: Avatar) -> None:
         _check_array(path, name, getattr(avatar.splats, name), dtype, (count, *tail))
     if avatar.splats.sh.shape[1] not in SH_SIZES:
         raise StgaError(f"{path}: sh has {avatar.splats.sh.shape[1]} coefficients, expected one of {SH_SIZES}")
+    if avatar.splats.strain_color.shape[1] not in (0, STRAINS):
+        size = avatar.splats.strain_color.shape[1]
+        raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAINS}")
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))

@@ -22,6 +22,8 @@ class Splats:
     face       (N,) int32 triangle that the splat is bound to; 0 for a world-space set
     loose      (N,) bool: stands for something outside the mesh (hair, shoulders), so limits that tie a splat
                to its triangle do not apply
+    strain_color  (N, S, 3) colour per unit of its triangle's strain (`avatar.strain`), S = 3, or 0 where colours do
+               not depend on deformation; nothing given means 0
     """
 
     xyz: np.ndarray
@@ -31,6 +33,11 @@ class Splats:
     sh: np.ndarray
     face: np.ndarray
     loose: np.ndarray
+    strain_color: np.ndarray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.strain_color is None:
+            object.__setattr__(self, "strain_color", no_strain_color(len(self.xyz)))
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -42,3 +49,8 @@ class Splats:
     def rows(self, index: np.ndarray) -> "Splats":
         """The splats at `index` (a boolean mask or integer array)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+def no_strain_color(count: int) -> np.ndarray:
+    """The `strain_color` of `count` splats whose colours do not depend on deformation."""
+    return np.zeros((count, 0, 3), np.float32)

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from ..avatar.embedding import face_frames, to_world
+from ..avatar.embedding import to_world
 from ..avatar.file import Avatar, read_avatar
 from ..capture.images import read_image
 from ..capture.model import Capture
@@ -18,7 +18,7 @@ from ..raster.draw import draw_avatar
 from ..raster.pictures import selection_picture, side_by_side, to_bytes
 from ..selection import SelectionOptions, select_capture
 from ..training.folder import Run
-from ..training.metrics import evaluate
+from ..training.metrics import measure
 from ..training.progress import ProgressBar
 from ..training.run import train
 from ..training.settings import make_settings
@@ -99,7 +99,7 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     worst = 0.0
     for timestep in capture.timesteps:
         go_to_frame(timestep)
-        frames = face_frames(capture.mesh(timestep), avatar.faces, avatar.neutral, avatar.convention)
+        frames = avatar.frames(capture.mesh(timestep))
         expected = to_world(avatar.splats, frames).xyz
         worst = max(worst, float(np.abs(evaluated_splats(object_named(name))[0] - expected).max()))
     if worst > TOLERANCE:
@@ -127,10 +127,4 @@ def _save(path: Path, pixels: np.ndarray) -> None:
 
 
 def _measure(capture: Capture, avatar: Avatar) -> dict[str, dict[str, float]]:
-    return {
-        split: evaluate(
-            lambda view: draw_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
-            capture.views[split],
-        ).as_json()
-        for split in ("val", "test")
-    }
+    return {split: measure(avatar, capture, split).as_json() for split in ("val", "test")}

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..avatar.embedding import WORLD, FaceFrames, face_frames
+from ..avatar.embedding import WORLD, FaceFrames
 from ..avatar.file import Avatar
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
@@ -11,15 +11,19 @@ from .render import Parameters, camera_frames, render_forward
 
 def draw_avatar(avatar: Avatar, mesh: np.ndarray, camera: Camera, background: tuple[float, float, float]) -> np.ndarray:
     """The avatar driven by a mesh (V, 3) in world metres: (3, H, W) float32 sRGB in 0…1."""
-    frames = face_frames(mesh, avatar.faces, avatar.neutral, avatar.convention)
-    return draw_splats(avatar.splats, camera, background, frames)
+    return draw_splats(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased)
 
 
 def draw_splats(
-    splats: Splats, camera: Camera, background: tuple[float, float, float], frames: FaceFrames = WORLD
+    splats: Splats,
+    camera: Camera,
+    background: tuple[float, float, float],
+    frames: FaceFrames = WORLD,
+    antialiased: bool = False,
 ) -> np.ndarray:
     """Splats in the frames of their triangles (or in world space): (3, H, W) float32 sRGB in 0…1."""
     arrays = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
     seen = camera_frames(frames, camera)
-    rendering = render_forward(arrays, splats.face, seen, splats.sh_degree, np.array(background, np.float32))
+    colour = np.array(background, np.float32)
+    rendering = render_forward(arrays, splats.face, seen, splats.sh_degree, colour, antialiased=antialiased)
     return np.clip(rendering.image, 0, 1)

@@ -26,11 +26,13 @@ def render(
     sh_degree: int = 3,
     near: float = 0.01,
     low_pass: float = 0.3,
+    antialiased: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image of world-space splats: colour (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight · z.
 
     xyz (N, 3) metres, rotation (N, 4) wxyz of any length, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3) of
     which the first (sh_degree + 1)² are used. near in metres, low_pass in square pixels, z the camera's.
+    antialiased: opacity loses what low_pass adds to the projected area (Mip-Splatting, 2D filter).
     Splats closer than `near` are dropped; the rest are blended front to back by z, in input order where z ties.
     A pixel ends before the splat that would leave it a transmittance of MIN_TRANSMITTANCE or less
     (3D Gaussian Splatting, sections 4 to 6, with gsplat's constants).
@@ -45,7 +47,11 @@ def render(
     position = torch.as_tensor(camera.position, dtype=xyz.dtype, device=xyz.device)
     colour = sh_colour(sh[order], xyz[order] - position, sh_degree)
     centre, projected = _project(in_camera[order], covariance, camera, low_pass)
-    alpha = _alpha(centre, projected, torch.sigmoid(opacity[order]), camera)
+    visible = torch.sigmoid(opacity[order])
+    if antialiased:
+        blur = low_pass * torch.eye(2, dtype=xyz.dtype, device=xyz.device)
+        visible = visible * (torch.linalg.det(projected - blur) / torch.linalg.det(projected)).clamp_min(0).sqrt()
+    alpha = _alpha(centre, projected, visible, camera)
     return _composite(alpha, colour, in_camera[order, 2])
 
 

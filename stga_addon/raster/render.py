@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ..avatar.embedding import WORLD, FaceFrames
+from ..avatar.splats import no_strain_color
 from ..capture.camera import Camera
 from .kernels.bins import count_pairs, depth_order, fill_pairs, mark_tiles
 from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
@@ -17,22 +18,27 @@ BLACK = np.zeros(3, np.float32)
 
 
 class Parameters(NamedTuple):
-    """What is trained of N splats, in the raw form of `Splats`: numpy float32 arrays, or torch tensors in `render`."""
+    """What is trained of N splats, in the raw form of `Splats`: numpy float32 arrays, or torch tensors in `render`.
+
+    Without `strain_color`, colours do not follow strain.
+    """
 
     xyz: Any
     rotation: Any
     log_scale: Any
     opacity: Any
     sh: Any
+    strain_color: Any = None
 
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """Face frames seen from a camera: camera point = matrix @ local + origin, float32."""
+    """Face frames seen from a camera: camera point = matrix @ local + origin, float32; strain as in `FaceFrames`."""
 
     camera: Camera
     origin: np.ndarray
     matrix: np.ndarray
+    strain: np.ndarray
     to_world: np.ndarray
     lens: np.ndarray
     size: np.ndarray
@@ -63,6 +69,7 @@ class Rendering:
     background: np.ndarray
     degree: int
     depth_as_colour: bool
+    antialiased: bool
 
 
 class Scratch:
@@ -91,6 +98,7 @@ def camera_frames(frames: FaceFrames, camera: Camera) -> CameraFrames:
         camera=camera,
         origin=(frames.origin @ rotation.T + translation).astype(np.float32),
         matrix=np.ascontiguousarray(matrix, np.float32),
+        strain=frames.strain,
         to_world=np.ascontiguousarray(rotation.T, np.float32),
         lens=np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy], np.float32),
         size=np.array([camera.width, camera.height], np.int64),
@@ -106,6 +114,7 @@ def render_forward(
     focus: np.ndarray | None = None,
     reach: int = 0,
     depth_as_colour: bool = False,
+    antialiased: bool = False,
     scratch: "Scratch | None" = None,
 ) -> Rendering:
     """Render N embedded splats over a background colour (3,).
@@ -114,16 +123,17 @@ def render_forward(
     focus (N,) bool: render only the tiles these splats touch and those at most `reach` pixels away, which is all
     that can influence their gradient; None renders everything.
     depth_as_colour: the first channel blends camera depth, the others are zero.
+    antialiased: splats narrower than a pixel, which are drawn a pixel wide, lose the opacity that this adds.
     scratch: buffers to reuse; the rendering is then valid until the next one with the same scratch.
     """
-    n, camera = len(splats.xyz), seen.camera
+    n, camera, splats = len(splats.xyz), seen.camera, _complete(splats)
     take = (scratch or Scratch()).take
     tiles_x, tiles_y = _tile_grid(camera)
     projected, depth = take("projected", (n, PROJECTED)), take("depth", (n,))
     extent_y, rect = take("extent_y", (n,)), take("rect", (n, 4), np.int32)
     project_forward(
-        *splats, degree, face, seen.origin, seen.matrix, seen.to_world, seen.lens, seen.size, depth_as_colour,
-        projected, depth, extent_y, rect,
+        *splats, degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
+        depth_as_colour, antialiased, projected, depth, extent_y, rect,
     )  # fmt: skip
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
     order = depth_order(depth, visible)
@@ -145,7 +155,7 @@ def render_forward(
     blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last)
     return Rendering(
         image, transmittance, visible, projected, extent_y, rect, last, slot_start, slot_count, start, pair_splat,
-        pair_slot, tiles, background, degree, depth_as_colour,
+        pair_slot, tiles, background, degree, depth_as_colour, antialiased,
     )  # fmt: skip
 
 
@@ -186,11 +196,17 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        *splats, rendering.degree, face, seen.origin, seen.matrix, seen.to_world, seen.lens, seen.size,
-        rendering.depth_as_colour, rendering.projected, rows,
-        rendering.slot_start, rendering.slot_count, pair_gradients, add, *gradients, screen,
+        *_complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens,
+        seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected, rows,
+        rendering.slot_start, rendering.slot_count, pair_gradients, add, *_complete(gradients), screen,
     )  # fmt: skip
     return rows, screen
+
+
+def _complete(splats: Parameters) -> Parameters:
+    if splats.strain_color is not None:
+        return splats
+    return splats._replace(strain_color=no_strain_color(len(splats.xyz)))
 
 
 def touched_tiles(rendering: Rendering, focus: np.ndarray) -> np.ndarray:
@@ -224,7 +240,12 @@ def _deal(tiles: np.ndarray, threads: int) -> np.ndarray:
 
 
 def render(
-    splats: Parameters, camera: Camera, frames: FaceFrames = WORLD, face: np.ndarray | None = None, degree: int = 3
+    splats: Parameters,
+    camera: Camera,
+    frames: FaceFrames = WORLD,
+    face: np.ndarray | None = None,
+    degree: int = 3,
+    antialiased: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Differentiable rendering of float32 torch tensors: the functional door to the kernels.
 
@@ -233,25 +254,32 @@ def render(
     """
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
     seen = camera_frames(frames, camera)
-    rgb, transmittance = _Blend.apply(seen, face, degree, False, *splats)  # type: ignore[no-untyped-call]
-    depth, _ = _Blend.apply(seen, face, degree, True, *splats)  # type: ignore[no-untyped-call]
+    given = [tensor for tensor in splats if tensor is not None]
+    rgb, transmittance = _Blend.apply(seen, face, degree, False, antialiased, *given)  # type: ignore[no-untyped-call]
+    depth, _ = _Blend.apply(seen, face, degree, True, antialiased, *given)  # type: ignore[no-untyped-call]
     return rgb, 1 - transmittance, depth[0]
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, seen: CameraFrames, face: np.ndarray, degree: int, depth_as_colour: bool, *tensors: torch.Tensor
+        ctx: Any,
+        seen: CameraFrames,
+        face: np.ndarray,
+        degree: int,
+        depth_as_colour: bool,
+        antialiased: bool,
+        *tensors: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
-        rendering = render_forward(splats, face, seen, degree, depth_as_colour=depth_as_colour)
+        rendering = render_forward(splats, face, seen, degree, depth_as_colour=depth_as_colour, antialiased=antialiased)
         ctx.saved = seen, face, splats, rendering
         return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
 
     @staticmethod
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
         seen, face, splats, rendering = ctx.saved
-        gradients = Parameters(*(np.zeros_like(a) for a in splats))
+        gradients = Parameters(*(np.zeros_like(a) for a in splats if a is not None))
         v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
         render_backward(rendering, splats, face, seen, v_rgb, gradients, v_t)
-        return None, None, None, None, *(torch.from_numpy(g) for g in gradients)
+        return None, None, None, None, None, *(torch.from_numpy(g) for g in gradients if g is not None)

@@ -30,4 +30,4 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> Non
 
 def _tables(tensors: Parameters) -> tuple[np.ndarray, ...]:
     """Each tensor as a numpy array (N, D) that shares its memory."""
-    return tuple(t.numpy().reshape(len(t), -1) for t in tensors)
+    return tuple(t.numpy().reshape(len(t), t[0].numel()) for t in tensors)

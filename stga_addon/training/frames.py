@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..avatar.embedding import FaceFrames, face_frames
+from ..avatar.strain import strain_basis
 from ..capture.model import Capture
 
 KEPT = 64
@@ -14,10 +15,11 @@ KEPT = 64
 class FrameStore:
     """Face frames by timestep, float64, bounded however long the sequence is."""
 
-    def __init__(self, capture: Capture, convention: str) -> None:
+    def __init__(self, capture: Capture, convention: str, strain: bool = False) -> None:
         self._capture, self._convention = capture, convention
+        self._strain = strain_basis(capture.neutral, capture.faces) if strain else None
         self.of = lru_cache(KEPT)(self._read)
 
     def _read(self, timestep: int) -> FaceFrames:
         mesh = np.asarray(self._capture.mesh(timestep))
-        return face_frames(mesh, self._capture.faces, self._capture.neutral, self._convention)
+        return face_frames(mesh, self._capture.faces, self._capture.neutral, self._convention, self._strain)

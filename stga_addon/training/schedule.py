@@ -49,6 +49,7 @@ def sh_degree(settings: Settings, progress: float) -> int:
 
 def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
     """Exponential decay from the initial rates to their ends."""
-    initial = {n: getattr(rates, n) for n in ("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest")}
+    names = ("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest", "strain_color")
+    initial = {name: getattr(rates, name) for name in names}
     ends = {name: rates.position_end if name == "xyz" else rates.end for name in initial}
     return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}

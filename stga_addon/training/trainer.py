@@ -1,11 +1,14 @@
 """The training loop's body: one view in, one step of the splats out."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from ..avatar.embedding import face_areas
 from ..avatar.lattice import lattice_splats
 from ..avatar.splats import Splats
+from ..avatar.strain import STRAINS
 from ..capture.model import Capture, View
 from ..raster.kernels.image_loss import change_background
 from ..raster.kernels.rows import distance_limit, scale_limit
@@ -44,7 +47,7 @@ class Trainer:
         self, capture: Capture, settings: Settings, selection: dict[int, np.ndarray], state: TrainState | None = None
     ) -> None:
         self.capture, self.settings, self.selection = capture, settings, selection
-        self.frames = FrameStore(capture, settings.convention)
+        self.frames = FrameStore(capture, settings.convention, settings.strain_color)
         self.state = new_state(initial_splats(capture, settings)) if state is None else state
         self.iteration, self.visit = 0, -1
         self.initial_count = len(self.state)
@@ -115,7 +118,7 @@ class Trainer:
         self._seen = camera_frames(self.frames.of(view.timestep), view.camera)
         return render_forward(
             self.state.arrays(), self.state.face.numpy(), self._seen, degree, background, focus, REACH,
-            scratch=self._scratch,
+            antialiased=self.settings.antialiased, scratch=self._scratch,
         )  # fmt: skip
 
     def _focus(self, timestep: int) -> np.ndarray | None:
@@ -154,11 +157,14 @@ def initial_splats(capture: Capture, settings: Settings) -> Splats:
     lattice = lattice_splats(
         capture.neutral, capture.faces, settings.lattice, settings.sh_degree, convention=settings.convention
     )
+    strains = STRAINS if settings.strain_color else 0
+    lattice = replace(lattice, strain_color=np.zeros((len(lattice), strains, 3), np.float32))
     if not settings.seeds:
         return lattice
     first = capture.views["train"][0].timestep
     views = [view for view in capture.views["train"] if view.timestep == first]
     seeds = hull_seeds(capture, views, settings.convention, settings.sh_degree)
+    seeds = replace(seeds, strain_color=np.zeros((len(seeds), strains, 3), np.float32))
     return Splats(*(np.concatenate([getattr(lattice, n), getattr(seeds, n)]) for n in vars(lattice)))
 
 

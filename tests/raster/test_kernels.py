@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from stga_addon.avatar.embedding import WORLD, face_frames
+from stga_addon.avatar.splats import SH_C0
+from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
 from stga_addon.raster.render import Parameters, Scratch, camera_frames, render, render_backward, render_forward
 
-NAMES = Parameters._fields
+NAMES = Parameters._fields[:5]
 # Kernels compute in float32 with a polynomial exp; a pixel sums up to a hundred terms below 1.
 IMAGE_TOLERANCE = 1e-5
 # Depth is that sum times distances of a few metres.
@@ -197,7 +199,7 @@ def raw_gradients(scene: Scene, fill: float = 0.0, add: bool = False, scratch: S
     seen = camera_frames(WORLD, scene.camera)
     rendering = render_forward(splats, face, seen, scene.degree, scratch=scratch, **options)
     v_image, v_alpha, _ = (v.float().numpy() for v in random_cotangents(scene.camera, 3))
-    gradients = Parameters(*(np.full_like(a, fill) for a in splats))
+    gradients = Parameters(*(np.full_like(a, fill) for a in splats if a is not None))
     rows, screen = render_backward(
         rendering, splats, face, seen, v_image, gradients, -v_alpha, options.get("focus"), add, scratch
     )
@@ -240,6 +242,52 @@ def test_screen_gradient_is_that_of_the_projected_centre():
     _, _, rows, screen = raw_gradients(scene)
     assert len(rows) > 20
     np.testing.assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
+
+
+def test_colour_follows_strain_with_the_right_gradient():
+    """Catches strain of the wrong triangle, a coefficient in the wrong unit, and a gradient that misses the clamp."""
+    scene, rng = SCENES["dark"], np.random.default_rng(31)
+    count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
+    faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]
+    basis = strain_basis(neutral, faces)
+    frames = face_frames(neutral + 0.1 * rng.normal(size=neutral.shape), faces, neutral, strain=basis)
+    face = rng.integers(0, len(faces), count).astype(np.int32)
+    color = rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32)
+    assert len(np.unique(frames.strain[face], axis=0)) > 5
+    cotangents = random_cotangents(scene.camera, 5)
+
+    tensors = [torch.from_numpy(a).clone().requires_grad_() for a in (*map(scene.splats.get, NAMES), color)]
+    images = render(Parameters(*tensors), scene.camera, frames, face)
+    loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
+    gradient = torch.autograd.grad(loss, tensors)[-1].numpy()
+    local = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
+    coefficients = torch.from_numpy(color).double().requires_grad_()
+    placed = embed(local, frames, face)
+    shift = torch.einsum("ns,nsc->nc", torch.from_numpy(frames.strain[face]).double(), coefficients) / SH_C0
+    sh = placed[4].clone()
+    sh[:, 0] += shift
+    expected_images = reference.render(*placed[:4], sh, scene.camera)
+    loss = sum((image * v).sum() for image, v in zip(expected_images, cotangents, strict=True))
+    expected = torch.autograd.grad(loss, coefficients)[0].numpy()
+    assert_images_agree([i.detach().numpy() for i in images], [i.detach().numpy() for i in expected_images])
+    assert np.abs(gradient - expected).max() < 2 * GRADIENT_TOLERANCE["sh"] * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("name", ["plain", "smaller than a pixel", "needles", "around the camera", "degree 1"])
+def test_antialiasing_takes_what_the_low_pass_adds(name):
+    """Catches a compensation of the wrong determinant, and gradients that leave it out: scale, rotation, position."""
+    scene = SCENES[name]
+    cotangents = random_cotangents(scene.camera, 6)
+    tensors = [torch.from_numpy(scene.splats[n]).clone().requires_grad_() for n in NAMES]
+    images = render(Parameters(*tensors), scene.camera, degree=scene.degree, antialiased=True)
+    images, gradients = finish(images, cotangents, tensors)
+    tensors = [torch.from_numpy(scene.splats[n]).double().requires_grad_() for n in NAMES]
+    expected_images = reference.render(*tensors, scene.camera, sh_degree=scene.degree, antialiased=True)
+    expected_images, expected = finish(expected_images, cotangents, tensors)
+    plain, _ = kernel_gradients(scene, cotangents)
+    assert np.abs(plain[1] - images[1]).max() > 0.01, "antialiasing changes nothing"
+    assert_images_agree(images, expected_images)
+    assert_gradients_agree(gradients, expected)
 
 
 def test_overwriting_and_adding():

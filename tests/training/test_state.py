@@ -13,7 +13,7 @@ def test_flat_names_round_trip() -> None:
     """Catches a tensor that a checkpoint would lose or put under another's name."""
     state = random_state(9, 5)
     flat = tensors_of(state)
-    assert len(flat) == 4 * 5 + 5
+    assert len(flat) == 4 * 6 + 5
     assert {"parameters/xyz", "gradients/sh", "first/opacity", "second/rotation", "steps", "pull"} <= set(flat)
     again = tensors_of(state_of(flat))
     assert list(again) == list(flat)

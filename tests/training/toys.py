@@ -20,6 +20,7 @@ def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Spl
         sh=rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
         face=rng.integers(0, faces, count).astype(np.int32),
         loose=rng.random(count) < 0.3,
+        strain_color=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
     )
 
 
@@ -44,4 +45,4 @@ def quick_settings(strategy: str = "selective", **changes: Any) -> Settings:
 def bits(state: TrainState) -> dict[str, np.ndarray]:
     """A copy of every tensor as bytes per row, so that NaN and −0 compare by their bits; gradients left out."""
     tensors = {name: t for name, t in tensors_of(state).items() if not name.startswith("gradients")}
-    return {name: t.numpy().copy().reshape(len(state), -1).view(np.uint8) for name, t in tensors.items()}
+    return {name: t.numpy().copy().reshape(len(state), t[0].numel()).view(np.uint8) for name, t in tensors.items()}

@@ -115,20 +115,24 @@ def _basis_gradient(degree, x, y, z, w):
 
 @parallel_jit
 def project_forward(
-    xyz, rotation, log_scale, opacity, sh, degree, face, origin, matrix, to_world, lens, size, depth_as_colour,
-    projected, depth, extent_y, rect,
+    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
+    depth_as_colour, antialiased, projected, depth, extent_y, rect,
 ):  # fmt: skip
     """Project N embedded splats.
 
-    xyz, rotation (wxyz), log_scale, opacity (logit), sh (N, K, 3), face: as in `Splats`; `degree` ≤ the stored.
+    xyz, rotation (wxyz), log_scale, opacity (logit), sh (N, K, 3), strain_color (N, S, 3), face: as in `Splats`;
+    `degree` ≤ the stored.
     origin (F, 3), matrix (F, 3, 3): camera-space frames, scale included: camera point = matrix @ xyz + origin.
+    strain (F, S): how the triangles deform; colours follow as many columns as both it and strain_color have.
     to_world (3, 3): camera to world rotation. lens (4,): fl_x, fl_y, cx, cy. size (2,): width, height.
-    depth_as_colour: blend (z, 0, 0) instead of the colour.
+    depth_as_colour: blend (z, 0, 0) instead of the colour. antialiased: what LOW_PASS adds to a splat's area is taken
+    from its opacity (Mip-Splatting's 2D filter, as gsplat's "antialiased" mode).
     Writes projected (N, 9), depth (N,), extent_y (N,) half height in pixels up to α = 1/255, and rect (N, 4) int32
     tile bounds x0, y0, x1, y1: all 0 for a splat that cannot be seen, all −1 for one that is not finite or would be
     wider than float32 can square (some 1e9 pixels).
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    strains = min(strain.shape[1], strain_color.shape[1])
     width, height = size[0], size[1]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, width, height)
@@ -166,8 +170,11 @@ def project_forward(
             yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS
             # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or below.
             m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
-            det = m01 * m01 + m02 * m02 + m12 * m12 + LOW_PASS * (xx + yy - LOW_PASS)
+            sharp = m01 * m01 + m02 * m02 + m12 * m12
+            det = sharp + LOW_PASS * (xx + yy - LOW_PASS)
             visible = ONE / (ONE + math.exp(-opacity[i]))
+            if antialiased:
+                visible *= math.sqrt(sharp / det)
             reach = TWO * math.log(np.float32(255.0) * visible)
             mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
             if not (visible >= ZERO and det < np.inf and abs(mean_x) < np.inf and abs(mean_y) < np.inf):
@@ -194,6 +201,10 @@ def project_forward(
                 red += basis[k] * sh[i, k, 0]
                 green += basis[k] * sh[i, k, 1]
                 blue += basis[k] * sh[i, k, 2]
+            for k in range(strains):
+                red += strain[f, k] * strain_color[i, k, 0]
+                green += strain[f, k] * strain_color[i, k, 1]
+                blue += strain[f, k] * strain_color[i, k, 2]
             # Before the cut at zero, which would turn NaN and −∞ into black.
             if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
                 rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
@@ -220,11 +231,28 @@ def _tan_limits(fx, fy, cx, cy, width, height):
     return low_x, high_x, low_y, high_y
 
 
+@jit
+def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
+    """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in `project_forward`."""
+    low = LOW_PASS
+    sharp = m01 * m01 + m02 * m02 + m12 * m12
+    xx, yy = a00 * a00 + a01 * a01 + a02 * a02, a10 * a10 + a11 * a11 + a12 * a12
+    det = sharp + low * (xx + yy + low)
+    # v holds sqrt(sharp) as a factor, so the quotient stays finite where a splat has no area and v = 0.
+    w = v * low * (xx + yy + low) / (det * max(sharp, np.float32(1e-30)))
+    u = -v * low / det
+    return (
+        w * (m01 * a11 + m02 * a12) + u * a00, w * (-m01 * a10 + m12 * a12) + u * a01,
+        w * (-m02 * a10 - m12 * a11) + u * a02, w * (-m01 * a01 - m02 * a02) + u * a10,
+        w * (m01 * a00 - m12 * a02) + u * a11, w * (m02 * a00 + m12 * a01) + u * a12,
+    )  # fmt: skip
+
+
 @parallel_jit
 def project_backward(
-    xyz, rotation, log_scale, opacity, sh, degree, face, origin, matrix, to_world, lens, size, depth_as_colour,
-    projected, visible, slot_start, slot_count, grads, add,
-    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, screen,
+    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
+    depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
+    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of v_* (or add it); the counterpart of `project_forward`.
 
@@ -233,6 +261,7 @@ def project_backward(
     image (what density control asks for), written for each listed splat.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
     chunk = 256
     for block in prange((len(visible) + chunk - 1) // chunk):
@@ -246,6 +275,7 @@ def project_backward(
                 v_log_scale[i, :] = ZERO
                 v_opacity[i] = ZERO
                 v_sh[i, :, :] = ZERO
+                v_strain_color[i, :, :] = ZERO
             for c in range(PROJECTED):
                 g[c] = ZERO
             for slot in range(slot_start[i], slot_start[i] + slot_count[i]):
@@ -290,6 +320,12 @@ def project_backward(
             vw = -TWO * inverse_yy * inverse_yy * g[PRECISION_Y]
             v00, v01, v02 = vs * e0 + vk * a10, vs * e1 + vk * a11, vs * e2 + vk * a12
             v10, v11, v12 = vk * e0 + vw * a10, vk * e1 + vw * a11, vk * e2 + vw * a12
+            if antialiased:
+                b00, b01, b02, b10, b11, b12 = _compensation_gradient(
+                    g[OPACITY] * projected[i, OPACITY], a00, a01, a02, a10, a11, a12, m01, m02, m12
+                )
+                v00, v01, v02 = v00 + b00, v01 + b01, v02 + b02
+                v10, v11, v12 = v10 + b10 + shear * b00, v11 + b11 + shear * b01, v12 + b12 + shear * b02
             by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
             v_log_scale[i, 0] += by0
             v_log_scale[i, 1] += by1
@@ -342,6 +378,10 @@ def project_backward(
                     v_sh[i, k, 1] += basis[k] * gg
                     v_sh[i, k, 2] += basis[k] * gb
                     weight[k] = gr * sh[i, k, 0] + gg * sh[i, k, 1] + gb * sh[i, k, 2]
+                for k in range(strains):
+                    v_strain_color[i, k, 0] += strain[f, k] * gr
+                    v_strain_color[i, k, 1] += strain[f, k] * gg
+                    v_strain_color[i, k, 2] += strain[f, k] * gb
                 ex, ey, ez = _basis_gradient(degree, dx, dy, dz, weight)
                 along = ex * dx + ey * dy + ez * dz
                 ex, ey, ez = (ex - along * dx) * rd, (ey - along * dy) * rd, (ez - along * dz) * rd

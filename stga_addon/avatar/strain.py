@@ -1,0 +1,82 @@
+"""How a triangle deforms, as numbers that a splat's colour can follow: wrinkles darken where skin is compressed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+STRAINS = 3
+"""Numbers per triangle: the stretch along two directions of its plane, and the shear between them."""
+GAIN, LIMIT = 5.0, 2.0
+"""A stretch of 18 % (E = 0.2) counts as one; beyond ±2 colours follow no further."""
+SMALLEST = 1e-24
+"""Squared normal (m⁴) of a neutral triangle below which it has no area to be deformed: edges of a micrometre."""
+
+
+@dataclass(frozen=True)
+class StrainBasis:
+    """What strain needs of the neutral mesh, computed once: V vertices, F triangles.
+
+    faces (F, 3); gram (F, 3) squared lengths and product of the neutral edges: d1·d1, d1·d2, d2·d2.
+    to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
+    to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear.
+    touching (V,): how many triangles touch a vertex, at least one.
+    """
+
+    faces: np.ndarray
+    gram: np.ndarray
+    to_tensor: np.ndarray
+    to_plane: np.ndarray
+    touching: np.ndarray
+
+
+def strain_basis(neutral: np.ndarray, faces: np.ndarray) -> StrainBasis:
+    """The basis of a neutral mesh: neutral (V, 3) metres, faces (F, 3). A triangle without area stays unstrained."""
+    d1, d2 = _edges(neutral, faces)
+    normal = np.cross(d1, d2)
+    square = _dot(normal, normal)
+    flat = square < SMALLEST
+    inverse = np.where(flat, 0.0, 1 / np.where(flat, 1.0, square))[:, None]
+    # The dual edges: a1·d1 = a2·d2 = 1, a1·d2 = a2·d1 = 0, both in the triangle's plane.
+    a1, a2 = np.cross(d2, normal) * inverse, np.cross(normal, d1) * inverse
+    along = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, _dot(d1, d1))))[:, None] * d1
+    across = np.cross(normal, along) * np.sqrt(inverse)
+    twice = np.array([1.0, 1, 1, 2, 2, 2])  # the three mixed components stand for two of a tensor's nine
+    return StrainBasis(
+        faces=faces,
+        gram=np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1),
+        to_tensor=np.stack([_product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2], 1),
+        to_plane=twice * np.stack([_product(along, along), _product(across, across), _product(along, across)], 1),
+        touching=np.maximum(np.bincount(faces.ravel(), minlength=len(neutral)), 1),
+    )
+
+
+def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
+    """Strain (F, 3) float32 of every triangle of a posed mesh: clip(5·E, ±2), zero for the neutral mesh moved rigidly.
+
+    vertices (V, 3) metres. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the posed mesh, averaged
+    over the triangles that touch a triangle (each vertex's mean over its triangles, then the mean of its three
+    vertices), so that colours do not jump at edges. Columns: along the neutral triangle's first edge, across it, shear.
+    """
+    e1, e2 = _edges(vertices, basis.faces)
+    change = np.stack([_dot(e1, e1), _dot(e1, e2), _dot(e2, e2)], -1) - basis.gram
+    tensor = np.einsum("fk,fkd->fd", change, basis.to_tensor)
+    corner = basis.faces.ravel()
+    at_vertex = [np.bincount(corner, np.repeat(column, 3), len(basis.touching)) for column in tensor.T]
+    averaged = (np.stack(at_vertex, -1) / basis.touching[:, None])[basis.faces].mean(1)
+    strain = np.einsum("fd,fkd->fk", averaged, basis.to_plane)
+    return np.asarray(np.clip(GAIN * strain, -LIMIT, LIMIT), np.float32)
+
+
+def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.asarray(vertices, np.float64)[faces]
+    return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.asarray(np.einsum("fi,fi->f", a, b))
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The symmetric part (F, 6) of the outer product of vectors (F, 3): xx, yy, zz, xy, yz, zx."""
+    outer = (a[:, :, None] * b[:, None, :] + b[:, :, None] * a[:, None, :]) / 2
+    return np.asarray(outer[:, [0, 1, 2, 0, 1, 2], [0, 1, 2, 1, 2, 0]])

@@ -1,0 +1,122 @@
+"""Strain of a triangle against what the deformation gradient says, and colours that follow it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.strain import face_strain, strain_basis
+from stga_addon.capture.camera import Camera
+from stga_addon.raster.draw import draw_avatar, draw_splats
+
+FACES = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]], np.int32)
+
+
+def sheet(seed: int = 0) -> np.ndarray:
+    """Five vertices of four triangles in space, edges of a centimetre."""
+    flat = np.array([[0, 0, 0], [1, 0.1, 0], [0.4, 1, 0], [1.3, 1.2, 0], [-0.2, 1.8, 0]])
+    bumpy = flat + np.random.default_rng(seed).normal(0, 0.1, flat.shape)
+    return 0.01 * bumpy
+
+
+def coloured(neutral: np.ndarray, seed: int = 0) -> Avatar:
+    splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
+    color = np.random.default_rng(seed).normal(0, 0.2, (len(splats), 3, 3)).astype(np.float32)
+    return Avatar(replace(splats, strain_color=color), "stga", neutral.astype(np.float32), FACES)
+
+
+def test_an_affine_map_strains_by_its_own_tensor() -> None:
+    """Catches a wrong dual basis, a factor two, transposed maps: E = ½(FᵀF − I) is known, and every triangle's."""
+    neutral, rng = sheet(), np.random.default_rng(1)
+    deformation = np.eye(3) + rng.normal(0, 0.04, (3, 3))
+    tensor = (deformation.T @ deformation - np.eye(3)) / 2
+    p0, p1, p2 = (neutral[FACES[:, c]] for c in range(3))
+    along = (p1 - p0) / np.linalg.norm(p1 - p0, axis=1, keepdims=True)
+    normal = np.cross(p1 - p0, p2 - p0)
+    across = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), along)
+    # In each triangle's plane; averaged over touching ones the planes differ, so one triangle at a time.
+    for n in range(len(FACES)):
+        strain = face_strain(strain_basis(neutral, FACES[n : n + 1]), neutral @ deformation.T + [3, 1, 2])[0]
+        expected = [along[n] @ tensor @ along[n], across[n] @ tensor @ across[n], along[n] @ tensor @ across[n]]
+        np.testing.assert_allclose(strain, 5 * np.array(expected), atol=1e-6)
+        assert np.abs(strain).max() > 0.05
+
+
+def test_neighbours_are_averaged_as_vertices_then_triangles() -> None:
+    """Catches weights: a vertex is the plain mean of its triangles, a triangle that of its vertices."""
+    neutral = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1, 0], [1, 1, 0]]) * 0.01
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    posed = neutral.copy()
+    posed[3, 0] += 0.002  # only the second triangle, along x
+    alone = [face_strain(strain_basis(neutral, faces[n : n + 1]), posed)[0].astype(np.float64) for n in range(2)]
+    assert not alone[0].any()
+    assert alone[1].any()
+    both = face_strain(strain_basis(neutral, faces), posed)
+    # Triangle 0: vertex 0 is its own, vertices 1 and 2 half the other's: (0 + ½ + ½) / 3 of the other's tensor.
+    first, second = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+    edge = np.array([1.0, -1, 0]) / np.sqrt(2)
+    side = np.array([1.0, 1, 0]) / np.sqrt(2)
+    tensor = alone[1][0] * np.outer(edge, edge) + alone[1][1] * np.outer(side, side)
+    tensor += alone[1][2] * (np.outer(edge, side) + np.outer(side, edge))
+    np.testing.assert_allclose(both[1], alone[1] * 2 / 3, atol=1e-6)
+    expected = np.array([first @ tensor @ first, second @ tensor @ second, first @ tensor @ second]) / 3
+    np.testing.assert_allclose(both[0], expected, atol=1e-6)
+
+
+def test_rigid_motion_far_away_does_not_strain() -> None:
+    """Catches strain of pose instead of expression, and cancellation 100 m from the origin."""
+    neutral = sheet()
+    turned = neutral @ Rotation.random(random_state=2).as_matrix().T + [100, -50, 20]
+    assert np.abs(face_strain(strain_basis(neutral, FACES), turned)).max() < 1e-6
+
+
+@pytest.mark.parametrize("broken", ["point", "line", "posed point", "torn"])
+def test_broken_triangles_stay_finite(broken: str) -> None:
+    """Catches division by an area of zero, and colours that explode with a stretch of a thousand."""
+    neutral, posed = sheet(), sheet(3)
+    if broken == "point":
+        neutral[FACES[1]] = neutral[2]
+    if broken == "line":
+        neutral[3] = (neutral[1] + neutral[2]) / 2
+    if broken == "posed point":
+        posed[:] = 0
+    if broken == "torn":
+        posed *= 1000
+    strain = face_strain(strain_basis(neutral, FACES), posed)
+    assert np.isfinite(strain).all()
+    assert np.abs(strain).max() <= 2
+    if broken in ("point", "line"):
+        assert not strain[1].any()
+
+
+def test_the_file_keeps_it_and_reads_avatars_without(tmp_path: Path) -> None:
+    """Catches strain colours lost in the file, and files from before they existed being refused."""
+    avatar = coloured(sheet())
+    write_avatar(tmp_path / "a.npz", avatar)
+    np.testing.assert_array_equal(read_avatar(tmp_path / "a.npz").splats.strain_color, avatar.splats.strain_color)
+    with np.load(tmp_path / "a.npz") as arrays:
+        np.savez(tmp_path / "old.npz", **{n: a for n, a in arrays.items() if n != "strain_color"})
+    assert read_avatar(tmp_path / "old.npz").splats.strain_color.shape == (len(avatar.splats), 0, 3)
+
+
+def test_baking_keeps_the_picture() -> None:
+    """Catches a world PLY that forgets the colours of a deformed frame, or counts them twice."""
+    neutral = sheet()
+    avatar, posed = coloured(neutral), sheet(4)
+    pose = np.eye(4)
+    pose[:3, 3] = [-0.005, -0.008, 0.1]
+    camera = Camera(48, 48, 150.0, 150.0, 24.0, 24.0, pose)
+    white = (1.0, 1.0, 1.0)
+    drawn = draw_avatar(avatar, posed, camera, white)
+    baked = to_world(avatar.splats, avatar.frames(posed))
+    assert baked.strain_color.shape[1] == 0
+    np.testing.assert_allclose(draw_splats(baked, camera, white), drawn, atol=2e-5)
+    plain = replace(avatar, splats=replace(avatar.splats, strain_color=np.zeros_like(avatar.splats.strain_color)))
+    assert np.abs(draw_avatar(plain, posed, camera, white) - drawn).max() > 0.05
+    undeformed = face_frames(posed, FACES, neutral)
+    np.testing.assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
