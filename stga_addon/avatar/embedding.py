@@ -1,6 +1,7 @@
 """Where a splat stands when its triangle moves: one local frame per triangle (STGA, embedding)."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,19 +23,23 @@ UPRIGHT = 0.8  # a unit vector with a larger z counts as upright when a perpendi
 class FaceFrames:
     """Per triangle: world = scale · rotation @ local + origin.
 
-    origin (F, 3) metres, rotation (F, 3, 3) proper, quaternion (F, 4) wxyz of the same rotation, scale (F,).
+    origin (F, 3) metres, rotation (F, 3, 3) proper, scale (F,).
     strain (F, S) float32: what colours follow (`avatar.strain`), S = 3, or 0 where nobody asked for it.
     """
 
     origin: np.ndarray
     rotation: np.ndarray
-    quaternion: np.ndarray
     scale: np.ndarray
     strain: np.ndarray
 
+    @cached_property
+    def quaternion(self) -> np.ndarray:
+        """(F, 4) wxyz of the same rotation; what bakes splats needs it, rendering does not."""
+        return quaternion_from_matrix(self.rotation)
+
 
 NO_STRAIN = np.zeros((1, 0), np.float32)
-WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 0, 0, 0]]), np.ones(1), NO_STRAIN)
+WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.ones(1), NO_STRAIN)
 """The single frame of a world-space set of splats (face 0)."""
 
 
@@ -56,7 +61,7 @@ def face_frames(
     """
     corners = np.asarray(vertices, np.float64)[faces]
     p0, p1, p2 = corners[:, 0], corners[:, 1], corners[:, 2]
-    origin = corners.mean(1)
+    origin = (p0 + p1 + p2) / 3
     if convention == "stga":
         # p0 − origin without the origin, which rounds: it must vanish where the corners coincide.
         first, normal = _orthonormal(((p0 - p1) + (p0 - p2)) / 3, corners)
@@ -73,7 +78,7 @@ def face_frames(
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     deformed = np.zeros((len(faces), 0), np.float32) if strain is None else face_strain(strain, vertices)
-    return FaceFrames(origin, rotation, quaternion_from_matrix(rotation), scale, deformed)
+    return FaceFrames(origin, rotation, scale, deformed)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -174,12 +179,19 @@ def _normal(corners: np.ndarray) -> np.ndarray:
 
 
 def _length(v: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.norm(v, axis=-1))
+    return np.asarray(np.sqrt(_dot(v, v)))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    # NumPy sums over a last axis of three many times slower than einsum.
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def _longest_squared(corners: np.ndarray) -> np.ndarray:
     """Square (F,) of the longest edge of triangles (F, 3, 3)."""
-    return np.asarray(np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=-1), axis=-1))
+    edges = (corners[:, b] - corners[:, a] for a, b in ((0, 1), (1, 2), (2, 0)))
+    first, second, third = (_dot(edge, edge) for edge in edges)
+    return np.asarray(np.maximum(np.maximum(first, second), third))
 
 
 def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +209,7 @@ def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
     upright = np.abs(first[:, 2:]) > UPRIGHT
     substitute = np.cross(first, np.where(upright, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
     normal = np.where(no_normal, substitute, normal)
-    normal = normal - np.sum(normal * first, axis=-1, keepdims=True) * first
+    normal = normal - _dot(normal, first)[:, None] * first
     return first, normal / _length(normal)[:, None]
 
 

@@ -1,6 +1,6 @@
 """A thread that holds the next views ready, so that training never waits for the disk."""
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from threading import Condition, Thread
@@ -20,6 +20,7 @@ class ViewLoader:
 
     views   drawn in the loader's thread, only as far ahead as the queue reaches; may be endless, must not block
     scale   position in `views` -> size in (0, 1], for coarse-to-fine; the yielded view's camera is scaled alike
+    correct   (view, image, mask) -> the image to yield instead, applied once to each that is read; None for none
     queue_bytes, cache_bytes  bounds on what is ready ahead (at least one view), and on decoded views kept for
             their next visit; memory depends on these, not on how long the sequence is
     waited_s  seconds that the consumer has waited so far
@@ -34,10 +35,11 @@ class ViewLoader:
         scale: Callable[[int], float] = lambda position: 1.0,
         background: tuple[int, int, int] = WHITE,
         queue_bytes: int = 64 << 20,
-        cache_bytes: int = 512 << 20,
+        cache_bytes: int = 256 << 20,
+        correct: Callable[[View, np.ndarray, np.ndarray | None], np.ndarray] | None = None,
     ) -> None:
         self.waited_s = 0.0
-        self._scale, self._background = scale, background
+        self._scale, self._background, self._correct = scale, background, correct
         self._queue_bytes = queue_bytes
         self._cache = _Cache(cache_bytes)
         self._ready: deque[Loaded] = deque()
@@ -114,6 +116,8 @@ class ViewLoader:
         kept = self._cache.get(key)
         if kept is None:
             kept = read_view(view, scale, self._background)
+            if self._correct is not None:
+                kept = kept[0], self._correct(*kept), kept[2]
             for array in kept[1:]:
                 if isinstance(array, np.ndarray):
                     array.setflags(write=False)
@@ -125,23 +129,26 @@ Key = tuple[Path, Path | None, int, int, float]
 
 
 class _Cache:
-    """The views used latest, up to a number of bytes."""
+    """The views of one size that came first, up to a number of bytes.
+
+    Views are visited in random order, every one once an epoch: what is thrown out to make room would be asked for
+    sooner than what replaces it, so nothing is thrown out until another size is asked for.
+    """
 
     def __init__(self, limit: int) -> None:
-        self._limit, self._held = limit, 0
-        self._entries: OrderedDict[Key, Loaded] = OrderedDict()
+        self._limit, self._held, self._scale = limit, 0, 1.0
+        self._entries: dict[Key, Loaded] = {}
 
     def get(self, key: Key) -> Loaded | None:
-        if key not in self._entries:
-            return None
-        self._entries.move_to_end(key)
-        return self._entries[key]
+        return self._entries.get(key)
 
     def put(self, key: Key, loaded: Loaded) -> None:
-        self._entries[key] = loaded
-        self._held += _size(loaded)
-        while self._held > self._limit:
-            self._held -= _size(self._entries.popitem(last=False)[1])
+        if key[-1] != self._scale:
+            self.clear()
+            self._scale = key[-1]
+        if self._held + _size(loaded) <= self._limit:
+            self._entries[key] = loaded
+            self._held += _size(loaded)
 
     def clear(self) -> None:
         self._entries.clear()

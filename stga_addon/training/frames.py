@@ -8,7 +8,7 @@ from ..avatar.embedding import FaceFrames, face_frames
 from ..avatar.strain import strain_basis
 from ..capture.model import Capture
 
-KEPT = 64
+KEPT = 12
 """Timesteps whose frames stay in memory: about 1 MB each for 10,000 triangles."""
 
 

@@ -70,12 +70,21 @@ def test_small_capture_is_decoded_once(views: list[View], decoded: list[str]) ->
 
 
 def test_cache_is_bounded(views: list[View], decoded: list[str]) -> None:
-    """Catches a cache that outgrows its limit, or drops the view used latest instead of the oldest."""
-    sequence = [views[i] for i in (0, 1, 0, 2, 0, 1)]
+    """Catches a cache that outgrows its limit, or throws out what the next epoch asks for."""
+    sequence = [views[i] for i in (0, 1, 0, 2, 2, 1)]
     with ViewLoader(sequence, cache_bytes=2 * VIEW_BYTES) as loader:
         list(loader)
-    # 2 drives out 1, which is older than 0; so 1 is decoded again and 0 never is.
-    assert decoded == [views[i].name for i in (0, 1, 2, 1)]
+    # There is room for 0 and 1; 2 is decoded whenever it comes, and drives nothing out.
+    assert decoded == [views[i].name for i in (0, 1, 2, 2)]
+
+
+def test_another_size_makes_room(views: list[View], decoded: list[str]) -> None:
+    """Catches a coarse-to-fine run whose small images fill the cache for good."""
+    sizes = [0.5, 0.5, 1.0, 1.0]
+    with ViewLoader([views[0]] * 4, scale=sizes.__getitem__, cache_bytes=VIEW_BYTES) as loader:
+        shapes = [image.shape[0] for _, image, _ in loader]
+    assert shapes == [factory.HEIGHT // 2] * 2 + [factory.HEIGHT] * 2
+    assert len(decoded) == 2
 
 
 def test_queue_is_bounded(views: list[View], decoded: list[str]) -> None:

@@ -16,7 +16,7 @@ from stga_addon.training.state import new_state
 from .scenes import NAMES, facing, random_cotangents
 
 HEIGHT, WIDTH = 30, 33
-RATE = dict.fromkeys((*NAMES, "sh_rest"), 1e-3)
+RATE = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
 
 
 def image_of(kind: str, value: float) -> np.ndarray:

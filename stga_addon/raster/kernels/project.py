@@ -28,6 +28,8 @@ LOW_PASS = np.float32(0.3)
 """Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
 NEAR = np.float32(0.01)
 LIFT = np.float32(2.0**90)
+CHUNK = 256
+"""Splats that a thread takes at a time."""
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 SH = np.array(
     [
@@ -131,94 +133,107 @@ def project_forward(
     tile bounds x0, y0, x1, y1: all 0 for a splat that cannot be seen, all −1 for one that is not finite or would be
     wider than float32 can square (some 1e9 pixels).
     """
+    # The loop's body is a function of its own, because Numba takes twice as long to compile it inside a parallel one.
+    for block in prange((len(xyz) + CHUNK - 1) // CHUNK):
+        _project_rows(
+            block * CHUNK, min(len(xyz), (block + 1) * CHUNK),
+            xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens,
+            size, depth_as_colour, antialiased, projected, depth, extent_y, rect,
+        )  # fmt: skip
+
+
+@jit
+def _project_rows(
+    begin, end,
+    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
+    depth_as_colour, antialiased, projected, depth, extent_y, rect,
+):  # fmt: skip
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     width, height = size[0], size[1]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, width, height)
-    chunk = 256
-    for block in prange((len(xyz) + chunk - 1) // chunk):
-        basis = np.empty(16, np.float32)
-        for i in range(block * chunk, min(len(xyz), (block + 1) * chunk)):
-            rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = 0
-            f = face[i]
-            lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            x = matrix[f, 0, 0] * lx + matrix[f, 0, 1] * ly + matrix[f, 0, 2] * lz + origin[f, 0]
-            y = matrix[f, 1, 0] * lx + matrix[f, 1, 1] * ly + matrix[f, 1, 2] * lz + origin[f, 1]
-            z = matrix[f, 2, 0] * lx + matrix[f, 2, 1] * ly + matrix[f, 2, 2] * lz + origin[f, 2]
-            if z < NEAR:
-                continue
-            rz = ONE / z
-            tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
-            q0, q1, q2, q3, _ = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
-            # U = J · matrix, the affine map from the local frame to pixels.
-            jx, jy = fx * rz, fy * rz
-            u00 = jx * (matrix[f, 0, 0] - tx * matrix[f, 2, 0])
-            u01 = jx * (matrix[f, 0, 1] - tx * matrix[f, 2, 1])
-            u02 = jx * (matrix[f, 0, 2] - tx * matrix[f, 2, 2])
-            u10 = jy * (matrix[f, 1, 0] - ty * matrix[f, 2, 0])
-            u11 = jy * (matrix[f, 1, 1] - ty * matrix[f, 2, 1])
-            u12 = jy * (matrix[f, 1, 2] - ty * matrix[f, 2, 2])
-            s0, s1, s2 = math.exp(log_scale[i, 0]), math.exp(log_scale[i, 1]), math.exp(log_scale[i, 2])
-            a00, a01 = (u00 * r00 + u01 * r10 + u02 * r20) * s0, (u00 * r01 + u01 * r11 + u02 * r21) * s1
-            a02 = (u00 * r02 + u01 * r12 + u02 * r22) * s2
-            a10, a11 = (u10 * r00 + u11 * r10 + u12 * r20) * s0, (u10 * r01 + u11 * r11 + u12 * r21) * s1
-            a12 = (u10 * r02 + u11 * r12 + u12 * r22) * s2
-            xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS
-            xy = a00 * a10 + a01 * a11 + a02 * a12
-            yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS
-            # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or below.
-            m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
-            sharp = m01 * m01 + m02 * m02 + m12 * m12
-            det = sharp + LOW_PASS * (xx + yy - LOW_PASS)
-            visible = ONE / (ONE + math.exp(-opacity[i]))
-            if antialiased:
-                visible *= math.sqrt(sharp / det)
-            reach = TWO * math.log(np.float32(255.0) * visible)
-            mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
-            if not (visible >= ZERO and det < np.inf and abs(mean_x) < np.inf and abs(mean_y) < np.inf):
-                rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
-                continue
-            if reach <= ZERO:
-                continue
-            ex, ey = math.sqrt(reach * xx), math.sqrt(reach * yy)
-            limit_x, limit_y = np.float32(tiles_x), np.float32(tiles_y)
-            size_ = np.float32(TILE)
-            x0 = np.int32(min(limit_x, max(ZERO, np.floor((mean_x - ex) / size_))))
-            x1 = np.int32(min(limit_x, max(ZERO, np.ceil((mean_x + ex) / size_))))
-            y0 = np.int32(min(limit_y, max(ZERO, np.floor((mean_y - ey) / size_))))
-            y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
-            if x1 <= x0 or y1 <= y0:
-                continue
-            rd = ONE / math.sqrt(x * x + y * y + z * z)
-            dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
-            dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
-            dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
-            _basis(degree, dx, dy, dz, basis)
-            red = green = blue = HALF
-            for k in range((degree + 1) * (degree + 1)):
-                red += basis[k] * sh[i, k, 0]
-                green += basis[k] * sh[i, k, 1]
-                blue += basis[k] * sh[i, k, 2]
-            for k in range(strains):
-                red += strain[f, k] * strain_color[i, k, 0]
-                green += strain[f, k] * strain_color[i, k, 1]
-                blue += strain[f, k] * strain_color[i, k, 2]
-            # Before the cut at zero, which would turn NaN and −∞ into black.
-            if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
-                rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
-                continue
-            red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
-            if depth_as_colour:
-                red, green, blue = z, ZERO, ZERO
-            rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3] = x0, y0, x1, y1
-            depth[i] = z
-            extent_y[i] = ey
-            projected[i, MEAN_X], projected[i, MEAN_Y] = mean_x, mean_y
-            projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y] = yy / det, xy / yy, ONE / yy
-            projected[i, OPACITY] = visible
-            projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
+    basis = np.empty(16, np.float32)
+    for i in range(begin, end):
+        rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = 0
+        f = face[i]
+        lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        x = matrix[f, 0, 0] * lx + matrix[f, 0, 1] * ly + matrix[f, 0, 2] * lz + origin[f, 0]
+        y = matrix[f, 1, 0] * lx + matrix[f, 1, 1] * ly + matrix[f, 1, 2] * lz + origin[f, 1]
+        z = matrix[f, 2, 0] * lx + matrix[f, 2, 1] * ly + matrix[f, 2, 2] * lz + origin[f, 2]
+        if z < NEAR:
+            continue
+        rz = ONE / z
+        tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
+        q0, q1, q2, q3, _ = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
+        # U = J · matrix, the affine map from the local frame to pixels.
+        jx, jy = fx * rz, fy * rz
+        u00 = jx * (matrix[f, 0, 0] - tx * matrix[f, 2, 0])
+        u01 = jx * (matrix[f, 0, 1] - tx * matrix[f, 2, 1])
+        u02 = jx * (matrix[f, 0, 2] - tx * matrix[f, 2, 2])
+        u10 = jy * (matrix[f, 1, 0] - ty * matrix[f, 2, 0])
+        u11 = jy * (matrix[f, 1, 1] - ty * matrix[f, 2, 1])
+        u12 = jy * (matrix[f, 1, 2] - ty * matrix[f, 2, 2])
+        s0, s1, s2 = math.exp(log_scale[i, 0]), math.exp(log_scale[i, 1]), math.exp(log_scale[i, 2])
+        a00, a01 = (u00 * r00 + u01 * r10 + u02 * r20) * s0, (u00 * r01 + u01 * r11 + u02 * r21) * s1
+        a02 = (u00 * r02 + u01 * r12 + u02 * r22) * s2
+        a10, a11 = (u10 * r00 + u11 * r10 + u12 * r20) * s0, (u10 * r01 + u11 * r11 + u12 * r21) * s1
+        a12 = (u10 * r02 + u11 * r12 + u12 * r22) * s2
+        xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS
+        xy = a00 * a10 + a01 * a11 + a02 * a12
+        yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS
+        # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or below.
+        m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+        sharp = m01 * m01 + m02 * m02 + m12 * m12
+        det = sharp + LOW_PASS * (xx + yy - LOW_PASS)
+        visible = ONE / (ONE + math.exp(-opacity[i]))
+        if antialiased:
+            visible *= math.sqrt(sharp / det)
+        reach = TWO * math.log(np.float32(255.0) * visible)
+        mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
+        if not (visible >= ZERO and det < np.inf and abs(mean_x) < np.inf and abs(mean_y) < np.inf):
+            rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
+            continue
+        if reach <= ZERO:
+            continue
+        ex, ey = math.sqrt(reach * xx), math.sqrt(reach * yy)
+        limit_x, limit_y = np.float32(tiles_x), np.float32(tiles_y)
+        size_ = np.float32(TILE)
+        x0 = np.int32(min(limit_x, max(ZERO, np.floor((mean_x - ex) / size_))))
+        x1 = np.int32(min(limit_x, max(ZERO, np.ceil((mean_x + ex) / size_))))
+        y0 = np.int32(min(limit_y, max(ZERO, np.floor((mean_y - ey) / size_))))
+        y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
+        if x1 <= x0 or y1 <= y0:
+            continue
+        rd = ONE / math.sqrt(x * x + y * y + z * z)
+        dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
+        dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
+        dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
+        _basis(degree, dx, dy, dz, basis)
+        red = green = blue = HALF
+        for k in range((degree + 1) * (degree + 1)):
+            red += basis[k] * sh[i, k, 0]
+            green += basis[k] * sh[i, k, 1]
+            blue += basis[k] * sh[i, k, 2]
+        for k in range(strains):
+            red += strain[f, k] * strain_color[i, k, 0]
+            green += strain[f, k] * strain_color[i, k, 1]
+            blue += strain[f, k] * strain_color[i, k, 2]
+        # Before the cut at zero, which would turn NaN and −∞ into black.
+        if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
+            rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
+            continue
+        red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
+        if depth_as_colour:
+            red, green, blue = z, ZERO, ZERO
+        rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3] = x0, y0, x1, y1
+        depth[i] = z
+        extent_y[i] = ey
+        projected[i, MEAN_X], projected[i, MEAN_Y] = mean_x, mean_y
+        projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y] = yy / det, xy / yy, ONE / yy
+        projected[i, OPACITY] = visible
+        projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
 
 
 @jit
@@ -260,134 +275,148 @@ def project_backward(
     lie in grads (P, 9). screen (N,): length of the gradient with respect to the projected centre in units of half the
     image (what density control asks for), written for each listed splat.
     """
+    for block in prange((len(visible) + CHUNK - 1) // CHUNK):
+        _differentiate_rows(
+            block * CHUNK, min(len(visible), (block + 1) * CHUNK),
+            xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens,
+            size, depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
+            v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
+        )  # fmt: skip
+
+
+@jit
+def _differentiate_rows(
+    begin, end,
+    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
+    depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
+    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
+):  # fmt: skip
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
-    chunk = 256
-    for block in prange((len(visible) + chunk - 1) // chunk):
-        basis, weight = np.empty(16, np.float32), np.empty(16, np.float32)
-        g = np.empty(PROJECTED, np.float32)
-        for n in range(block * chunk, min(len(visible), (block + 1) * chunk)):
-            i = visible[n]
-            if not add:
-                v_xyz[i, :] = ZERO
-                v_rotation[i, :] = ZERO
-                v_log_scale[i, :] = ZERO
-                v_opacity[i] = ZERO
-                v_sh[i, :, :] = ZERO
-                v_strain_color[i, :, :] = ZERO
+    basis, weight = np.empty(16, np.float32), np.empty(16, np.float32)
+    g = np.empty(PROJECTED, np.float32)
+    for n in range(begin, end):
+        i = visible[n]
+        if not add:
+            v_xyz[i, :] = ZERO
+            v_rotation[i, :] = ZERO
+            v_log_scale[i, :] = ZERO
+            v_opacity[i] = ZERO
+            v_sh[i, :, :] = ZERO
+            v_strain_color[i, :, :] = ZERO
+        for c in range(PROJECTED):
+            g[c] = ZERO
+        for slot in range(slot_start[i], slot_start[i] + slot_count[i]):
             for c in range(PROJECTED):
-                g[c] = ZERO
-            for slot in range(slot_start[i], slot_start[i] + slot_count[i]):
-                for c in range(PROJECTED):
-                    g[c] += grads[slot, c]
-            half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]
-            screen[i] = math.sqrt(half_x * half_x + half_y * half_y)
-            f = face[i]
-            lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            c00, c01, c02 = matrix[f, 0, 0], matrix[f, 0, 1], matrix[f, 0, 2]
-            c10, c11, c12 = matrix[f, 1, 0], matrix[f, 1, 1], matrix[f, 1, 2]
-            c20, c21, c22 = matrix[f, 2, 0], matrix[f, 2, 1], matrix[f, 2, 2]
-            x = c00 * lx + c01 * ly + c02 * lz + origin[f, 0]
-            y = c10 * lx + c11 * ly + c12 * lz + origin[f, 1]
-            z = c20 * lx + c21 * ly + c22 * lz + origin[f, 2]
-            rz = ONE / z
-            slope_x, slope_y = x * rz, y * rz
-            tx, ty = min(high_x, max(low_x, slope_x)), min(high_y, max(low_y, slope_y))
-            q0, q1, q2, q3, rn = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
-            jx, jy = fx * rz, fy * rz
-            u00, u01, u02 = jx * (c00 - tx * c20), jx * (c01 - tx * c21), jx * (c02 - tx * c22)
-            u10, u11, u12 = jy * (c10 - ty * c20), jy * (c11 - ty * c21), jy * (c12 - ty * c22)
-            s0, s1, s2 = math.exp(log_scale[i, 0]), math.exp(log_scale[i, 1]), math.exp(log_scale[i, 2])
-            w00, w01 = u00 * r00 + u01 * r10 + u02 * r20, u00 * r01 + u01 * r11 + u02 * r21
-            w02 = u00 * r02 + u01 * r12 + u02 * r22
-            w10, w11 = u10 * r00 + u11 * r10 + u12 * r20, u10 * r01 + u11 * r11 + u12 * r21
-            w12 = u10 * r02 + u11 * r12 + u12 * r22
-            a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
+                g[c] += grads[slot, c]
+        half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]
+        screen[i] = math.sqrt(half_x * half_x + half_y * half_y)
+        f = face[i]
+        lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        c00, c01, c02 = matrix[f, 0, 0], matrix[f, 0, 1], matrix[f, 0, 2]
+        c10, c11, c12 = matrix[f, 1, 0], matrix[f, 1, 1], matrix[f, 1, 2]
+        c20, c21, c22 = matrix[f, 2, 0], matrix[f, 2, 1], matrix[f, 2, 2]
+        x = c00 * lx + c01 * ly + c02 * lz + origin[f, 0]
+        y = c10 * lx + c11 * ly + c12 * lz + origin[f, 1]
+        z = c20 * lx + c21 * ly + c22 * lz + origin[f, 2]
+        rz = ONE / z
+        slope_x, slope_y = x * rz, y * rz
+        tx, ty = min(high_x, max(low_x, slope_x)), min(high_y, max(low_y, slope_y))
+        q0, q1, q2, q3, rn = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
+        jx, jy = fx * rz, fy * rz
+        u00, u01, u02 = jx * (c00 - tx * c20), jx * (c01 - tx * c21), jx * (c02 - tx * c22)
+        u10, u11, u12 = jy * (c10 - ty * c20), jy * (c11 - ty * c21), jy * (c12 - ty * c22)
+        s0, s1, s2 = math.exp(log_scale[i, 0]), math.exp(log_scale[i, 1]), math.exp(log_scale[i, 2])
+        w00, w01 = u00 * r00 + u01 * r10 + u02 * r20, u00 * r01 + u01 * r11 + u02 * r21
+        w02 = u00 * r02 + u01 * r12 + u02 * r22
+        w10, w11 = u10 * r00 + u11 * r10 + u12 * r20, u10 * r01 + u11 * r11 + u12 * r21
+        w12 = u10 * r02 + u11 * r12 + u12 * r22
+        a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
 
-            # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0 − shear·a1,
-            # ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy: the gradient with respect to
-            # a0 is v0, that with respect to a1 is −shear·v0 + v1. The residual, and every product of −shear·v0 with
-            # something of row 1, is taken together with row 0, because the two cancel for long splats.
-            shear, inverse_yy = projected[i, SHEAR], projected[i, PRECISION_Y]
-            m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
-            e0 = inverse_yy * (LOW_PASS * a00 + a11 * m01 + a12 * m02)
-            e1 = inverse_yy * (LOW_PASS * a01 - a10 * m01 + a12 * m12)
-            e2 = inverse_yy * (LOW_PASS * a02 - a10 * m02 - a11 * m12)
-            vs = -TWO * projected[i, PRECISION_X] * projected[i, PRECISION_X] * g[PRECISION_X]
-            vk = inverse_yy * g[SHEAR]
-            vw = -TWO * inverse_yy * inverse_yy * g[PRECISION_Y]
-            v00, v01, v02 = vs * e0 + vk * a10, vs * e1 + vk * a11, vs * e2 + vk * a12
-            v10, v11, v12 = vk * e0 + vw * a10, vk * e1 + vw * a11, vk * e2 + vw * a12
-            if antialiased:
-                b00, b01, b02, b10, b11, b12 = _compensation_gradient(
-                    g[OPACITY] * projected[i, OPACITY], a00, a01, a02, a10, a11, a12, m01, m02, m12
-                )
-                v00, v01, v02 = v00 + b00, v01 + b01, v02 + b02
-                v10, v11, v12 = v10 + b10 + shear * b00, v11 + b11 + shear * b01, v12 + b12 + shear * b02
-            by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
-            v_log_scale[i, 0] += by0
-            v_log_scale[i, 1] += by1
-            v_log_scale[i, 2] += by2
-            # A = U·R·diag(s): to R, then through the normalised quaternion.
-            v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
-            p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
-            h00, h01, h02 = p0 * v00 + u10 * v10, p0 * v01 + u10 * v11, p0 * v02 + u10 * v12
-            h10, h11, h12 = p1 * v00 + u11 * v10, p1 * v01 + u11 * v11, p1 * v02 + u11 * v12
-            h20, h21, h22 = p2 * v00 + u12 * v10, p2 * v01 + u12 * v11, p2 * v02 + u12 * v12
-            vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
-            vq1 = TWO * (q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22))
-            vq2 = TWO * (q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22))
-            vq3 = TWO * (q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11))
-            radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
-            v_rotation[i, 0] += (vq0 - radial * q0) * rn
-            v_rotation[i, 1] += (vq1 - radial * q1) * rn
-            v_rotation[i, 2] += (vq2 - radial * q2) * rn
-            v_rotation[i, 3] += (vq3 - radial * q3) * rn
-            # to U, and through it to the camera-space position (the Jacobian depends on it).
-            d00, d01 = v00 * r00 + v01 * r01 + v02 * r02, v00 * r10 + v01 * r11 + v02 * r12
-            d02 = v00 * r20 + v01 * r21 + v02 * r22
-            d10, d11 = v10 * r00 + v11 * r01 + v12 * r02, v10 * r10 + v11 * r11 + v12 * r12
-            d12 = v10 * r20 + v11 * r21 + v12 * r22
-            from_row_0 = d00 * c20 + d01 * c21 + d02 * c22
-            vtx = -jx * from_row_0
-            vty = -jy * (d10 * c20 + d11 * c21 + d12 * c22 - shear * from_row_0)
-            vz = -rz * (by0 + by1 + by2)  # U shrinks with z as the scales do
-            vtx = vtx if tx == slope_x else ZERO
-            vty = vty if ty == slope_y else ZERO
-            vtx, vty = vtx + g[MEAN_X] * fx, vty + g[MEAN_Y] * fy
-            vx, vy = vtx * rz, vty * rz
-            vz -= (vtx * slope_x + vty * slope_y) * rz
+        # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0 − shear·a1,
+        # ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy: the gradient with respect to
+        # a0 is v0, that with respect to a1 is −shear·v0 + v1. The residual, and every product of −shear·v0 with
+        # something of row 1, is taken together with row 0, because the two cancel for long splats.
+        shear, inverse_yy = projected[i, SHEAR], projected[i, PRECISION_Y]
+        m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+        e0 = inverse_yy * (LOW_PASS * a00 + a11 * m01 + a12 * m02)
+        e1 = inverse_yy * (LOW_PASS * a01 - a10 * m01 + a12 * m12)
+        e2 = inverse_yy * (LOW_PASS * a02 - a10 * m02 - a11 * m12)
+        vs = -TWO * projected[i, PRECISION_X] * projected[i, PRECISION_X] * g[PRECISION_X]
+        vk = inverse_yy * g[SHEAR]
+        vw = -TWO * inverse_yy * inverse_yy * g[PRECISION_Y]
+        v00, v01, v02 = vs * e0 + vk * a10, vs * e1 + vk * a11, vs * e2 + vk * a12
+        v10, v11, v12 = vk * e0 + vw * a10, vk * e1 + vw * a11, vk * e2 + vw * a12
+        if antialiased:
+            b00, b01, b02, b10, b11, b12 = _compensation_gradient(
+                g[OPACITY] * projected[i, OPACITY], a00, a01, a02, a10, a11, a12, m01, m02, m12
+            )
+            v00, v01, v02 = v00 + b00, v01 + b01, v02 + b02
+            v10, v11, v12 = v10 + b10 + shear * b00, v11 + b11 + shear * b01, v12 + b12 + shear * b02
+        by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
+        v_log_scale[i, 0] += by0
+        v_log_scale[i, 1] += by1
+        v_log_scale[i, 2] += by2
+        # A = U·R·diag(s): to R, then through the normalised quaternion.
+        v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
+        p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
+        h00, h01, h02 = p0 * v00 + u10 * v10, p0 * v01 + u10 * v11, p0 * v02 + u10 * v12
+        h10, h11, h12 = p1 * v00 + u11 * v10, p1 * v01 + u11 * v11, p1 * v02 + u11 * v12
+        h20, h21, h22 = p2 * v00 + u12 * v10, p2 * v01 + u12 * v11, p2 * v02 + u12 * v12
+        vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
+        vq1 = TWO * (q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22))
+        vq2 = TWO * (q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22))
+        vq3 = TWO * (q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11))
+        radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
+        v_rotation[i, 0] += (vq0 - radial * q0) * rn
+        v_rotation[i, 1] += (vq1 - radial * q1) * rn
+        v_rotation[i, 2] += (vq2 - radial * q2) * rn
+        v_rotation[i, 3] += (vq3 - radial * q3) * rn
+        # to U, and through it to the camera-space position (the Jacobian depends on it).
+        d00, d01 = v00 * r00 + v01 * r01 + v02 * r02, v00 * r10 + v01 * r11 + v02 * r12
+        d02 = v00 * r20 + v01 * r21 + v02 * r22
+        d10, d11 = v10 * r00 + v11 * r01 + v12 * r02, v10 * r10 + v11 * r11 + v12 * r12
+        d12 = v10 * r20 + v11 * r21 + v12 * r22
+        from_row_0 = d00 * c20 + d01 * c21 + d02 * c22
+        vtx = -jx * from_row_0
+        vty = -jy * (d10 * c20 + d11 * c21 + d12 * c22 - shear * from_row_0)
+        vz = -rz * (by0 + by1 + by2)  # U shrinks with z as the scales do
+        vtx = vtx if tx == slope_x else ZERO
+        vty = vty if ty == slope_y else ZERO
+        vtx, vty = vtx + g[MEAN_X] * fx, vty + g[MEAN_Y] * fy
+        vx, vy = vtx * rz, vty * rz
+        vz -= (vtx * slope_x + vty * slope_y) * rz
 
-            # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
-            v_opacity[i] += g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
-            if depth_as_colour:
-                vz += g[RED]
-            else:
-                rd = ONE / math.sqrt(x * x + y * y + z * z)
-                dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
-                dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
-                dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
-                _basis(degree, dx, dy, dz, basis)
-                gr = g[RED] if projected[i, RED] > ZERO else ZERO
-                gg = g[GREEN] if projected[i, GREEN] > ZERO else ZERO
-                gb = g[BLUE] if projected[i, BLUE] > ZERO else ZERO
-                for k in range((degree + 1) * (degree + 1)):
-                    v_sh[i, k, 0] += basis[k] * gr
-                    v_sh[i, k, 1] += basis[k] * gg
-                    v_sh[i, k, 2] += basis[k] * gb
-                    weight[k] = gr * sh[i, k, 0] + gg * sh[i, k, 1] + gb * sh[i, k, 2]
-                for k in range(strains):
-                    v_strain_color[i, k, 0] += strain[f, k] * gr
-                    v_strain_color[i, k, 1] += strain[f, k] * gg
-                    v_strain_color[i, k, 2] += strain[f, k] * gb
-                ex, ey, ez = _basis_gradient(degree, dx, dy, dz, weight)
-                along = ex * dx + ey * dy + ez * dz
-                ex, ey, ez = (ex - along * dx) * rd, (ey - along * dy) * rd, (ez - along * dz) * rd
-                vx += to_world[0, 0] * ex + to_world[1, 0] * ey + to_world[2, 0] * ez
-                vy += to_world[0, 1] * ex + to_world[1, 1] * ey + to_world[2, 1] * ez
-                vz += to_world[0, 2] * ex + to_world[1, 2] * ey + to_world[2, 2] * ez
-            v_xyz[i, 0] += c00 * vx + c10 * vy + c20 * vz
-            v_xyz[i, 1] += c01 * vx + c11 * vy + c21 * vz
-            v_xyz[i, 2] += c02 * vx + c12 * vy + c22 * vz
+        # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
+        v_opacity[i] += g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
+        if depth_as_colour:
+            vz += g[RED]
+        else:
+            rd = ONE / math.sqrt(x * x + y * y + z * z)
+            dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
+            dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
+            dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
+            _basis(degree, dx, dy, dz, basis)
+            gr = g[RED] if projected[i, RED] > ZERO else ZERO
+            gg = g[GREEN] if projected[i, GREEN] > ZERO else ZERO
+            gb = g[BLUE] if projected[i, BLUE] > ZERO else ZERO
+            for k in range((degree + 1) * (degree + 1)):
+                v_sh[i, k, 0] += basis[k] * gr
+                v_sh[i, k, 1] += basis[k] * gg
+                v_sh[i, k, 2] += basis[k] * gb
+                weight[k] = gr * sh[i, k, 0] + gg * sh[i, k, 1] + gb * sh[i, k, 2]
+            for k in range(strains):
+                v_strain_color[i, k, 0] += strain[f, k] * gr
+                v_strain_color[i, k, 1] += strain[f, k] * gg
+                v_strain_color[i, k, 2] += strain[f, k] * gb
+            ex, ey, ez = _basis_gradient(degree, dx, dy, dz, weight)
+            along = ex * dx + ey * dy + ez * dz
+            ex, ey, ez = (ex - along * dx) * rd, (ey - along * dy) * rd, (ez - along * dz) * rd
+            vx += to_world[0, 0] * ex + to_world[1, 0] * ey + to_world[2, 0] * ez
+            vy += to_world[0, 1] * ex + to_world[1, 1] * ey + to_world[2, 1] * ez
+            vz += to_world[0, 2] * ex + to_world[1, 2] * ey + to_world[2, 2] * ez
+        v_xyz[i, 0] += c00 * vx + c10 * vy + c20 * vz
+        v_xyz[i, 1] += c01 * vx + c11 * vy + c21 * vz
+        v_xyz[i, 2] += c02 * vx + c12 * vy + c22 * vz
