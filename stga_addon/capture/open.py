@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import StgaError
-from .flame_capture import CANONICAL_NAME, PARAMETERS, open_flame_capture
+from .flame_capture import CANONICAL_NAME, PARAMETERS, open_flame_capture, open_flame_motion
 from .mesh_capture import mesh_files, open_mesh_capture, open_mesh_folder
 from .model import Capture, View
 from .principal_point import principal_point_warning
@@ -13,10 +15,14 @@ from .release import is_release, open_release
 from .transforms import PRINCIPAL_POINTS, SPLITS, Frame, Transforms, has_transforms, read_splits
 
 NO_TRANSFORMS = Transforms({}, None, None)
+SMALLEST_HEAD, TYPICAL, LARGEST_HEAD = 0.05, 0.3, 3.0
+"""Largest extent of a neutral mesh, metres: outside of these, it is probably not in metres."""
 
 
 def open_capture(folder: Path, flame: Path | None = None, principal_point: str = "vhap") -> Capture:
     """Open a capture: cameras and file names now, images and tracked meshes when they are asked for.
+
+    An .npz file in place of a folder is a FLAME motion: a capture without views.
 
     Layouts: "flame" (VHAP and GaussianAvatars; needs the model file `flame`), "mesh" (`mesh_path` per frame, or a
     bare folder of meshes, which has no views) and "release" (STGA's authors). `principal_point` as in
@@ -26,6 +32,8 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
     """
     if principal_point not in PRINCIPAL_POINTS:
         raise StgaError(f"principal point convention {principal_point!r} is not one of {', '.join(PRINCIPAL_POINTS)}")
+    if folder.suffix.lower() == ".npz" and folder.is_file():
+        return open_flame_motion(folder.resolve(), flame)
     if not folder.is_dir():
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root = folder.resolve()
@@ -33,8 +41,16 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
     views = {split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()}
     _require_files(transforms)
     capture = _open_layout(root, transforms, views, flame)
-    warning = principal_point_warning(transforms.frames, capture.mesh, principal_point)
-    return capture if warning is None else replace(capture, warnings=(*capture.warnings, warning))
+    found = (principal_point_warning(transforms.frames, capture.mesh, principal_point), _size_warning(capture))
+    return replace(capture, warnings=(*capture.warnings, *(warning for warning in found if warning)))
+
+
+def _size_warning(capture: Capture) -> str | None:
+    """Limits, thresholds and the near plane are in metres, so a head in millimetres would train to nonsense."""
+    size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
+    if SMALLEST_HEAD <= size <= LARGEST_HEAD:
+        return None
+    return f"{capture.root}: the neutral mesh measures {size:.3g} m; a head of {TYPICAL} m is expected, in metres"
 
 
 def _open_layout(

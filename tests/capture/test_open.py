@@ -226,6 +226,19 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
     assert open_capture(root, principal_point="opencv").warnings == ()
 
 
+@pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
+def test_a_head_that_is_not_in_metres(tmp_path: Path, factor: float, says: str | None) -> None:
+    """Catches a capture in millimetres that trains to nonsense, or renders nothing, without a word."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    vertices, faces = factory.ball()
+    for path in (root / "meshes").glob("*.obj"):
+        factory.write_mesh(path, factor * vertices, faces)
+    each_split(root, no_masks)
+    warnings = open_capture(root).warnings
+    assert len(warnings) == (says is not None)
+    assert says is None or says in warnings[0]
+
+
 def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) -> None:
     """Catches a check too dull for a real head: the principal point 10 pixels off the centre, of 401."""
     root = tmp_path / "capture"
@@ -451,7 +464,9 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
     with pytest.raises(StgaError, match="'left' is not one of vhap, opencv, centre"):
         open_capture(root, model_file, "left")
     with pytest.raises(StgaError, match="is not a folder"):
-        open_capture(model_file)
+        open_capture(root / "transforms_train.json")
+    with pytest.raises(StgaError, match="model.npz: has none of expr"):
+        open_capture(model_file, model_file)
     plain = tmp_path / "plain"
     plain.mkdir()
     factory.write_images(plain, [0], [0])
@@ -489,3 +504,14 @@ def test_random_damage_never_escapes(tmp_path: Path, suffix: str) -> None:
             refused += 1
         path.write_bytes(whole)
     assert refused > 30
+
+
+def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:
+    """Catches a motion that needs a folder around it, or loses its identity, offsets or regions on the way."""
+    root, model_file = factory.write_flame_capture(tmp_path / "flame")
+    whole = open_capture(root, model_file)
+    motion = open_capture(root / "flame_param/00003.npz", model_file)
+    assert (motion.layout, motion.timesteps, dict(motion.views)) == ("flame", (0,), {})
+    np.testing.assert_array_equal(motion.mesh(0), whole.mesh(3))
+    np.testing.assert_array_equal(motion.neutral, whole.neutral)
+    assert motion.regions.keys() == whole.regions.keys()
