@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: demo test test-fast lint fuzz zip clean
+.PHONY: demo test test-fast test-gui lint fuzz extension clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -13,6 +13,10 @@ test: lint
 test-fast: .venv/ready
 	$(BIN)/python -m pytest -m "not slow"
 
+# STGA_BLENDER: the command that starts a Blender with a window (docs/blender.md)
+test-gui: .venv/ready
+	$(BIN)/python -m pytest tests/gui -s
+
 lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -21,7 +25,7 @@ lint: .venv/ready
 fuzz: .venv/ready
 	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} $(BIN)/python -m pytest tests/fuzz
 
-zip: .venv/ready
+extension: .venv/ready
 	$(BIN)/python -m stga_addon.package --out dist
 
 .venv/ready: pyproject.toml

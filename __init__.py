@@ -8,11 +8,11 @@ _registered = ExitStack()
 def register() -> None:
     """Register everything or nothing. Nothing is imported before Blender asks: this file also lies beside the tests."""
     from . import operators
-    from .operators import command_line
+    from .operators import command_line, render_engine
     from .ui import panel, preferences, properties
 
     with ExitStack() as done:
-        for part in (properties, preferences, operators, panel, command_line):
+        for part in (properties, preferences, operators, render_engine, panel, command_line):
             part.register()
             done.callback(part.unregister)
         _registered.enter_context(done.pop_all())

@@ -1,16 +1,20 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
-    python benchmarks/iteration.py [--splats 60000] [--width 802] [--height 550] [--repeats 30] [--out FILE.json]
+    python benchmarks/iteration.py [--head ellipsoid] [--device cuda] [--splats 60000] [--width 802] [--height 550]
+                                   [--repeats 30] [--out FILE.json]
 
-A head-shaped ellipsoid of embedded splats, SH degree 3. Medians over repeats in one process; beside each stage the
-bytes it must at least move and the time that takes at this machine's measured copy bandwidth. Run it on an idle
-machine.
+Splats of SH degree 3 on the demo's head (16,000 triangles, denser at eyes and mouth, as heads are), or on an evenly
+covered ellipsoid, for which a selection costs most. On the CPU: medians over repeats in one process; beside each
+stage the bytes it must at least move and the time that takes at this machine's measured copy bandwidth. On a GPU, whose
+queue is never waited for: means over all repeats, the time of each kernel, and the peak of its memory. Run it on an
+idle machine.
 """
 
 import argparse
 import json
 import statistics
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -18,35 +22,65 @@ import numba
 import numpy as np
 import trimesh
 
-from stga_addon.avatar.embedding import face_frames
+from stga_addon.avatar.embedding import face_areas, face_frames
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
+from stga_addon.capture.model import Capture, View
+from stga_addon.demo.head import synthetic_head
 from stga_addon.raster.kernels.bins import count_pairs, depth_order, fill_pairs
 from stga_addon.raster.kernels.blend import blend_backward, blend_forward
 from stga_addon.raster.kernels.project import project_backward, project_forward
-from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_backward, render_forward, touched_tiles
+from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_forward
 from stga_addon.training import adam
-from stga_addon.training.losses import REACH, image_gradient, tile_rectangles, whole_image
+from stga_addon.training.device import choose_device, make_step
+from stga_addon.training.frames import FrameStore
+from stga_addon.training.losses import image_gradient, whole_image
+from stga_addon.training.settings import make_settings
 from stga_addon.training.state import new_state
+from stga_addon.training.step import Batch, Step
 
-RATES = {"xyz": 1e-9, "rotation": 1e-9, "log_scale": 1e-9, "opacity": 1e-9, "sh": 1e-9, "sh_rest": 1e-9}
+RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
 
 
-def head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
-    """`count` splats on an ellipsoid of about 20,000 triangles; with its vertices (V, 3) and faces (F, 3)."""
+REGIONS = {"demo": ([0.03, 0.02, 0.08], [0.0, -0.05, 0.09]), "ellipsoid": ([0.03, -0.04, 0.08], [0.0, 0.06, 0.07])}
+"""Where each head's selected regions lie: an eye and the mouth."""
+
+
+def demo_head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
+    """`count` splats on the demo's head, sized like its triangles; with its vertices (V, 3) and faces (F, 3)."""
+    model = synthetic_head(0, 2).model
+    vertices, faces = model.v_template, model.faces
+    spacing = np.sqrt(2 * face_areas(vertices, faces)) * np.sqrt(len(faces) / count)
+    return _splats(count, 0.6 * np.maximum(spacing, 1e-5), rng), vertices, faces
+
+
+def ellipsoid(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
+    """`count` splats of one size on an ellipsoid of about 20,000 triangles; with its vertices and faces."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
     vertices, faces = sphere.vertices * [0.08, 0.11, 0.09], np.asarray(sphere.faces, np.int32)
-    face = rng.integers(0, len(faces), count).astype(np.int32)
-    splats = Splats(
-        xyz=(rng.normal(size=(count, 3)) * 0.001).astype(np.float32),
+    return _splats(count, np.full(len(faces), 0.0012), rng), vertices, faces
+
+
+def _splats(count: int, size: np.ndarray, rng: np.random.Generator) -> Splats:
+    """Splats on random triangles; size (F,): the smallest standard deviation on each, metres."""
+    face = rng.integers(0, len(size), count).astype(np.int32)
+    sigma = size[face][:, None]
+    return Splats(
+        xyz=(rng.normal(size=(count, 3)) * 0.8 * sigma).astype(np.float32),
         rotation=rng.normal(size=(count, 4)).astype(np.float32),
-        log_scale=np.log(0.0012 + 0.0006 * rng.random((count, 3))).astype(np.float32),
+        log_scale=np.log(sigma * (1 + 0.5 * rng.random((count, 3)))).astype(np.float32),
         opacity=(rng.normal(size=count) + 1).astype(np.float32),
         sh=(rng.normal(size=(count, 16, 3)) * 0.1).astype(np.float32),
         face=face,
         loose=np.zeros(count, bool),
     )
-    return splats, vertices, faces
+
+
+def front_camera(width: int, height: int) -> Camera:
+    """A metre before a head that looks along +z."""
+    view = np.diag([1.0, -1.0, -1.0, 1.0])
+    view[2, 3] = 1.0
+    return Camera(width, height, 2.43 * width, 2.43 * width, width / 2, height / 2, view)
 
 
 def median_ms(work: Callable[[], object], repeats: int) -> float:
@@ -78,7 +112,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     projected, depth = np.empty_like(r.projected), np.empty(n, np.float32)
     extent_y, rect = np.empty(n, np.float32), np.empty((n, 4), np.int32)
     project = (
-        *arrays, 3, face, seen.origin, seen.matrix, seen.to_world, seen.lens, seen.size, False,
+        *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size, False, False,
         projected, depth, extent_y, rect,
     )  # fmt: skip
     project_forward(*project)
@@ -117,9 +151,8 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         ),
         "project backward": (
             lambda: project_backward(
-                *arrays, 3, face, seen.origin, seen.matrix,
-                seen.to_world, seen.lens, seen.size, False, r.projected, rows, r.slot_start, r.slot_count,
-                pair_gradients, False, *gradients, screen,
+                *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
+                False, False, r.projected, rows, r.slot_start, r.slot_count, pair_gradients, False, *gradients, screen,
             ),
             pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),
@@ -128,38 +161,54 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     return {name: (median_ms(call, repeats), moved) for name, (call, moved) in work.items()}
 
 
-def iteration(splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray):
-    """A function that runs one whole iteration, from the posed mesh's frames on; `focus` as in `render_forward`."""
-    frames = face_frames(mesh, faces, mesh)
-    state, scratch = new_state(splats), Scratch()
-    gradients = Parameters(*(g.numpy() for g in state.gradients))
-    background = np.ones(3, np.float32)
-
-    def run(focus: np.ndarray | None = None) -> None:
-        seen = camera_frames(frames, camera)
-        arrays, face = state.arrays(), state.face.numpy()
-        r = render_forward(arrays, face, seen, 3, background, focus, REACH, scratch=scratch)
-        rectangles = whole_image(camera.height, camera.width)
-        if focus is not None:
-            tiles = touched_tiles(r, focus)
-            rectangles = tile_rectangles(tiles, camera.height, camera.width)
-        v_image = scratch.take("v_image", r.image.shape)
-        image_gradient(r.image, target, rectangles, 0.2, v_image)
-        rows, _ = render_backward(r, arrays, face, seen, v_image, gradients, focus=focus, scratch=scratch)
-        adam.step(state, rows, RATES)
-
-    return run
+def device_step(
+    device: str, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
+) -> tuple[Step, Batch]:
+    """A whole iteration on a device, from the posed mesh's frames on, and the global batch to give it."""
+    lengths = np.sqrt(2 * face_areas(mesh, faces)).astype(np.float32)
+    capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
+    step = make_step(device, make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats))
+    view = View(0, 0, camera, "benchmark", Path())
+    return step, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
 
 
-def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float) -> np.ndarray:
-    """(N,) bool: the splats nearest to two points on the front (an eye and the mouth, say) that make up `share`."""
-    centre = mesh[faces].mean(1)[splats.face]
-    away = np.minimum(*(np.linalg.norm(centre - p, axis=1) for p in ([0.03, -0.04, -0.08], [0.0, 0.06, -0.07])))
-    return away <= np.quantile(away, share)
+def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "demo") -> np.ndarray:
+    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of the splats."""
+    centre = mesh[faces].mean(1)
+    away = np.minimum(*(np.linalg.norm(centre - p, axis=1) for p in REGIONS[head]))
+    return away <= np.quantile(away[splats.face], share)
+
+
+def queued_ms(step: Step, batch: Batch, repeats: int) -> float:
+    """Mean wall time in milliseconds of iterations that follow each other without waiting, after five of them."""
+    import warp
+
+    for count in (5, repeats):
+        warp.synchronize()
+        begin = perf_counter()
+        for _ in range(count):
+            step.train(batch)
+        warp.synchronize()
+    return 1e3 * (perf_counter() - begin) / repeats
+
+
+def kernel_times(step: Step, batch: Batch, repeats: int) -> dict[str, float]:
+    """kernel, copy or fill -> mean milliseconds of an iteration, longest first."""
+    import warp
+
+    warp.timing_begin(cuda_filter=warp.TIMING_ALL, synchronize=True)
+    for _ in range(repeats):
+        step.train(batch)
+    total: dict[str, float] = {}
+    for result in warp.timing_end(synchronize=True):
+        total[result.name] = total.get(result.name, 0.0) + result.elapsed / repeats
+    return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=("cpu", "cuda", "warp-cpu"), default="cpu")
+    parser.add_argument("--head", choices=tuple(REGIONS), default="demo")
     parser.add_argument("--splats", type=int, default=60_000)
     parser.add_argument("--width", type=int, default=802)
     parser.add_argument("--height", type=int, default=550)
@@ -167,33 +216,52 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rng = np.random.default_rng(0)
-    splats, mesh, faces = head(options.splats, rng)
-    view = np.eye(4)
-    view[2, 3] = 1.0
-    size = options.width, options.height
-    camera = Camera(*size, 2.43 * size[0], 2.43 * size[0], size[0] / 2, size[1] / 2, view)
+    make_head = {"demo": demo_head, "ellipsoid": ellipsoid}[options.head]
+    splats, mesh, faces = make_head(options.splats, rng)
+    camera = front_camera(options.width, options.height)
     target = rng.integers(0, 256, (options.height, options.width, 3)).astype(np.uint8)
-    seen = camera_frames(face_frames(mesh, faces, mesh), camera)
+    device, why = choose_device(options.device)
+    print(why)
+    step, batch = device_step(device, splats, mesh, faces, camera, target)
 
+    def measure(batch: Batch) -> float:
+        if device == "cpu":
+            return median_ms(lambda: step.train(batch), options.repeats)
+        return queued_ms(step, batch, options.repeats)
+
+    whole = measure(batch)
+    if device == "cpu":
+        seen = camera_frames(face_frames(mesh, faces, mesh), camera)
+        found = cpu_table(splats, seen, target, options.repeats)
+    else:
+        found = kernel_times(step, batch, options.repeats)
+        for name, ms in found.items():
+            print(f"{name:<60}{ms:8.3f} ms")
+    print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
+    print(f"{'whole iteration':<22}{whole:8.2f}")
+    parts = {}
+    for share in (0.05, 0.1, 0.2, 0.4):
+        parts[share] = measure(replace(batch, selected=two_regions(splats, mesh, faces, share, options.head)))
+        print(f"local, {share:4.0%} selected   {parts[share]:8.2f}   {parts[share] / whole:.2f} of a global one")
+    if device.startswith("cuda"):
+        import warp
+
+        print(f"peak memory {warp.get_mempool_used_mem_high(device) / 2**20:.0f} MiB")
+    if options.out:
+        result = {"stages_ms": found, "global_ms": whole, "local_ms": parts}
+        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def cpu_table(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, float]:
+    """Print the stages beside their floors; returns their times."""
     bandwidth = copy_bandwidth()
     print(f"{numba.get_num_threads()} threads, copy {bandwidth / 1e9:.1f} GB/s")
-    found = stages(splats, seen, target, options.repeats)
+    found = stages(splats, seen, target, repeats)
     print(f"{'stage':<22}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, (ms, moved) in found.items():
         floor = 1e3 * moved / bandwidth
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
-    run = iteration(splats, mesh, faces, camera, target)
-    whole = median_ms(run, options.repeats)
-    print(f"{'sum of stages':<22}{sum(ms for ms, _ in found.values()):8.2f}")
-    print(f"{'whole iteration':<22}{whole:8.2f}")
-    parts = {}
-    for share in (0.05, 0.1, 0.2, 0.4):
-        focus = two_regions(splats, mesh, faces, share)
-        parts[share] = median_ms(lambda focus=focus: run(focus), options.repeats)
-        print(f"local, {share:4.0%} selected   {parts[share]:8.2f}   {parts[share] / whole:.2f} of a global one")
-    if options.out:
-        result = {"stages_ms": {k: v[0] for k, v in found.items()}, "global_ms": whole, "local_ms": parts}
-        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return {name: ms for name, (ms, _) in found.items()}
 
 
 if __name__ == "__main__":

@@ -9,7 +9,10 @@ import bpy
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
+from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.rig import rig_of
 from . import ids
 
 
@@ -29,6 +32,17 @@ def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], s
 def settings(context: Any) -> Any:
     """The scene's property group (`ui.properties.Settings`)."""
     return getattr(context.scene, ids.SETTINGS)
+
+
+def preferences(context: Any) -> Any:
+    """The extension's preferences (`ui.preferences.Preferences`); None while it runs from a checkout."""
+    addon = context.preferences.addons.get(package())
+    return addon.preferences if addon else None
+
+
+def package() -> str:
+    """The name by which Blender knows the extension."""
+    return str(__package__).rpartition(".")[0]
 
 
 def head_of(context: Any) -> Any:
@@ -52,6 +66,47 @@ def needs_head(operator: Any, context: Any) -> bool:
     return False
 
 
+def needs_own_head(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head that can be changed here; says what to do where not."""
+    if not needs_head(operator, context):
+        return False
+    head = settings(context).head
+    if head.library is None and head.data.library is None:
+        return True
+    operator.poll_message_set("The head is linked from another file: open that file, or make the head local")
+    return False
+
+
+def needs_rig(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head with a FLAME rig that can be animated; says what to do where not."""
+    if not needs_own_head(operator, context):
+        return False
+    try:
+        rig_of(settings(context).head)
+    except StgaError as error:
+        operator.poll_message_set(str(error))
+        return False
+    return True
+
+
+def flame_property() -> Any:
+    """The model file that an import reads parameters with."""
+    return bpy.props.StringProperty(
+        name="FLAME Model",
+        description="Your own FLAME model file (.pkl or .npz), for what was tracked with FLAME; "
+        "empty: the one in the preferences",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS,
+    )
+
+
+def flame_model_path(context: Any, given: str = "") -> Path | None:
+    """The model file `given`, else the one in the preferences, else None."""
+    preferred = preferences(context)
+    path = given or (preferred.flame_model if preferred else "")
+    return file_path(path, "FLAME model") if path else None
+
+
 def capture_of(head: Any) -> Capture:
     """Open the capture that a head was imported from again. Raises StgaError where it has moved or changed."""
     model = head.get(tags.FLAME_MODEL)
@@ -60,6 +115,13 @@ def capture_of(head: Any) -> Capture:
         flame=Path(model) if model else None,
         principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
     )
+
+
+def flame_of(capture: Capture, name: str) -> FlameSequence:
+    """The FLAME parameters of a capture. Raises StgaError where it has none; `name` says whose."""
+    if capture.flame is None:
+        raise StgaError(f"{name}: was not tracked with FLAME, so it has no parameters of expression and pose")
+    return capture.flame
 
 
 def file_path(value: str, what: str) -> Path:

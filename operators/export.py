@@ -1,7 +1,5 @@
 """Avatar → files for other viewers."""
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
@@ -10,11 +8,11 @@ from ..stga_addon.avatar.embedding import to_world
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
 from ..stga_addon.avatar.ply import write_ply
-from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.compat import PATH_OPTIONS, evaluated_vertices
+from ..stga_addon.scene.motion import performed_motion, played
 from ..stga_addon.scene.splats import check_head
 from . import ids
-from .common import capture_of, file_path, head_of, needs_head, reporting, settings
+from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, settings
 
 
 class Export(bpy.types.Operator):
@@ -39,7 +37,11 @@ class Export(bpy.types.Operator):
         items=(
             ("ply", "PLY", "The current frame in world space, for every 3D Gaussian Splatting viewer"),
             ("ply-sequence", "PLY Sequence", "One world-space PLY for every frame of the scene"),
-            ("gaussian-avatars", "GaussianAvatars", "point_cloud.ply and flame_param.npz; captures tracked with FLAME"),
+            (
+                "gaussian-avatars",
+                "GaussianAvatars",
+                "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads",
+            ),
         ),
     )
 
@@ -59,14 +61,18 @@ class Export(bpy.types.Operator):
         avatar = read_avatar(source)
         check_head(avatar, head)
         if self.format == "gaussian-avatars":
-            _export_gaussian_avatars(path, avatar, head)
+            own = flame_of(capture_of(head), head.name)
+            write_gaussian_avatars(path, avatar, performed_motion(head, own, _frames(context), self._warn))
         elif self.format == "ply":
             write_ply(path if path.suffix else path.with_suffix(".ply"), _posed(avatar, head))
         else:
-            for frame in _each_frame(context):
+            for frame in played(_frames(context)):
                 write_ply(path / f"{frame:05d}.ply", _posed(avatar, head))
         self.report({"INFO"}, f"Exported {len(avatar.splats)} splats to {path}")
         return {"FINISHED"}
+
+    def _warn(self, sentence: str) -> None:
+        self.report({"WARNING"}, sentence)
 
 
 def _posed(avatar: Avatar, head: Any) -> Any:
@@ -74,22 +80,5 @@ def _posed(avatar: Avatar, head: Any) -> Any:
     return to_world(avatar.splats, frames)
 
 
-def _export_gaussian_avatars(folder: Path, avatar: Avatar, head: Any) -> None:
-    sequence = capture_of(head).flame
-    if sequence is None:
-        raise StgaError(f"{head.name}: was not tracked with FLAME, which the gaussian-avatars format stores")
-    write_gaussian_avatars(folder, avatar, sequence)
-
-
-def _each_frame(context: Any) -> Iterator[int]:
-    """Set every frame of the scene in turn, with progress at the cursor; returns to the frame it started from."""
-    scene, before = context.scene, context.scene.frame_current
-    context.window_manager.progress_begin(scene.frame_start, scene.frame_end + 1)
-    try:
-        for frame in range(scene.frame_start, scene.frame_end + 1):
-            scene.frame_set(frame)
-            yield frame
-            context.window_manager.progress_update(frame)
-    finally:
-        context.window_manager.progress_end()
-        scene.frame_set(before)
+def _frames(context: Any) -> range:
+    return range(context.scene.frame_start, context.scene.frame_end + 1)

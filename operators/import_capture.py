@@ -1,9 +1,11 @@
 """Capture folder → head and cameras."""
 
+from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
+from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import configure_scene, import_cameras
@@ -11,7 +13,7 @@ from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.head import import_head
 from ..stga_addon.scene.hierarchy import capture_root
 from . import ids
-from .common import file_path, reporting, settings
+from .common import file_path, flame_model_path, flame_property, reporting, settings
 
 
 class ImportCapture(bpy.types.Operator):
@@ -27,13 +29,7 @@ class ImportCapture(bpy.types.Operator):
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
     )
-    flame: bpy.props.StringProperty(
-        name="FLAME Model",
-        description="Your own FLAME model file (.pkl or .npz), for captures tracked with FLAME; "
-        "empty: the one in the preferences",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS,
-    )
+    flame: flame_property()
     principal_point: bpy.props.EnumProperty(
         name="Principal Point",
         description="What cx and cy in the transforms files mean",
@@ -58,31 +54,39 @@ class ImportCapture(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         folder = file_path(self.directory, "capture")
-        model = self.flame or _preferred_model(context)
-        flame = file_path(model, "FLAME model") if model else None
-        capture = open_capture(folder, flame=flame, principal_point=self.principal_point)
-        head = import_head(capture, warn=self._warn)
-        cameras = import_cameras(capture, capture_root(capture.root), warn=self._warn)
-        head[tags.FLAME_MODEL] = str(flame) if flame else ""
-        head[tags.PRINCIPAL_POINT] = self.principal_point
-        settings(context).head = head
-        scene = context.scene
-        scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
-        scene.frame_set(capture.timesteps[0])
-        if self.set_up_scene and cameras:
-            configure_scene(scene, capture, cameras[0], warn=self._warn)
-        for sentence in capture.warnings:
-            self._warn(sentence)
-        self.report(
-            {"INFO"}, f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
-        )
+        bring_in(self, context, folder, self.flame, self.principal_point, self.set_up_scene)
         return {"FINISHED"}
 
-    def _warn(self, sentence: str) -> None:
-        self.report({"WARNING"}, sentence)
+
+def bring_in(
+    operator: Any,
+    context: Any,
+    source: Path,
+    flame: str = "",
+    principal_point: str = "vhap",
+    set_up_scene: bool = False,
+) -> None:
+    """Import what `open_capture` makes of `source` and work on it from here on. Raises StgaError."""
+
+    def warn(sentence: str) -> None:
+        operator.report({"WARNING"}, sentence)
+
+    model = flame_model_path(context, flame)
+    capture = open_capture(source, flame=model, principal_point=principal_point)
+    head = import_head(capture, warn=warn)
+    cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
+    head[tags.FLAME_MODEL] = str(model or "")
+    head[tags.PRINCIPAL_POINT] = principal_point
+    settings(context).head = head
+    _show_first_frame(context.scene, capture)
+    if set_up_scene and cameras:
+        configure_scene(context.scene, capture, cameras[0], warn=warn)
+    for sentence in capture.warnings:
+        warn(sentence)
+    counts = f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
+    operator.report({"INFO"}, counts)
 
 
-def _preferred_model(context: Any) -> str:
-    # The preferences know an extension by its root package; it has none while it runs from a checkout.
-    addon = context.preferences.addons.get(__package__.rpartition(".")[0])
-    return addon.preferences.flame_model if addon else ""
+def _show_first_frame(scene: Any, capture: Capture) -> None:
+    scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
+    scene.frame_set(capture.timesteps[0])

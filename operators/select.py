@@ -1,13 +1,20 @@
-"""Tracked head → one vertex group a frame."""
+"""Tracked head → one vertex group a frame, and what it amounts to."""
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import bpy
+import numpy as np
 
-from ..stga_addon.scene.groups import write_selection
-from ..stga_addon.selection import SelectionOptions, select_capture
+from ..stga_addon.capture.model import Capture
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.groups import painted_regions, read_selection, splats_per_face, write_selection
+from ..stga_addon.scene.heat import hide_heat, is_heat_shown, show_heat
+from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
+from ..stga_addon.training.settings import Settings
 from . import ids
-from .common import capture_of, head_of, needs_head, reporting
+from .common import capture_of, head_of, needs_head, needs_own_head, reporting, settings
 
 
 class Select(bpy.types.Operator):
@@ -35,6 +42,65 @@ class Select(bpy.types.Operator):
             ("all", "Whole Pose", "Head motion, jaw and eyes"),
         ),
     )
+    regions: bpy.props.StringProperty(
+        name="Key Regions",
+        description="Regions or vertex groups that are selected as a whole, separated by commas; "
+        "empty: those ticked in the panel",
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_own_head(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head = head_of(context)
+        names = [name.strip() for name in self.regions.split(",") if name.strip()] or key_regions(head)
+        capture = _with_painted(capture_of(head), head, names)
+        chosen = select_capture(capture, SelectionOptions(self.threshold, self.zero_pose, tuple(names)))
+        write_selection(head, chosen)
+        head[tags.KEY_REGIONS] = "\n".join(names)
+        _count(context, head)
+        if is_heat_shown(head):
+            show_heat(head, _shares(head))
+        moving = [faces.mean() for faces in chosen.values() if faces.any()]
+        share = 100 * sum(moving) / len(moving) if moving else 0.0
+        self.report(
+            {"INFO"}, f"{len(moving)} of {len(chosen)} frames select triangles, {share:.0f} % of the head on average"
+        )
+        return {"FINISHED"}
+
+
+class ToggleRegion(bpy.types.Operator):
+    """Select this region as a whole, or triangle by triangle, the next time triangles are selected"""
+
+    bl_idname = ids.TOGGLE_REGION
+    bl_label = "Key Region"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO", "INTERNAL"}
+
+    name: bpy.props.StringProperty(name="Name", description="A region of the capture, or a vertex group of the head")
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_own_head(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head = head_of(context)
+        if self.name not in possible_regions(head):
+            raise StgaError(f"{head.name}: has no region and no vertex group '{self.name}'")
+        names = key_regions(head)
+        names = [name for name in names if name != self.name] if self.name in names else [*names, self.name]
+        head[tags.KEY_REGIONS] = "\n".join(names)
+        return {"FINISHED"}
+
+
+class CountSelected(bpy.types.Operator):
+    """Count again how many triangles and splats each frame trains, after vertex groups were painted"""
+
+    bl_idname = ids.COUNT_SELECTED
+    bl_label = "Count Selected"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -42,12 +108,90 @@ class Select(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        head = head_of(context)
-        chosen = select_capture(capture_of(head), SelectionOptions(self.threshold, self.zero_pose))
-        write_selection(head, chosen)
-        moving = [faces.mean() for faces in chosen.values() if faces.any()]
-        share = 100 * sum(moving) / len(moving) if moving else 0.0
-        self.report(
-            {"INFO"}, f"{len(moving)} of {len(chosen)} frames select triangles, {share:.0f} % of the head on average"
-        )
+        _count(context, head_of(context))
         return {"FINISHED"}
+
+
+class HeatMap(bpy.types.Operator):
+    """Colour the head by how often each triangle is selected, in the viewport and when rendered; or stop doing so"""
+
+    bl_idname = ids.HEAT_MAP
+    bl_label = "Heat Map"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    show: bpy.props.BoolProperty(name="Show", description="Off: show the head as it was", default=True)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_own_head(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head, splats = head_of(context), settings(context).splats
+        if self.show:
+            share = _shares(head)
+            if not share.any():
+                raise StgaError(f"{head.name}: no frame selects a triangle yet; select moving triangles first")
+            show_heat(head, share)
+            self.report({"INFO"}, f"The most selected triangle is selected in {share.max():.0%} of the frames")
+        else:
+            hide_heat(head)
+        in_view = context.view_layer.objects
+        if splats is not None and in_view.get(splats.name) is splats and in_view.get(head.name) is head:
+            # One of the two at a time: each covers the other.
+            splats.hide_set(self.show)
+            head.hide_set(not self.show)
+        _colour_viewports(context, "VERTEX" if self.show else "MATERIAL")
+        return {"FINISHED"}
+
+
+def possible_regions(head: Any) -> list[str]:
+    """What can be selected as a whole: regions of the capture, and vertex groups that are neither selection nor rig."""
+    names = [name for name in head.data.attributes.keys() if name.startswith(tags.REGION_PREFIX)]  # noqa: SIM118
+    rigs = [modifier.object for modifier in head.modifiers if modifier.type == "ARMATURE" and modifier.object]
+    bones = {bone.name for rig in rigs for bone in rig.data.bones}
+    groups = [group.name for group in head.vertex_groups if tags.group_timestep(group.name) is None]
+    painted = [name for name in groups if name not in bones]
+    return list(dict.fromkeys([*(name.removeprefix(tags.REGION_PREFIX) for name in names), *painted]))
+
+
+def key_regions(head: Any) -> list[str]:
+    """What is ticked; at first the capture's eyes, mouth and nose."""
+    possible = possible_regions(head)
+    ticked = head[tags.KEY_REGIONS].split("\n") if tags.KEY_REGIONS in head else KEY_REGIONS
+    return [name for name in ticked if name in possible]
+
+
+def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
+    """The capture with those of the regions that are vertex groups; what was painted wins over a region of its name."""
+    painted = painted_regions(head, [name for name in names if name in head.vertex_groups])
+    for name in names:
+        if name not in painted and name not in capture.regions:
+            raise StgaError(f"{head.name}: has no region and no vertex group '{name}'")
+        if name in painted and not painted[name].any():
+            raise StgaError(f"{head.name}: no triangle has all its corners in the vertex group '{name}'")
+    return replace(capture, regions={**capture.regions, **painted})
+
+
+def _count(context: Any, head: Any) -> None:
+    """Fill the panel's table."""
+    chosen, splats = settings(context), settings(context).splats
+    per_face = splats_per_face(splats, head)
+    every = (Settings.lattice + 1) * (Settings.lattice + 2) // 2  # at the start of a training
+    chosen.selected_frames.clear()
+    for timestep, selected in read_selection(head).items():
+        row = chosen.selected_frames.add()
+        row.frame, row.triangles = timestep, int(selected.sum())
+        row.splats = int(selected.sum()) * every if per_face is None else int(per_face[selected].sum())
+
+
+def _shares(head: Any) -> np.ndarray:
+    """(F,) share of the frames that select each triangle."""
+    return np.mean(list(read_selection(head).values()), axis=0)
+
+
+def _colour_viewports(context: Any, kind: str) -> None:
+    """What solid mode colours by, in every viewport of the screen; in background there is none."""
+    for area in context.screen.areas if context.screen else ():
+        if area.type == "VIEW_3D":
+            area.spaces.active.shading.color_type = kind

@@ -4,10 +4,10 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.materials import view_transform_hint
-from ..stga_addon.scene.splats import show_avatar
+from ..stga_addon.scene.materials import TRANSPARENT_BOUNCES, view_transform_hint
+from ..stga_addon.scene.splats import Attributes, show_avatar
 from . import ids
 from .common import file_path, head_of, needs_head, reporting, settings
 
@@ -43,15 +43,28 @@ class ShowAvatar(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         path, head = file_path(self.filepath, "avatar"), head_of(context)
         avatar = read_avatar(path)
-        shown = show_avatar(avatar, head, f"{head.name} {path.stem}")
-        if self.hide_head:
-            head.hide_render = True
-            if context.view_layer.objects.get(head.name) is head:
-                head.hide_set(True)
-        settings(context).avatar, settings(context).splats = self.filepath, shown
+        show(context.scene, avatar, head, f"{head.name} {path.stem}", self.hide_head)
+        settings(context).avatar = self.filepath
         hint = view_transform_hint(context.scene)
         self.report({"WARNING" if hint else "INFO"}, f"{len(avatar.splats)} splats" + (f". {hint}" if hint else ""))
         return {"FINISHED"}
+
+
+def show(
+    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, attributes: Attributes | None = None
+) -> Any:
+    """Show the avatar on the head; the splat object becomes the one that the scene's panel works on.
+
+    attributes: as `show_avatar` takes them.
+    """
+    shown = show_avatar(avatar, head, name, attributes)
+    if hide_head:
+        head.hide_render = True
+        for layer in scene.view_layers:
+            if layer.objects.get(head.name) is head:
+                head.hide_set(True, view_layer=layer)
+    getattr(scene, ids.SETTINGS).splats = shown
+    return shown
 
 
 class StandardView(bpy.types.Operator):
@@ -64,4 +77,24 @@ class StandardView(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         context.scene.view_settings.view_transform = "Standard"
         context.scene.view_settings.look = "None"
+        return {"FINISHED"}
+
+
+class MoreBounces(bpy.types.Operator):
+    """Let Cycles look through enough overlapping splats: raise the scene's transparent bounces to 64"""
+
+    bl_idname = ids.MORE_BOUNCES
+    bl_label = "Use 64 Transparent Bounces"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if hasattr(context.scene, "cycles"):
+            return True
+        cls.poll_message_set("Cycles is not enabled")
+        return False
+
+    def execute(self, context: Any) -> set[str]:
+        cycles = context.scene.cycles
+        cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
         return {"FINISHED"}

@@ -1,22 +1,25 @@
-"""Capture and selection → trained avatar, in Blender's own process."""
+"""Capture and selection → trained avatar, by a worker process beside Blender."""
 
+import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.capture.model import Capture
+from ..stga_addon import task
 from ..stga_addon.errors import StgaError
+from ..stga_addon.job import Job, arguments, folder_of, work, write_job
+from ..stga_addon.runtime import missing_here
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.groups import read_selection
-from . import ids
-from .common import capture_of, file_path, head_of, needs_head, reporting, settings
-
-# module -> what pip calls it
-NEEDED = {"torch": "torch", "numba": "numba", "scipy": "scipy", "PIL": "pillow", "platformdirs": "platformdirs"}
+from ..stga_addon.scene.groups import painted_selection
+from ..stga_addon.scene.nodes import splat_tree
+from ..stga_addon.training.plan import parse_choices
+from ..stga_addon.training.settings import PRESETS, make_settings
+from . import ids, watch
+from .common import file_path, head_of, needs_head, reporting, settings
+from .runtime import training_python
 
 
 def strategy_property() -> Any:
@@ -32,8 +35,19 @@ def strategy_property() -> Any:
     )
 
 
+def preset_property(**more: Any) -> Any:
+    """The choice of a preset: the operator's, and the panel's that is handed to it."""
+    purposes = [(name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()]
+    return bpy.props.EnumProperty(
+        name="Preset",
+        description="How good, and so how long",
+        items=(("none", "Default", "The default settings, for as long as Minutes says"), *purposes),
+        **more,
+    )
+
+
 class Train(bpy.types.Operator):
-    """Train the avatar on the capture's images, in Blender's own process; Blender waits until the time is up"""
+    """Train the avatar on the capture's images: in a process beside Blender, which goes on when Blender is closed"""
 
     bl_idname = ids.TRAIN
     bl_label = "Train Avatar"
@@ -50,65 +64,147 @@ class Train(bpy.types.Operator):
         name="Iterations", description="Train this many iterations, whatever time they take; 0: by time", min=0
     )
     strategy: strategy_property()
+    preset: preset_property()
     seed: bpy.props.IntProperty(name="Seed", description="Fixes every random choice", min=0)
-
+    effects: bpy.props.StringProperty(
+        name="Effects",
+        description="NAME=on or NAME=off, separated by spaces, for what the capture is not to decide itself",
+    )
     resume: bpy.props.BoolProperty(
         name="Resume",
         description="Continue the run in the folder, with the settings and the budget it was started with",
     )
+    python: bpy.props.StringProperty(
+        name="Python",
+        description="The interpreter that trains; empty: the runtime in the add-on's preferences",
+        subtype="FILE_PATH",
+    )
+    wait: bpy.props.BoolProperty(
+        name="Wait",
+        description="Return when training has ended, as it always does without a window; "
+        "Blender's own Python trains then, where it has all that it takes",
+    )
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_head(cls, context)
+        if not needs_head(cls, context):
+            return False
+        if watch.snapshot_of(context.scene).state.is_alive:
+            cls.poll_message_set("Training is under way; cancel it first")
+            return False
+        return True
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        _require_runtime()
         head = head_of(context)
-        capture = capture_of(head)
-        folder = file_path(self.directory, "run folder")
-        avatar = self._train(context, capture, folder, head)
+        run = file_path(self.directory, "run folder").resolve()
+        waits = self.wait or bpy.app.background
+        here = waits and not self.python and not missing_here()
+        python = "" if here else training_python(context, self.python)
+        job = self._job(head)
+        write_job(run, job, painted_selection(head))
+        if here:
+            watch.set_job(context.scene, run)
+            avatar = _work_here(context, run)
+        else:
+            process = task.start(folder_of(run), python, arguments(run))
+            watch.set_job(context.scene, run)
+            watch.started(folder_of(run), process)
+            if not waits:
+                _prepare_display(job)
+                return {"FINISHED"}
+            avatar = _wait(run, process)
         settings(context).avatar = str(avatar)
+        settings(context).job_ended = True
         self.report({"INFO"}, f"Trained {avatar}")
         return {"FINISHED"}
 
-    def _train(self, context: Any, capture: Capture, folder: Path, head: Any) -> Path:
-        from ..stga_addon.training.folder import Run, read_run
-        from ..stga_addon.training.run import train
-        from ..stga_addon.training.settings import make_settings
+    def _job(self, head: Any) -> Job:
+        budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
+        chosen = None
+        if not self.resume:
+            effects = None if self.strategy == "gaussian-avatars" else parse_choices(self.effects.split())
+            preset = None if self.preset == "none" else self.preset
+            chosen = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
+        capture, model = Path(head[tags.CAPTURE]), head.get(tags.FLAME_MODEL)
+        if not capture.is_dir():
+            raise StgaError(f"{capture}: is not a folder; expected that of the capture, which the head came from")
+        return Job(capture, Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap"), chosen)
 
-        if self.resume:
-            run = read_run(folder)
-        else:
-            budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-            chosen = make_settings(self.strategy, seed=self.seed, **budget)
-            flame = Path(head[tags.FLAME_MODEL]) if head[tags.FLAME_MODEL] else None
-            run = Run(capture.root, flame, head[tags.PRINCIPAL_POINT], chosen)
-        manager = context.window_manager
 
-        def show(progress: Any) -> bool:
-            manager.progress_update(100 * progress.share)
+class CancelTraining(bpy.types.Operator):
+    """Stop training soon, and keep the avatar as it is by then; Resume goes on from there"""
+
+    bl_idname = ids.CANCEL_TRAINING
+    bl_label = "Cancel Training"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if watch.snapshot_of(context.scene).state.is_alive:
+            return True
+        cls.poll_message_set("Nothing is being trained")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        folder = folder_of(watch.run_of(context.scene))
+        task.ask_to_stop(folder)
+        watch.follow(folder)
+        return {"FINISHED"}
+
+
+class DismissTraining(bpy.types.Operator):
+    """Forget how training ended: its log and messages; the run, its avatar and checkpoints stay"""
+
+    bl_idname = ids.DISMISS_TRAINING
+    bl_label = "Dismiss"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if watch.run_of(context.scene) is None:
+            cls.poll_message_set("There is nothing to dismiss")
             return False
+        if watch.snapshot_of(context.scene).state.is_alive:
+            cls.poll_message_set("Training is under way; cancel it first")
+            return False
+        return True
 
-        manager.progress_begin(0, 100)
-        try:
-            return train(capture, folder, run, _painted_selection(head), resume=self.resume, report=show)
-        finally:
-            manager.progress_end()
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        folder = folder_of(watch.run_of(context.scene))
+        task.forget(folder)
+        watch.forget(folder)
+        watch.set_job(context.scene, None)
+        return {"FINISHED"}
 
 
-def _painted_selection(head: Any) -> dict[int, Any] | None:
-    """The head's selection groups as they are now; None where there are none, so that the trainer selects itself."""
-    if any(tags.group_timestep(group.name) is not None for group in head.vertex_groups):
-        return read_selection(head)
-    return None
+def _prepare_display(job: Job) -> None:
+    """Build the splats' node tree, which takes a moment: now, while that is expected, and not at the first preview."""
+    if job.settings is not None:
+        splat_tree(job.settings.convention, job.settings.sh_degree, job.settings.strain_color)
 
 
-def _require_runtime() -> None:
-    missing = [package for module, package in NEEDED.items() if find_spec(module) is None]
-    if missing:
-        python = f"{sys.executable}, {sys.version.split()[0]}"
-        raise StgaError(
-            f"training needs {', '.join(missing)} in Blender's own Python ({python}): install what is missing, "
-            "or train outside Blender with `python -m stga_addon train` and show the avatar here"
-        )
+def _work_here(context: Any, run: Path) -> Path:
+    manager = context.window_manager
+
+    def show(progress: Any) -> bool:
+        manager.progress_update(100 * progress.share)
+        return False
+
+    manager.progress_begin(0, 100)
+    try:
+        return work(run, also=show)
+    finally:
+        manager.progress_end()
+
+
+def _wait(run: Path, process: "subprocess.Popen[bytes]") -> Path:
+    """Wait for the worker. Raises StgaError with its sentence where it failed; the traceback goes to the terminal."""
+    process.wait()
+    last = task.look(folder_of(run), process)
+    if last.state.is_mishap:
+        print(task.account(folder_of(run), last), file=sys.stderr)
+        raise StgaError(last.status.error)
+    return run / "avatar.npz"

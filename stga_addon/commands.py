@@ -1,8 +1,10 @@
 """What each command does; `cli.py` parses, this module works and prints."""
 
+import json
 import sys
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,29 +17,41 @@ from .capture.model import Capture, View
 from .capture.open import open_capture
 from .errors import StgaError
 from .files import replacing, write_npz
+from .flame.motion import driven
+from .flame.sequence import sequence_mesh
 from .selection import SelectionOptions, select_capture
 
 
 def train(options: Namespace) -> None:
     """Train, or continue, a run."""
+    from .effects.plan import decide, describe_plan
+    from .report.summary import conclude
+    from .training.device import choose_device
     from .training.folder import read_run
     from .training.progress import ProgressBar
     from .training.run import train as train_run
 
     if not options.capture.is_dir():
         raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
+    device, why = choose_device(options.device)
+    print(why)
     if options.resume:
         run = read_run(options.out)
         _refuse_changes(options, run)
+        capture = open_capture(run.capture, options.flame or run.flame, run.principal_point)
     else:
-        run = _new_run(options)
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
-    capture = open_capture(run.capture, options.flame or run.flame, run.principal_point)
+        capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
+        run = decide(_new_run(options, capture), capture)
     for warning in capture.warnings:
         print(f"warning: {warning}")
+    _print_table(describe_plan(run.plan))
     with ProgressBar() as bar:
-        avatar = train_run(capture, options.out, run, resume=options.resume, report=bar.report)
+        selection = None if options.head is None else options.head.selection()
+        avatar = train_run(capture, options.out, run, selection, options.resume, bar.report, device)
+    for line in conclude(options.out):
+        print(line)
     print(f"avatar: {avatar}")
 
 
@@ -66,32 +80,59 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
         "schedule": settings.schedule,
         "threshold": settings.selection.threshold,
         "seed": settings.seed,
+        "preset": settings.preset,
+        "target_psnr": settings.target_psnr,
         "principal_point": run.principal_point,
     }
     for name, value in began_with.items():
         if getattr(options, name) not in (None, value):
             option = "--" + name.replace("_", "-")
             raise StgaError(f"{option}: this run began with {value}, which cannot change; use another --out")
+    decided = {decision.effect: decision for decision in run.plan}
+    for name, choice in _choices(options).items():
+        if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
+            raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
 
 
-def _new_run(options: Namespace) -> Any:
+def _choices(options: Namespace) -> dict[str, str]:
+    from .training.plan import parse_choices
+
+    return parse_choices(options.effect)
+
+
+def _new_run(options: Namespace, capture: Capture) -> Any:
     from .training.folder import Run
     from .training.settings import make_settings
 
-    changes: dict[str, Any] = {}
+    changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": options.stop_when_flat}
     if options.seed is not None:
         changes["seed"] = options.seed
     if options.iterations is not None:
         changes["iterations"] = options.iterations
+    elif options.budget is not None:
+        changes["seconds"] = options.budget
     else:
-        changes["seconds"] = 120.0 if options.budget is None else options.budget
+        changes["seconds"] = 120.0 if options.preset is None else _planned(capture, options.preset)
     if options.strategy is not None:
         changes["strategy"] = options.strategy
     if options.threshold is not None:
         changes["selection"] = SelectionOptions(threshold=options.threshold)
     flame = None if options.flame is None else options.flame.resolve()
-    settings = make_settings(schedule=options.schedule or "default", **changes)
+    choices = _choices(options)
+    if choices or (options.schedule != "paper" and options.strategy != "gaussian-avatars"):
+        changes["effects"] = choices
+    settings = make_settings(schedule=options.schedule or "default", preset=options.preset, **changes)
     return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
+
+
+def _planned(capture: Capture, preset: str) -> float:
+    """Seconds that a preset takes here, which are printed."""
+    from .report.calibration import plan_presets
+    from .training.forecast import clock
+
+    (plan,) = plan_presets(capture, [preset])
+    print(f"{preset}: {plan.iterations} iterations, {clock(plan.seconds)} on this machine")
+    return plan.seconds
 
 
 def render(options: Namespace) -> None:
@@ -102,12 +143,15 @@ def render(options: Namespace) -> None:
     from .capture.transforms import read_transforms
     from .raster.pictures import to_bytes
 
-    draw = _drawer(options)
-    frames = read_transforms(options.cameras, options.principal_point or "vhap")
-    names = _unique_names([frame.view.name for frame in frames])
-    for frame, name in zip(tqdm(frames, desc="rendering", unit="image"), names, strict=True):
+    views = [frame.view for frame in read_transforms(options.cameras, options.principal_point or "vhap")]
+    if options.motion is None:
+        draw = _drawer(options)
+    else:
+        draw, views = _reenactment(options, views)
+    names = _unique_names([view.name for view in views])
+    for view, name in zip(tqdm(views, desc="rendering", unit="image"), names, strict=True):
         with replacing(options.out / name) as partial:
-            Image.fromarray(to_bytes(draw(frame.view))).save(partial, format="PNG")
+            Image.fromarray(to_bytes(draw(view))).save(partial, format="PNG")
 
 
 def _drawer(options: Namespace) -> Callable[[View], np.ndarray]:
@@ -117,11 +161,36 @@ def _drawer(options: Namespace) -> Callable[[View], np.ndarray]:
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
         return lambda view: draw_splats(splats, view.camera, options.background)
-    avatar, capture = _avatar_and_capture(options.source, options.capture, options.flame)
+    avatar, capture = _avatar_and_capture(options.source, options)
     if capture is None:
         raise StgaError(f"{options.source}: an avatar needs the meshes of a capture to follow; give --capture")
     driver = _fitting(capture, avatar)
     return lambda view: draw_avatar(avatar, _mesh(driver, view), view.camera, options.background)
+
+
+def _reenactment(options: Namespace, views: list[View]) -> tuple[Callable[[View], np.ndarray], list[View]]:
+    """An avatar moved by another person's FLAME motion; the views of every timestep from each camera's first place."""
+    from .raster.draw import draw_avatar
+    from .training.folder import read_run
+
+    if options.source.suffix.lower() == ".ply":
+        raise StgaError(f"{options.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
+    is_run = options.source.is_dir()
+    flame = options.flame or (read_run(options.source).flame if is_run else None)
+    avatar = read_avatar(options.source / "avatar.npz" if is_run else options.source)
+    motion = open_capture(options.motion, flame)
+    if motion.flame is None:
+        raise StgaError(f"{options.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
+    _fitting(motion, avatar)
+    sequence = driven(motion.flame, avatar.neutral)
+    cameras = {view.camera_index: view for view in reversed(views)}
+    placed = [
+        replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")
+        for timestep in sequence.timesteps
+        for index in sorted(cameras)
+    ]
+    background = options.background
+    return lambda view: draw_avatar(avatar, sequence_mesh(sequence, view.timestep), view.camera, background), placed
 
 
 def _mesh(capture: Capture, view: View) -> np.ndarray:
@@ -150,7 +219,7 @@ def eval(options: Namespace) -> None:
 
     if not options.run.is_dir():
         raise StgaError(f"{options.run}: is not a folder; expected that of a run")
-    avatar, capture = _avatar_and_capture(options.run, None, None)
+    avatar, capture = _avatar_and_capture(options.run, options)
     assert capture is not None  # a run names one
     views = capture.views.get(options.split, ())
     if not views:
@@ -158,6 +227,10 @@ def eval(options: Namespace) -> None:
     quality = measure(avatar, capture, options.split, perceptual=True)
     lpips = "not measured (package lpips is not installed)" if quality.lpips is None else f"{quality.lpips:.4f}"
     print(f"{options.split}: {len(views)} views, PSNR {quality.psnr:.3f} dB, SSIM {quality.ssim:.4f}, LPIPS {lpips}")
+    for region, name in (("mask", "inside the head mask"), ("selected", "where something moves")):
+        if region in quality.regions:
+            part = quality.regions[region]
+            print(f"  {name}: PSNR {part.psnr:.3f} dB, SSIM {part.ssim:.4f}")
     write_json(options.run / f"quality_{options.split}.json", {"views": len(views), **quality.as_json()})
 
 
@@ -176,7 +249,7 @@ def select(options: Namespace) -> None:
 
 def export(options: Namespace) -> None:
     """Write an avatar as GaussianAvatars pair, world PLY or a sequence of them."""
-    avatar, capture = _avatar_and_capture(options.avatar, options.capture, options.flame)
+    avatar, capture = _avatar_and_capture(options.avatar, options)
     if capture is not None:
         _fitting(capture, avatar)
     export_avatar(avatar, capture, options.format, options.out, options.timestep)
@@ -218,13 +291,68 @@ def _baked(avatar: Avatar, mesh: np.ndarray) -> Any:
 
 
 def info(options: Namespace) -> None:
-    """Print what a capture holds."""
+    """Print what a capture holds, and the effects that training on it would compute."""
     from .capture.summary import describe
+    from .effects.plan import describe_plan, plan_effects
+    from .training.plan import plan_to_json
+    from .training.settings import make_settings
 
-    lines = describe(open_capture(options.capture, options.flame, options.principal_point or "vhap"))
-    width = max(len(label) for label, _ in lines)
+    capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
+    plan: tuple[Any, ...] = ()
+    if capture.views.get("train"):
+        _, plan = plan_effects(capture, make_settings(iterations=1, effects=_choices(options)))
+    if options.json:
+        found: dict[str, Any] = {"plan": plan_to_json(plan)}
+        if options.presets and plan:
+            from .report.calibration import plan_presets
+
+            found["presets"] = [preset.as_json() for preset in plan_presets(capture)]
+        print(json.dumps(found))
+        return
+    _print_table(describe(capture))
+    if plan:
+        print()
+        _print_table(describe_plan(plan))
+
+
+def _print_table(lines: Sequence[tuple[str, str]]) -> None:
+    width = max((len(label) for label, _ in lines), default=0)
     for label, value in lines:
         print(f"{label:<{width}}  {value}")
+
+
+def plan(options: Namespace) -> None:
+    """Print what each preset is for, and how long it would train on this machine."""
+    from .report.calibration import plan_presets
+    from .training.forecast import clock
+
+    capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
+    for plan in plan_presets(capture):
+        print(f"{plan.preset:<9} {plan.iterations:6d} iterations  about {clock(plan.seconds):<10}  {plan.purpose}")
+
+
+def benchmark(options: Namespace) -> None:
+    """Train variants for the same time in turns, and print what came of them."""
+    from .report.benchmark import run_benchmark
+    from .report.variants import KNOBS, MAIN, chosen
+    from .training.folder import Run
+    from .training.settings import make_settings
+
+    variants = chosen(KNOBS if options.knobs else MAIN, options.only)
+    if options.seeds < 1:
+        raise StgaError(f"--seeds: {options.seeds} is not a number of runs")
+    settings = make_settings(seconds=options.budget)
+    capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
+    for split, purpose in (("train", "train on"), ("val", "measure with")):
+        if not capture.views.get(split):
+            raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
+    flame = None if options.flame is None else options.flame.resolve()
+    run = Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
+    print(run_benchmark(capture, run, variants, options.budget, options.seeds, options.out.resolve(), _tell))
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def demo(options: Namespace) -> None:
@@ -234,16 +362,22 @@ def demo(options: Namespace) -> None:
     run_demo(options.out, options.budget)
 
 
-def _avatar_and_capture(source: Path, capture: Path | None, flame: Path | None) -> tuple[Avatar, Capture | None]:
-    """The avatar of a run folder or file, and the capture that was given or that the run was trained on."""
-    if not source.is_dir():
-        return read_avatar(source), None if capture is None else open_capture(capture, flame)
-    from .training.folder import read_run
+def _avatar_and_capture(source: Path, options: Namespace) -> tuple[Avatar, Capture | None]:
+    """The avatar of a run folder or file, and the capture that was given or that the run was trained on.
 
-    run = read_run(source)
-    return read_avatar(source / "avatar.npz"), open_capture(
-        capture or run.capture, flame or run.flame, run.principal_point
-    )
+    Where Blender has a head open and no capture is named, the capture as that head plays it.
+    """
+    capture, flame = getattr(options, "capture", None), getattr(options, "flame", None)
+    if source.is_dir():
+        from .training.folder import read_run
+
+        run = read_run(source)
+        avatar, principal_point = read_avatar(source / "avatar.npz"), run.principal_point
+        capture, flame = capture or run.capture, flame or run.flame
+    else:
+        avatar, principal_point = read_avatar(source), "vhap"
+    opened = None if capture is None else open_capture(capture, flame, principal_point)
+    return avatar, opened if opened is None or options.head is None else options.head.played(opened)
 
 
 def _fitting(capture: Capture, avatar: Avatar) -> Capture:

@@ -1,4 +1,4 @@
-"""The sidebar tab: Capture → Select → Train → Show."""
+"""The sidebar tab: Capture → Select → Train → Show → Motion."""
 
 from typing import Any
 
@@ -9,25 +9,36 @@ from ..operators.common import is_head, register_classes, settings, unregister_c
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import nodes, tags
 from ..stga_addon.scene.compat import modifier_input_owner
-from ..stga_addon.scene.materials import view_transform_hint
+from ..stga_addon.scene.materials import few_bounces_hint, view_transform_hint
 from ..stga_addon.scene.splats import input_identifier, splat_modifier
+from .effects import EffectsPanel
+from .motion import ExpressionPanel, IdentityPanel, MotionPanel
+from .render_panel import RenderPanel
+from .select_panel import SelectedFrames, SelectPanel
+from .step import Step
+from .train_panel import TrainPanel
 
-DISPLAY_INPUTS = (nodes.ELLIPSOIDS, nodes.SIZE, nodes.OPACITY_THRESHOLD, nodes.PERCENTAGE, nodes.SHOW_SELECTION)
+DISPLAY_INPUTS = (
+    nodes.DISPLAY,
+    nodes.SIZE,
+    nodes.OPACITY_THRESHOLD,
+    nodes.PERCENTAGE,
+    nodes.VIEW_DEPENDENT,
+    nodes.SHOW_SELECTION,
+    nodes.SELECTED_ONLY,
+)
 
 
-class _Step:
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "STGA"
-
-
-class CapturePanel(_Step, bpy.types.Panel):
+class CapturePanel(Step, bpy.types.Panel):
     bl_idname = "STGA_PT_capture"
     bl_label = "1 Capture"
 
     def draw(self, context: Any) -> None:
         layout, chosen = self.layout, settings(context)
         layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
+        row = layout.row(align=True)
+        row.operator(ids.IMPORT_MOTION, text="FLAME Motion", icon="ARMATURE_DATA")
+        row.operator(ids.IMPORT_MESHES, text="Meshes", icon="MESH_DATA")
         layout.prop(chosen, "head")
         if is_head(chosen.head):
             layout.label(
@@ -35,36 +46,7 @@ class CapturePanel(_Step, bpy.types.Panel):
             )
 
 
-class SelectPanel(_Step, bpy.types.Panel):
-    bl_idname = "STGA_PT_select"
-    bl_label = "2 Select"
-
-    def draw(self, context: Any) -> None:
-        layout, head = self.layout, settings(context).head
-        layout.operator(ids.SELECT, icon="GROUP_VERTEX")
-        if is_head(head):
-            frames = sum(tags.group_timestep(group.name) is not None for group in head.vertex_groups)
-            layout.label(text=f"{frames} frames have a selection" if frames else "No selection yet")
-
-
-class TrainPanel(_Step, bpy.types.Panel):
-    bl_idname = "STGA_PT_train"
-    bl_label = "3 Train"
-
-    def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, settings(context)
-        layout.prop(chosen, "run_folder")
-        layout.prop(chosen, "resume")
-        column = layout.column()
-        column.active = not chosen.resume  # a run that goes on keeps its budget and strategy
-        column.prop(chosen, "minutes")
-        column.prop(chosen, "strategy")
-        train = layout.operator(ids.TRAIN, icon="PLAY")
-        train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, chosen.resume
-        train.strategy = chosen.strategy
-
-
-class ShowPanel(_Step, bpy.types.Panel):
+class ShowPanel(Step, bpy.types.Panel):
     bl_idname = "STGA_PT_show"
     bl_label = "4 Show"
 
@@ -92,9 +74,24 @@ class ShowPanel(_Step, bpy.types.Panel):
         if view_transform_hint(context.scene):
             layout.label(text="View transform changes the colours", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)
+        hint = few_bounces_hint(context.scene)
+        if hint:
+            layout.label(text=hint, icon="ERROR")
+            layout.operator(ids.MORE_BOUNCES)
 
 
-CLASSES = (CapturePanel, SelectPanel, TrainPanel, ShowPanel)
+CLASSES = (
+    CapturePanel,
+    SelectedFrames,
+    SelectPanel,
+    TrainPanel,
+    EffectsPanel,
+    ShowPanel,
+    MotionPanel,
+    ExpressionPanel,
+    IdentityPanel,
+    RenderPanel,
+)
 
 
 def register() -> None:

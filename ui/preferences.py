@@ -4,8 +4,13 @@ from typing import Any
 
 import bpy
 
+from ..operators import ids, watch
 from ..operators.common import register_classes, unregister_classes
+from ..operators.runtime import runtime_folder
+from ..stga_addon.runtime import made_python, task_folder
 from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.task import State
+from .mishap import draw_mishap
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -19,8 +24,37 @@ class Preferences(bpy.types.AddonPreferences):
         options=PATH_OPTIONS,
     )
 
+    runtime_python: bpy.props.StringProperty(
+        name="Python",
+        description="An interpreter that has torch, numba and what else training needs; empty: the runtime made here",
+        subtype="FILE_PATH",
+    )
+
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "flame_model")
+        _draw_runtime(self.layout.box(), context, self)
+
+
+def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
+    folder = task_folder(runtime_folder())
+    now = watch.snapshot(folder)
+    box.label(text="Training Runtime")
+    row = box.row(align=True)
+    row.prop(stored, "runtime_python")
+    row.operator(ids.TEST_RUNTIME)
+    if made_python(runtime_folder()):
+        box.label(text=f"Made here: {runtime_folder() / 'venv'}", icon="CHECKMARK")
+    if now.state.is_alive:
+        row = box.row(align=True)
+        row.progress(factor=now.status.share, text=now.status.message)
+        row.operator(ids.CANCEL_RUNTIME, icon="CANCEL")
+        box.label(text=now.status.remark)
+        return
+    if now.state.is_mishap:
+        draw_mishap(box, context, now.status.error, now.tail, folder)
+    elif now.state == State.FINISHED:
+        box.label(text=now.status.message, icon="CHECKMARK")
+    box.operator(ids.MAKE_RUNTIME, text="Make Runtime…", icon="IMPORT")
 
 
 def register() -> None:

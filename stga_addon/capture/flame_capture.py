@@ -7,7 +7,15 @@ from pathlib import Path
 from ..errors import StgaError
 from ..flame.masks import key_regions
 from ..flame.model import FlameModel, read_flame
-from ..flame.sequence import FlameSequence, expression_mesh, neutral_mesh, read_frame, read_identity, sequence_mesh
+from ..flame.sequence import (
+    FlameSequence,
+    expression_mesh,
+    neutral_mesh,
+    read_frame,
+    read_identity,
+    read_motion,
+    sequence_mesh,
+)
 from ..flame.teeth import TEMPLATE_VERTICES, with_teeth
 from .meshes import file_of, remembered
 from .model import Capture, View
@@ -26,15 +34,23 @@ def open_flame_capture(
     with them; a model of any other size is taken as it is. Shape and static offset come from the first timestep.
     Raises StgaError, also where the model file is not given: FLAME's licence does not let anyone pass it on.
     """
-    if model_file is None:
-        raise StgaError(f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame")
-    model = flame_model(model_file)
+    model = _model_for(root, model_file)
     files = parameter_files(root, transforms)
     first = files[min(files)]
     shape, static_offset = read_identity(first, model)
     sequence = FlameSequence(
         model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
     )
+    return _flame_capture(root, sequence, views)
+
+
+def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
+    """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views. Raises StgaError."""
+    return _flame_capture(path, read_motion(path, _model_for(path, model_file)), {})
+
+
+def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tuple[View, ...]]) -> Capture:
+    model = sequence.model
     regions = key_regions(model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"
     return Capture(
@@ -50,6 +66,12 @@ def open_flame_capture(
         flame=sequence,
         warnings=() if regions else (missing,),
     )
+
+
+def _model_for(root: Path, model_file: Path | None) -> FlameModel:
+    if model_file is None:
+        raise StgaError(f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame")
+    return flame_model(model_file)
 
 
 def flame_model(path: Path) -> FlameModel:

@@ -16,6 +16,20 @@ ZERO_POSES = ("head", "all")
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
 COEFFICIENTS = ("expr", "shape")
 REQUIRED_FIELDS = ("expr", "rotation", "translation")
+# What trackers other than VHAP call the fields.
+ALIASES = {
+    "exp": "expr",
+    "expression": "expr",
+    "global_orient": "rotation",
+    "transl": "translation",
+    "jaw": "jaw_pose",
+    "neck": "neck_pose",
+    "eyes": "eyes_pose",
+    "eye_pose": "eyes_pose",
+    "betas": "shape",
+}
+# Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
+POSES = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 MOTION_PACKING = 256  # dynamic offsets that are all zero, as most are, pack a published FLAME's motion 116 times
 
 
@@ -72,7 +86,11 @@ def read_frame(path: Path, model: FlameModel) -> FlameFrame:
     Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression coefficients than the model has, and
     offsets without the teeth's vertices, are filled up with zeros. Raises StgaError naming the file and the field.
     """
-    return _frame(path, read_npz(path), model)
+    arrays = read_npz(path)
+    for name in REQUIRED_FIELDS:
+        if name not in arrays:
+            raise StgaError(f"{path}: has no {name}, which a FLAME frame needs")
+    return _frame(path, arrays, model)
 
 
 def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
@@ -81,23 +99,26 @@ def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray
 
 
 def read_motion(path: Path, model: FlameModel) -> FlameSequence:
-    """Read a whole motion from one file: arrays with a leading time axis.
+    """Read a whole motion from one file: arrays with a leading time axis, of which any but one may be missing (zero).
 
-    VHAP's `tracked_flame_params_*.npz` and the `flame_param.npz` of a GaussianAvatars avatar. Timesteps count from 0.
-    Raises StgaError naming the file and the field.
+    VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a GaussianAvatars avatar, and
+    plain files of expression and pose, by the names in `ALIASES` too; `pose` holds the joints of `POSES`. Timesteps
+    count from 0. Raises StgaError naming the file and the field.
     """
-    arrays = read_npz(path, max_packing=MOTION_PACKING)
-    for name in REQUIRED_FIELDS:
-        if name not in arrays:
-            raise StgaError(f"{path}: has no {name}, which a FLAME motion needs")
-    if arrays["expr"].ndim != 2 or not len(arrays["expr"]):
-        raise StgaError(f"{path}: expr has shape {arrays['expr'].shape}, expected (timesteps, coefficients)")
-    count = len(arrays["expr"])
-    shape, static_offset = _identity(path, arrays, model)
+    arrays = _spelled_out(path, read_npz(path, max_packing=MOTION_PACKING))
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
+    if not moving:
+        raise StgaError(f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of")
+    name, array = next(iter(moving.items()))
+    if array.ndim < 2 or not len(array):
+        raise StgaError(f"{path}: {name} has shape {array.shape}, expected (timesteps, coefficients)")
+    count = len(array)
     for name, array in moving.items():
         if array.ndim < 2 or len(array) != count:
             raise StgaError(f"{path}: {name} has shape {array.shape}, expected {count} timesteps first")
+    if "shape" in arrays and arrays["shape"].ndim == 2:
+        arrays["shape"] = arrays["shape"][0]  # one a timestep: whoever is tracked stays the same person
+    shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
 
     def frame(timestep: int) -> FlameFrame:
         return _frame(path, {name: array[timestep] for name, array in moving.items()}, model)
@@ -107,10 +128,22 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     return FlameSequence(model, shape, static_offset, tuple(range(count)), frame)
 
 
+def _spelled_out(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays by VHAP's names, with `pose` taken apart."""
+    named = {ALIASES[name]: array for name, array in arrays.items() if name in ALIASES} | dict(arrays)
+    pose = named.pop("pose", None)
+    if pose is None:
+        return named
+    if pose.ndim < 2 or not len(pose) or pose[0].size not in POSES:
+        sizes = " or ".join(f"(timesteps, {size})" for size in POSES)
+        raise StgaError(f"{path}: pose has shape {pose.shape}, expected {sizes}")
+    fields = POSES[pose[0].size]
+    columns = pose.reshape(len(pose), -1)
+    parts = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
+    return dict(zip(fields, parts, strict=True)) | named
+
+
 def _frame(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameFrame:
-    for name in REQUIRED_FIELDS:
-        if name not in arrays:
-            raise StgaError(f"{path}: has no {name}, which a FLAME frame needs")
     sizes = dict.fromkeys(FRAME_FIELDS, 3) | {"expr": model.n_expression, "eyes_pose": 6}
     values = {name: _vector(path, arrays, name, size) for name, size in sizes.items()}
     offset = _offset(path, arrays, "dynamic_offset", len(model.v_template))

@@ -1,16 +1,16 @@
 """Splats and a camera to an image, and the image's gradient back to the splats, on the CPU."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-import torch
 
-from ..avatar.embedding import WORLD, FaceFrames
+from ..avatar.embedding import FaceFrames
 from ..avatar.splats import no_strain_color
 from ..capture.camera import Camera
-from .kernels.bins import count_pairs, depth_order, fill_pairs, mark_tiles
+from .kernels.bins import count_pairs, depth_order, fill_pairs, mark_tiles, reaching
 from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
 from .kernels.project import project_backward, project_forward
 
@@ -18,7 +18,7 @@ BLACK = np.zeros(3, np.float32)
 
 
 class Parameters(NamedTuple):
-    """What is trained of N splats, in the raw form of `Splats`: numpy float32 arrays, or torch tensors in `render`.
+    """What is trained of N splats, in the raw form of `Splats`: numpy float32 arrays, or torch tensors in `autograd`.
 
     Without `strain_color`, colours do not follow strain.
     """
@@ -50,7 +50,7 @@ class Rendering:
 
     image (3, H, W) float32 over the background; transmittance (H, W) = 1 − alpha.
     With restricted tiles, pixels of other tiles are undefined.
-    visible (M,) int32: the splats that reach a tile.
+    visible (M,) int32: the splats that reach a rendered tile.
     """
 
     image: np.ndarray
@@ -126,37 +126,67 @@ def render_forward(
     antialiased: splats narrower than a pixel, which are drawn a pixel wide, lose the opacity that this adds.
     scratch: buffers to reuse; the rendering is then valid until the next one with the same scratch.
     """
-    n, camera, splats = len(splats.xyz), seen.camera, _complete(splats)
+    n, camera, splats = len(splats.xyz), seen.camera, complete(splats)
     take = (scratch or Scratch()).take
-    tiles_x, tiles_y = _tile_grid(camera)
+    tiles_x, tiles_y = tile_grid(camera)
     projected, depth = take("projected", (n, PROJECTED)), take("depth", (n,))
     extent_y, rect = take("extent_y", (n,)), take("rect", (n, 4), np.int32)
     project_forward(
         *splats, degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
         depth_as_colour, antialiased, projected, depth, extent_y, rect,
     )  # fmt: skip
+    drawn = None if focus is None else _near(_touched(rect, focus, (camera.height, camera.width)), reach)
+    bins = sort_into_tiles(depth, rect, camera, take, drawn)
+    tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
+    tiles = deal(tiles if drawn is None else tiles[drawn.ravel()], numba.get_num_threads())
+    image = take("image", (3, camera.height, camera.width))
+    transmittance = take("transmittance", (camera.height, camera.width))
+    last = take("last", (camera.height, camera.width), np.int32)
+    background = np.asarray(background, np.float32)
+    blend_forward(
+        tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, background, image, transmittance, last
+    )
+    return Rendering(
+        image, transmittance, bins.visible, projected, extent_y, rect, last, bins.slot_start, bins.slot_count,
+        bins.start, bins.pair_splat, bins.pair_slot, tiles, background, degree, depth_as_colour, antialiased,
+    )  # fmt: skip
+
+
+class Bins(NamedTuple):
+    """Which splats touch which tile, as `blend_forward` wants it; visible (M,) int32: those that touch any."""
+
+    visible: np.ndarray
+    slot_start: np.ndarray
+    slot_count: np.ndarray
+    start: np.ndarray
+    pair_splat: np.ndarray
+    pair_slot: np.ndarray
+
+
+def sort_into_tiles(
+    depth: np.ndarray,
+    rect: np.ndarray,
+    camera: Camera,
+    take: Callable[..., np.ndarray],
+    drawn: np.ndarray | None = None,
+) -> Bins:
+    """Projected splats in tiles, front to back; depth (N,) and rect (N, 4) from `project_forward`, take: a `Scratch`'s.
+
+    Splats of several projections may stand in the arrays one after the other. drawn (tiles_y, tiles_x) bool: leave out
+    the splats that reach none of these tiles.
+    """
+    tiles_x, tiles_y = tile_grid(camera)
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
+    if drawn is not None:
+        visible = reaching(rect, visible, drawn)
     order = depth_order(depth, visible)
-    slot_start, slot_count = take("slot_start", (n,), np.int32), take("slot_count", (n,), np.int32)
+    slot_start, slot_count = take("slot_start", depth.shape, np.int32), take("slot_count", depth.shape, np.int32)
     start = count_pairs(rect, order, tiles_x, tiles_y, slot_start, slot_count)
     pair_splat = take("pair_splat", (start[-1],), np.int32)
     pair_slot = take("pair_slot", (start[-1],), np.int32)
     bands = max(1, min(tiles_y, numba.get_num_threads()))
     fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, bands, pair_splat, pair_slot)
-
-    tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
-    if focus is not None:
-        tiles = tiles[_near(_touched(rect, focus, visible, (camera.height, camera.width)), reach).ravel()]
-    tiles = _deal(tiles, numba.get_num_threads())
-    image = take("image", (3, camera.height, camera.width))
-    transmittance = take("transmittance", (camera.height, camera.width))
-    last = take("last", (camera.height, camera.width), np.int32)
-    background = np.asarray(background, np.float32)
-    blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last)
-    return Rendering(
-        image, transmittance, visible, projected, extent_y, rect, last, slot_start, slot_count, start, pair_splat,
-        pair_slot, tiles, background, degree, depth_as_colour, antialiased,
-    )  # fmt: skip
+    return Bins(visible, slot_start, slot_count, start, pair_splat, pair_slot)
 
 
 def render_backward(
@@ -180,7 +210,7 @@ def render_backward(
     the projected centre in units of half the image.
     """
     n, take = len(splats.xyz), (scratch or Scratch()).take
-    tiles_x, _ = _tile_grid(seen.camera)
+    tiles_x, _ = tile_grid(seen.camera)
     tiles, rows = rendering.tiles, rendering.visible
     wanted = np.ones(n, bool) if focus is None else focus
     if focus is not None:
@@ -196,14 +226,15 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        *_complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens,
+        *complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens,
         seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected, rows,
-        rendering.slot_start, rendering.slot_count, pair_gradients, add, *_complete(gradients), screen,
+        rendering.slot_start, rendering.slot_count, pair_gradients, add, *complete(gradients), screen,
     )  # fmt: skip
     return rows, screen
 
 
-def _complete(splats: Parameters) -> Parameters:
+def complete(splats: Parameters) -> Parameters:
+    """With an empty `strain_color` where there is none, as the kernels want it."""
     if splats.strain_color is not None:
         return splats
     return splats._replace(strain_color=no_strain_color(len(splats.xyz)))
@@ -211,16 +242,17 @@ def _complete(splats: Parameters) -> Parameters:
 
 def touched_tiles(rendering: Rendering, focus: np.ndarray) -> np.ndarray:
     """(tiles_y, tiles_x) bool: the tiles that a splat of `focus` (N,) bool reaches."""
-    return _touched(rendering.rect, focus, rendering.visible, rendering.last.shape)
+    return _touched(rendering.rect, focus, rendering.last.shape)
 
 
-def _touched(rect: np.ndarray, focus: np.ndarray, visible: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _touched(rect: np.ndarray, focus: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     marked = np.zeros([-(-pixels // TILE) for pixels in size], bool)
-    mark_tiles(rect, focus, visible, marked)
+    mark_tiles(rect, focus, marked)
     return marked
 
 
-def _tile_grid(camera: Camera) -> tuple[int, int]:
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Columns and rows of tiles."""
     return -(-camera.width // TILE), -(-camera.height // TILE)
 
 
@@ -234,52 +266,6 @@ def _near(tiles: np.ndarray, reach: int) -> np.ndarray:
     return grown
 
 
-def _deal(tiles: np.ndarray, threads: int) -> np.ndarray:
+def deal(tiles: np.ndarray, threads: int) -> np.ndarray:
     """Deal tiles out like cards, so that every thread's contiguous share is spread over the whole image."""
     return np.concatenate([tiles[k::threads] for k in range(threads)])
-
-
-def render(
-    splats: Parameters,
-    camera: Camera,
-    frames: FaceFrames = WORLD,
-    face: np.ndarray | None = None,
-    degree: int = 3,
-    antialiased: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Differentiable rendering of float32 torch tensors: the functional door to the kernels.
-
-    Without frames and face the splats are world-space ones. Returns rgb (3, H, W) premultiplied on black,
-    alpha (H, W), and depth (H, W) = Σ weight · camera z.
-    """
-    face = np.zeros(len(splats.xyz), np.int32) if face is None else face
-    seen = camera_frames(frames, camera)
-    given = [tensor for tensor in splats if tensor is not None]
-    rgb, transmittance = _Blend.apply(seen, face, degree, False, antialiased, *given)  # type: ignore[no-untyped-call]
-    depth, _ = _Blend.apply(seen, face, degree, True, antialiased, *given)  # type: ignore[no-untyped-call]
-    return rgb, 1 - transmittance, depth[0]
-
-
-class _Blend(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        seen: CameraFrames,
-        face: np.ndarray,
-        degree: int,
-        depth_as_colour: bool,
-        antialiased: bool,
-        *tensors: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
-        rendering = render_forward(splats, face, seen, degree, depth_as_colour=depth_as_colour, antialiased=antialiased)
-        ctx.saved = seen, face, splats, rendering
-        return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
-
-    @staticmethod
-    def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
-        seen, face, splats, rendering = ctx.saved
-        gradients = Parameters(*(np.zeros_like(a) for a in splats if a is not None))
-        v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
-        render_backward(rendering, splats, face, seen, v_rgb, gradients, v_t)
-        return None, None, None, None, None, *(torch.from_numpy(g) for g in gradients if g is not None)

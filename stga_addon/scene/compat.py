@@ -8,6 +8,7 @@ import numpy as np
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
+NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")
 # Options of a path property that may start with "//"; newer versions want to be told, older ones refuse the word.
 PATH_OPTIONS = (
     {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -32,6 +33,41 @@ def action_curves(owner: Any) -> Any:
     layer = action.layers[0] if action.layers else action.layers.new("Layer")
     strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
     return strip.channelbag(animation.action_slot, ensure=True).fcurves
+
+
+def copy_action(owner: Any, name: str) -> Any:
+    """Make a copy of the action that animates `owner`, or an empty one, its action; the old one stays in the file.
+
+    Returns the f-curve collection of the new action, as `action_curves`.
+    """
+    animation = owner.animation_data or owner.animation_data_create()
+    old = animation.action
+    if old is None:
+        animation.action = bpy.data.actions.new(name)
+        return action_curves(owner)
+    slot = animation.action_slot.identifier if SLOTTED_ACTIONS and animation.action_slot else None
+    old.use_fake_user = True
+    animation.action = old.copy()
+    animation.action.name = name
+    if slot is not None:
+        animation.action_slot = animation.action.slots[slot]
+    return action_curves(owner)
+
+
+def push_down_action(owner: Any, extrapolation: str = "HOLD") -> None:
+    """Turn the action that animates `owner`, if any, into a strip of its own on top of the NLA tracks."""
+    animation = owner.animation_data
+    if animation is None or animation.action is None:
+        return
+    action = animation.action
+    slot = animation.action_slot if SLOTTED_ACTIONS else None
+    animation.action = None
+    track = animation.nla_tracks.new()
+    track.name = action.name
+    strip = track.strips.new(action.name, int(np.floor(action.frame_range[0])), action)
+    strip.extrapolation = extrapolation
+    if slot is not None:
+        strip.action_slot = slot
 
 
 def write_curve(
@@ -101,16 +137,19 @@ def evaluated_vertices(thing: Any) -> np.ndarray:
 
 
 def set_modifier_input(modifier: Any, identifier: str, value: Any) -> None:
-    """Set a geometry nodes modifier's input by its socket identifier ("Socket_2")."""
+    """Set a geometry nodes modifier's input by its socket identifier ("Socket_2"); a menu's by its item's name."""
     if MODIFIER_INPUT_PROPERTIES:
         getattr(modifier.properties.inputs, identifier).value = value
+    elif isinstance(value, str) and isinstance(modifier[identifier], int):
+        items = modifier.id_properties_ui(identifier).as_dict()["items"]
+        modifier[identifier] = next(item[4] for item in items if item[0] == value)
     else:
         modifier[identifier] = value
     modifier.id_data.update_tag()
 
 
 def modifier_input(modifier: Any, identifier: str) -> Any:
-    """The value of a geometry nodes modifier's input by its socket identifier."""
+    """The value of a geometry nodes modifier's input by its socket identifier; a menu's is a number before 5.2."""
     if MODIFIER_INPUT_PROPERTIES:
         return getattr(modifier.properties.inputs, identifier).value
     return modifier[identifier]
@@ -121,3 +160,8 @@ def modifier_input_owner(modifier: Any, identifier: str) -> tuple[Any, str]:
     if MODIFIER_INPUT_PROPERTIES:
         return getattr(modifier.properties.inputs, identifier), "value"
     return modifier, f'["{identifier}"]'
+
+
+def world_nodes(world: Any) -> Any:
+    """The node tree that a world uses; None where it is a plain colour, which ended with Blender 4."""
+    return world.node_tree if bpy.app.version >= (5, 0, 0) or world.use_nodes else None

@@ -5,13 +5,14 @@ vertices are in the group. Writing a selection and reading it back therefore kee
 those that selected ones enclose on all three corners (`closure` says which).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..errors import StgaError
 from . import tags
+from .node_colors import FACE
 
 
 def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -62,6 +63,41 @@ def read_selection(head: Any) -> dict[int, np.ndarray]:
     for row, timestep in zip(painted, columns.values(), strict=True):
         selection[timestep] = row[faces].all(1)
     return selection
+
+
+def painted_selection(head: Any) -> dict[int, np.ndarray] | None:
+    """`read_selection` for training; None where the head has no selection group, so that the trainer selects itself."""
+    if any(tags.group_timestep(group.name) is not None for group in head.vertex_groups):
+        return read_selection(head)
+    return None
+
+
+def painted_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """name -> (F,) bool of vertex groups of the head: the triangles whose corners all have a weight of 0.5 or more."""
+    head.update_from_editmode()
+    painted = _painted(head.data, len(head.vertex_groups), [head.vertex_groups[name].index for name in names])
+    faces = _faces(head.data)
+    return {name: row[faces].all(1) for name, row in zip(names, painted, strict=True)}
+
+
+def splats_per_face(shown: Any, head: Any) -> np.ndarray | None:
+    """(F,) how many splats of the object `shown` each triangle of the head carries; None where it shows no avatar."""
+    attribute = shown.data.attributes.get(FACE) if shown is not None else None
+    if attribute is None:
+        return None
+    face = np.empty(len(attribute.data), np.int32)
+    attribute.data.foreach_get("value", face)
+    count = np.bincount(face, minlength=len(head.data.polygons))
+    return count if len(count) == len(head.data.polygons) else None
+
+
+def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
+    """(F,) bool of one timestep as it is painted; None where it has no group."""
+    group = head.vertex_groups.get(tags.group_name(timestep))
+    if group is None:
+        return None
+    (painted,) = _painted(head.data, len(head.vertex_groups), [group.index])
+    return np.asarray(painted[_faces(head.data)].all(1))
 
 
 def _painted(mesh: Any, groups: int, wanted: list[int]) -> np.ndarray:

@@ -1,88 +1,76 @@
 """The tracked head as an animated Blender mesh: shape keys for any topology, a rig for FLAME."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..capture.model import Capture
-from ..flame.sequence import FlameSequence, neutral_mesh
 from . import compat, tags
-from .hierarchy import Warn, capture_root, log_warning, place, triangle_mesh
+from .hierarchy import Warn, capture_root, log_warning, place, reset, triangle_mesh
 from .rig import add_rig, remove_rig
 
 
-def import_head(
-    capture: Capture, name: str | None = None, warn: Warn = log_warning, all_expressions: bool = False
-) -> Any:
+def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warning) -> Any:
     """The capture's head as a mesh object, animated so that Blender's frame number is the capture's timestep.
 
     A FLAME capture becomes a rig (see `rig.add_rig`); any other gets one shape key a timestep, `t00012`, which is 1 at
     its own frame, so that the evaluated mesh of that frame is the timestep's mesh; between frames the two neighbours
     blend. Object coordinates are the capture's (metres, y-up). Regions become boolean face attributes
-    `stga_region_<name>`. Importing the same folder again replaces what the last import made. Raises StgaError where a
-    timestep cannot be read; the scene is then unchanged. `warn` receives one sentence for each thing worth knowing;
-    `all_expressions` makes a key for every expression component of FLAME, used or not.
+    `stga_region_<name>`. Importing the same folder or file again replaces what the last import made; vertex groups and
+    materials stay where the triangles are the same. Raises StgaError
+    where a timestep cannot be read; the scene is then unchanged. `warn` receives one sentence for each thing worth
+    knowing.
     """
-    if capture.flame is not None:
-        return _import_flame(capture.flame, capture.root, name, capture.neutral, capture.regions, warn, all_expressions)
+    sequence = capture.flame
+    if sequence is not None:
+        frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+        head = _place_head(capture, name)
+        add_rig(head, sequence, frames, warn)
+        return head
     meshes = np.empty((len(capture.timesteps), *capture.neutral.shape), np.float32)
     for row, timestep in enumerate(capture.timesteps):
         meshes[row] = capture.mesh(timestep)
-    head = _place_head(capture.root, name, capture.neutral, capture.faces, capture.regions, capture.timesteps)
+    head = _place_head(capture, name)
     remove_rig(head)
     _add_timestep_keys(head, capture.timesteps, meshes)
     return head
 
 
-def import_motion(
-    sequence: FlameSequence,
-    source: Path,
-    name: str | None = None,
-    warn: Warn = log_warning,
-    all_expressions: bool = False,
-) -> Any:
-    """A FLAME motion without images as a rigged head mesh object; `source` is the file it came from.
-
-    Otherwise as `import_head`.
-    """
-    return _import_flame(sequence, source, name, neutral_mesh(sequence), {}, warn, all_expressions)
-
-
-def _import_flame(
-    sequence: FlameSequence,
-    source: Path,
-    name: str | None,
-    neutral: np.ndarray,
-    regions: Mapping[str, np.ndarray],
-    warn: Warn,
-    all_expressions: bool,
-) -> Any:
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    head = _place_head(source, name, neutral, sequence.model.faces, regions, sequence.timesteps)
-    add_rig(head, sequence, frames, warn, all_expressions)
-    return head
-
-
-def _place_head(
-    source: Path,
-    name: str | None,
-    neutral: np.ndarray,
-    faces: np.ndarray,
-    regions: Mapping[str, np.ndarray],
-    timesteps: Sequence[int],
-) -> Any:
-    root = capture_root(source, name)
-    title = f"{root.name} head"
-    mesh = triangle_mesh(title, neutral, faces)
-    for region, members in regions.items():
-        attribute = mesh.attributes.new(tags.REGION_PREFIX + region, "BOOLEAN", "FACE")
+def _place_head(capture: Capture, name: str | None) -> Any:
+    root = capture_root(capture.root, name)
+    head = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    if head is not None and _has_triangles(head.data, capture.faces):
+        _renew_mesh(head, capture)
+    else:
+        title = f"{root.name} head"
+        head = place(root, tags.HEAD, title, triangle_mesh(title, capture.neutral, capture.faces), head)
+    for region, members in capture.regions.items():
+        attribute = head.data.attributes.new(tags.REGION_PREFIX + region, "BOOLEAN", "FACE")
         attribute.data.foreach_set("value", np.ascontiguousarray(members, bool))
-    head = place(root, tags.HEAD, title, mesh, next(iter(tags.find(tags.HEAD, source)), None))
-    head[tags.TIMESTEPS] = [int(timestep) for timestep in timesteps]
+    head[tags.TIMESTEPS] = [int(timestep) for timestep in capture.timesteps]
     head.shape_key_add(name="Basis", from_mix=False)
     return head
+
+
+def _has_triangles(mesh: Any, faces: np.ndarray) -> bool:
+    corners = np.empty(len(mesh.loops), np.int32)
+    mesh.loops.foreach_get("vertex_index", corners)
+    return np.array_equal(corners, faces.ravel())
+
+
+def _renew_mesh(head: Any, capture: Capture) -> None:
+    """The same triangles again: what an artist painted, and the selection that was made, stay on them."""
+    reset(head)
+    mesh = head.data
+    mesh.vertices.foreach_set("co", capture.neutral.astype(np.float32).ravel())
+    mesh.update()
+    for name in [name for name in mesh.attributes.keys() if name.startswith(tags.REGION_PREFIX)]:  # noqa: SIM118
+        mesh.attributes.remove(mesh.attributes[name])
+    for group in reversed(list(head.vertex_groups)):  # the last first: removal renumbers those behind
+        timestep = tags.group_timestep(group.name)
+        if timestep is not None and timestep not in capture.timesteps:
+            head.vertex_groups.remove(group)
 
 
 def _add_timestep_keys(head: Any, timesteps: Sequence[int], meshes: np.ndarray) -> None:

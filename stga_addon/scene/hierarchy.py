@@ -58,6 +58,16 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
     return thing
 
 
+def reset(thing: Any) -> None:
+    """Take a mesh object of an earlier import back to its bare mesh: without keyframes, drivers and shape keys."""
+    leave_edit_mode()
+    actions = [_action(thing), _action(thing.data.shape_keys)]
+    thing.animation_data_clear()
+    if thing.data.shape_keys is not None:
+        thing.shape_key_clear()
+    _purge([], actions)
+
+
 def leave_edit_mode() -> None:
     """Back to object mode, whichever mode the active object is in: what is being edited cannot be exchanged."""
     active = bpy.context.view_layer.objects.active

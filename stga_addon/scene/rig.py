@@ -1,10 +1,13 @@
 """FLAME as a Blender rig whose mesh is FLAME's own forward pass, on the tracked frames and for any pose set by hand.
 
 Expression coefficients are shape keys, joint rotations are pose bones, pose correctives are shape keys driven by the
-bones, and linear blend skinning is the armature modifier. FLAME regresses its joints from the *shaped* vertices, so an
-expression moves the point a joint turns about by d = D·expr, which a bone's rest position cannot. A bone whose joint
-moves therefore hangs on a hidden bone `<name>_joint`, driven to d, and carries a hidden bone `<name>_deform`, driven to
--d, which the vertices follow. All drivers are arithmetic, which Blender evaluates without Python.
+bones, and linear blend skinning is the armature modifier. The first identity components are shape keys too, counted
+from the person who was tracked: with all of them at zero the head is that person's.
+
+FLAME regresses its joints from the *shaped* vertices, so a slider moves the point a joint turns about by d = D·sliders,
+which a bone's rest position cannot. A bone whose joint moves therefore hangs on a hidden bone `<name>_joint`, driven to
+d, and carries a hidden bone `<name>_deform`, driven to -d, which the vertices follow. All drivers are arithmetic, which
+Blender evaluates without Python.
 """
 
 from collections.abc import Sequence
@@ -14,15 +17,23 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ..errors import StgaError
 from ..flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ..flame.model import JOINTS, FlameModel
+from ..flame.motion import PARTS
+from ..flame.quaternions import continuous, from_axis_angle
 from ..flame.sequence import FlameSequence
 from . import compat, tags
 from .hierarchy import Warn, leave_edit_mode, log_warning, place, remove
 
+IDENTITY_SLIDERS = 10
+PART_JOINTS = {"jaw": ("jaw",), "eyes": ("left_eye", "right_eye"), "neck": ("neck",), "head": ("root",)}
 SLIDER = 10.0  # the widest range a shape key's value can have
 BONE_LENGTH = 0.03  # metres; only how long the bones are drawn
 NEGLIGIBLE = 1e-6  # metres a joint may be off along an axis when all sliders are at their ends
+# Starts of shape keys' names; the number behind is the column in a parameter file, or the timestep.
+EXPRESSION_KEY, IDENTITY_KEY, OFFSET_KEY = "expr_", "identity_", "offset_t"
+ROOT_LOCATION = 'pose.bones["root"].location'
 QUATERNION = ("w", "x", "y", "z")
 NORM = "(w*w+x*x+y*y+z*z)"  # keyed quaternions interpolate unnormalised
 # (rotation - identity) / 2 as quadratic forms of the quaternion, row by row.
@@ -35,46 +46,136 @@ ROTATION_MINUS_IDENTITY = (
 TERMS = "abcdfghijklmnopqrs"
 
 
-def add_rig(
-    head: Any,
-    sequence: FlameSequence,
-    frames: Sequence[FlameFrame],
-    warn: Warn = log_warning,
-    all_expressions: bool = False,
-) -> Any:
+def add_rig(head: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], warn: Warn = log_warning) -> Any:
     """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature object.
 
-    head has its "Basis" shape key; frames: the sequence's frames, one a timestep. Expression keys `expr_000`… are made
-    for the components the sequence uses, or for all. The evaluated mesh equals `flame_forward` within 1e-5 m. Vertex
-    offsets that change by frame have no rig: they become one shape key a timestep, which `warn` is told, as it is of
-    coefficients beyond ±10.
+    head has its "Basis" shape key; frames: the sequence's frames, one a timestep. The evaluated mesh equals
+    `flame_forward` within 1e-5 m. Vertex offsets that change by frame have no rig: they become one shape key a
+    timestep, which `warn` is told, as it is of coefficients beyond ±10.
     """
     model = sequence.model
     basis = shaped_vertices(model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset)
-    expressions = np.stack([frame.expr for frame in frames])
-    components = np.arange(model.n_expression) if all_expressions else np.flatnonzero(expressions.any(axis=0))
-    directions = _joint_directions(model, components)
+    sliders = slider_components(model)
+    directions = _joint_directions(model, list(sliders.values()))
     has_offsets = any(frame.dynamic_offset is not None for frame in frames)
     moving = [has_offsets or any(terms for terms in _terms(direction)) for direction in directions]
+    _remove_bone_groups(head, _rigs(head))
     rig = _place_armature(head, joint_positions(model, basis), model.parents, moving)
     _skin(head, rig, model.weights, moving)
-    _add_expression_keys(head, sequence, components, basis, expressions[:, components], warn)
+    for name, component in sliders.items():
+        _new_key(head, name, basis + model.shapedirs[:, :, component], SLIDER)
     _add_pose_keys(head, rig, model, basis)
-    _animate_bones(rig, sequence.timesteps, frames)
+    key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
         _add_offset_keys(head, sequence, frames, basis, warn)
         _animate_offset_joints(rig, sequence, frames)
     for joint in np.flatnonzero(moving).tolist():
-        _drive_joint(head, rig, joint, components, directions[joint])
+        _drive_joint(head, rig, joint, list(sliders), directions[joint])
     return rig
+
+
+def slider_components(model: FlameModel) -> dict[str, int]:
+    """Shape key -> component of `model.shapedirs`: every expression, and the first `IDENTITY_SLIDERS` of identity."""
+    expressions = {expression_key(k): model.n_identity + k for k in range(model.n_expression)}
+    return expressions | {identity_key(k): k for k in range(min(IDENTITY_SLIDERS, model.n_identity))}
+
+
+def expression_key(component: int) -> str:
+    return f"{EXPRESSION_KEY}{component:03d}"
+
+
+def identity_key(component: int) -> str:
+    return f"{IDENTITY_KEY}{component:03d}"
+
+
+def joint_bone(name: str) -> str:
+    """The hidden bone that carries a bone whose joint moves with the sliders."""
+    return f"{name}_joint"
+
+
+def key_motion(
+    head: Any,
+    rig: Any,
+    numbers: Sequence[int],
+    frames: Sequence[FlameFrame],
+    parts: Sequence[str] = tuple(PARTS),
+    warn: Warn = log_warning,
+) -> None:
+    """Add keyframes of the parts (`flame.motion.PARTS`) of `frames` to the active actions of rig and shape keys.
+
+    numbers: the Blender frame of each, ascending. A slider that the motion never moves gets a single keyframe.
+    """
+    if "expression" in parts:
+        _key_expressions(head, numbers, np.stack([frame.expr for frame in frames]), warn)
+    bones = [bone for part in parts for bone in PART_JOINTS.get(part, ())]
+    if not bones:
+        return
+    curves, at = compat.action_curves(rig), np.asarray(numbers)
+    poses = np.stack([frame.pose for frame in frames])
+    for bone in bones:
+        quaternions = continuous(from_axis_angle(poses[:, JOINTS.index(bone)]))
+        for element in range(4):
+            compat.write_curve(curves, _rotation_path(bone), element, at, quaternions[:, element])
+    if "head" in parts:
+        translations = np.stack([frame.translation for frame in frames])
+        for axis in range(3):
+            compat.write_curve(curves, ROOT_LOCATION, axis, at, translations[:, axis])
+
+
+def is_of_parts(data_path: str, parts: Sequence[str]) -> bool:
+    """Whether an f-curve of the rig or the shape keys animates one of the parts (`flame.motion.PARTS`)."""
+    starts = [f'pose.bones["{bone}"].rotation_' for part in parts for bone in PART_JOINTS.get(part, ())]
+    starts += [ROOT_LOCATION] if "head" in parts else []
+    # The offsets of the tracked frames belong to the expressions that were tracked.
+    starts += [f'key_blocks["{EXPRESSION_KEY}', f'key_blocks["{OFFSET_KEY}', '["stga_'] if "expression" in parts else []
+    return data_path.startswith(tuple(starts))
+
+
+def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:
+    """The data-blocks in whose actions the parts are keyframed: the rig, the shape keys, or both."""
+    bones = set(parts) & set(PART_JOINTS) or ("expression" in parts and offset_keys(head))
+    return ([rig] if bones else []) + ([head.data.shape_keys] if "expression" in parts else [])
+
+
+def still_offsets(head: Any, rig: Any, frame: int) -> None:
+    """Keyframe the tracked per-frame offsets of mesh and joints, where there are any, to stay zero."""
+    at, nothing = np.array([frame]), np.zeros(1)
+    for key in offset_keys(head):
+        compat.write_curve(compat.action_curves(head.data.shape_keys), _value_path(key.name), 0, at, nothing)
+    for bone in JOINTS:
+        for axis in range(3) if _offset_property(bone) in rig else ():
+            compat.write_curve(compat.action_curves(rig), f'["{_offset_property(bone)}"]', axis, at, nothing)
+
+
+def offset_keys(head: Any) -> list[Any]:
+    """The shape keys that hold tracked per-frame offsets."""
+    return [key for key in head.data.shape_keys.key_blocks if key.name.startswith(OFFSET_KEY)]
+
+
+def rig_of(head: Any) -> Any:
+    """The armature object that moves `head`. Raises StgaError where it has no FLAME rig."""
+    for modifier in head.modifiers:
+        if modifier.type == "ARMATURE" and modifier.object is not None and modifier.object.get(tags.KIND) == tags.RIG:
+            return modifier.object
+    raise StgaError(
+        f"{head.name}: has no FLAME rig, because it was not imported from parameters of FLAME; its splats follow "
+        "whatever moves its mesh (shape keys, modifiers, a mesh cache)"
+    )
 
 
 def remove_rig(head: Any) -> None:
     """Remove the rig of `head` and the modifiers that bind the head to it, where it has one."""
     rigs = _rigs(head)
+    _remove_bone_groups(head, rigs)
     for modifier in [old for old in head.modifiers if old.type == "ARMATURE" and old.object in rigs]:
         head.modifiers.remove(modifier)
     remove(rigs)
+
+
+def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:
+    bones = {bone.name for rig in rigs for bone in rig.data.bones}
+    for group in reversed([group for group in head.vertex_groups if group.name in bones]):
+        head.vertex_groups.remove(group)
 
 
 def _rigs(head: Any) -> list[Any]:
@@ -110,7 +211,7 @@ def _armature(name: str, joints: np.ndarray, parents: np.ndarray, moving: Sequen
     bpy.ops.object.mode_set(mode="EDIT")
     for joint, (bone, parent) in enumerate(zip(JOINTS, parents.tolist(), strict=True)):
         above = _deform_bone(parent, moving) if parent >= 0 else None
-        chain = [_joint_bone(bone), bone, _deform_bone(joint, moving)] if moving[joint] else [bone]
+        chain = [joint_bone(bone), bone, _deform_bone(joint, moving)] if moving[joint] else [bone]
         for link in chain:
             _edit_bone(armature, link, above, joints[joint].tolist())
             above = link
@@ -135,10 +236,6 @@ def _hide_helpers(armature: Any) -> None:
         (shown if bone.name in JOINTS else hidden).assign(bone)
 
 
-def _joint_bone(name: str) -> str:
-    return f"{name}_joint"
-
-
 def _deform_bone(joint: int, moving: Sequence[bool]) -> str:
     return f"{JOINTS[joint]}_deform" if moving[joint] else JOINTS[joint]
 
@@ -159,33 +256,19 @@ def _new_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> None:
     key = head.shape_key_add(name=name, from_mix=False)
     key.points.foreach_set("co", vertices.astype(np.float32).ravel())
     key.slider_min, key.slider_max = -limit, limit
+    key.value = 0.0  # a key made from a script starts at 1
 
 
-def _expression_name(component: int) -> str:
-    return f"expr_{component:03d}"
-
-
-def _add_expression_keys(
-    head: Any,
-    sequence: FlameSequence,
-    components: np.ndarray,
-    basis: np.ndarray,
-    values: np.ndarray,
-    warn: Warn,
-) -> None:
-    """values (T, K) of the K components."""
-    model = sequence.model
-    for component in components.tolist():
-        direction = model.shapedirs[:, :, model.n_identity + component]
-        _new_key(head, _expression_name(component), basis + direction, SLIDER)
-    curves = compat.action_curves(head.data.shape_keys)
-    frames = np.asarray(sequence.timesteps)
-    for component, column in zip(components.tolist(), values.T, strict=True):
-        compat.write_curve(curves, _value_path(_expression_name(component)), 0, frames, column)
-    row, column = np.unravel_index(np.abs(values).argmax(), values.shape) if values.size else (0, 0)
-    if values.size and abs(values[row, column]) > SLIDER:
+def _key_expressions(head: Any, numbers: Sequence[int], values: np.ndarray, warn: Warn) -> None:
+    """values (T, E), one a frame in `numbers`."""
+    curves, at = compat.action_curves(head.data.shape_keys), np.asarray(numbers)
+    for component, column in enumerate(values.T):
+        keyed = slice(None) if column.any() else slice(1)
+        compat.write_curve(curves, _value_path(expression_key(component)), 0, at[keyed], column[keyed])
+    row, component = np.unravel_index(np.abs(values).argmax(), values.shape) if values.size else (0, 0)
+    if values.size and abs(values[row, component]) > SLIDER:
         warn(
-            f"{head.name}: expr {components[column]} is {values[row, column]:.1f} at timestep {frames[row]}; Blender's"
+            f"{head.name}: expr {component} is {values[row, component]:.1f} at frame {at[row]}; Blender's"
             f" shape keys end at ±{SLIDER:g}, so the mesh differs from the tracked one there"
         )
 
@@ -208,37 +291,15 @@ def _add_offset_keys(
         f"{head.name}: the capture has a dynamic_offset per frame, which no rig describes; it became one shape key per"
         f" timestep ({len(frames)})"
     )
-    names = [f"offset_t{timestep:05d}" for timestep in sequence.timesteps]
+    names = [f"{OFFSET_KEY}{timestep:05d}" for timestep in sequence.timesteps]
     for name, frame in zip(names, frames, strict=True):
         _new_key(head, name, basis if frame.dynamic_offset is None else basis + frame.dynamic_offset, 1.0)
     compat.write_hat_curves(head.data.shape_keys, names, sequence.timesteps)
 
 
-def _animate_bones(rig: Any, timesteps: Sequence[int], frames: Sequence[FlameFrame]) -> None:
-    curves = compat.action_curves(rig)
-    numbers = np.asarray(timesteps)
-    translations = np.stack([frame.translation for frame in frames])
-    for axis in range(3):
-        compat.write_curve(curves, 'pose.bones["root"].location', axis, numbers, translations[:, axis])
-    poses = np.stack([frame.pose for frame in frames])
-    for joint, name in enumerate(JOINTS):
-        quaternions = _continuous_quaternions(poses[:, joint])
-        for element in range(4):
-            compat.write_curve(curves, _rotation_path(name), element, numbers, quaternions[:, element])
-
-
-def _continuous_quaternions(axis_angles: np.ndarray) -> np.ndarray:
-    """(T, 4) wxyz of axis-angle (T, 3), with signs such that each step takes the short way."""
-    half = np.linalg.norm(axis_angles, axis=1, keepdims=True) / 2
-    quaternions = np.hstack([np.cos(half), axis_angles * np.sinc(half / np.pi) / 2])
-    flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(1))
-    quaternions[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]
-    return np.asarray(quaternions)
-
-
-def _joint_directions(model: FlameModel, components: np.ndarray) -> np.ndarray:
-    """(5, 3, K): how far each expression component moves each joint."""
-    return np.einsum("jv,vck->jck", model.j_regressor, model.shapedirs[:, :, model.n_identity + components])
+def _joint_directions(model: FlameModel, components: Sequence[int]) -> np.ndarray:
+    """(5, 3, K): how far each component of the shape moves each joint."""
+    return np.einsum("jv,vck->jck", model.j_regressor, model.shapedirs[:, :, components])
 
 
 def _terms(directions: np.ndarray) -> list[list[int]]:
@@ -268,8 +329,8 @@ def _animate_offset_joints(rig: Any, sequence: FlameSequence, frames: Sequence[F
             compat.write_curve(curves, path, axis, np.asarray(sequence.timesteps), column)
 
 
-def _drive_joint(head: Any, rig: Any, joint: int, components: np.ndarray, directions: np.ndarray) -> None:
-    """Drive a joint's helper bones by directions (3, K) · expression, plus the per-frame offset where there is one.
+def _drive_joint(head: Any, rig: Any, joint: int, sliders: Sequence[str], directions: np.ndarray) -> None:
+    """Drive a joint's helper bones by directions (3, K) · sliders, plus the per-frame offset where there is one.
 
     Blender's expressions are short, so the sum is taken in two stages; the first stands in a property of the rig.
     """
@@ -282,9 +343,9 @@ def _drive_joint(head: Any, rig: Any, joint: int, components: np.ndarray, direct
     if parts:
         rig[_sum_property(name)] = [0.0] * len(parts)
     for slot, (axis, terms) in enumerate(parts):
-        sources = [(head.data.shape_keys, _value_path(_expression_name(int(components[k])))) for k in terms]
+        sources = [(head.data.shape_keys, _value_path(sliders[k])) for k in terms]
         weighted = zip(directions[axis, terms], TERMS, strict=False)
-        expression = "".join(f"{weight:+.4e}*{letter}" for weight, letter in weighted)
+        expression = "".join(f"{weight:+.5e}*{letter}" for weight, letter in weighted)
         variables = dict(zip(TERMS, sources, strict=False))
         compat.add_driver(rig, f'["{_sum_property(name)}"]', slot, expression, variables)
     for axis in range(3):
@@ -299,7 +360,7 @@ def _drive_helpers(rig: Any, joint: int, axis: int, paths: Sequence[str]) -> Non
     variables = {letter: (rig, path) for letter, path in zip(TERMS, paths, strict=False)}
     total = "+".join(variables)
     name = JOINTS[joint]
-    compat.add_driver(rig, f'pose.bones["{_joint_bone(name)}"].location', axis, total, variables)
+    compat.add_driver(rig, f'pose.bones["{joint_bone(name)}"].location', axis, total, variables)
     compat.add_driver(rig, f'pose.bones["{name}_deform"].location', axis, f"-({total})", variables)
 
 

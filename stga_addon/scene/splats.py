@@ -8,29 +8,67 @@ import numpy as np
 from ..avatar.embedding import face_areas
 from ..avatar.file import Avatar
 from ..avatar.splats import SH_C0, Splats
+from ..avatar.strain import strain_basis
 from ..errors import StgaError
 from . import nodes, tags
-from .compat import set_modifier_input
+from .colors import srgb_to_linear
+from .compat import modifier_input, set_modifier_input
+from .hierarchy import triangle_mesh
 from .materials import OPACITY
+from .node_colors import FACE, SH, STRAIN_COLOR, strain_attributes
+from .node_display import POINTS, WORLD_ROTATION, WORLD_SCALE
+
+Attributes = dict[str, tuple[str, str, np.ndarray]]
+"""Name -> (data type, the field to set, flat values) of every attribute of a splat object's vertices."""
 
 
-def show_avatar(avatar: Avatar, head: Any, name: str | None = None) -> Any:
+def show_avatar(avatar: Avatar, head: Any, name: str | None = None, attributes: Attributes | None = None) -> Any:
     """The splat object of an avatar: it follows the evaluated mesh of the object `head`, frame by frame.
 
-    head: a mesh object with the avatar's triangles, in their order. Raises StgaError where it has others.
+    head: a mesh object with the avatar's triangles, in their order. attributes: `avatar_attributes`, where it is there
+    already. Raises StgaError where the head has other triangles.
     """
     check_head(avatar, head)
-    shown = _splat_object(name or f"{head.name} splats", avatar.splats, head.users_collection[0])
-    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
-    _attribute(shown.data, nodes.FACE, "INT", "value", avatar.splats.face, np.int32)
-    _attribute(shown.data, nodes.NEUTRAL_AREA, "FLOAT", "value", area)
-    _add_modifier(shown, avatar.convention)
+    attributes = attributes or avatar_attributes(avatar)
+    shown = _splat_object(name or f"{head.name} splats", attributes, head.users_collection[0])
+    shown[tags.CONVENTION], shown[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
+    _add_modifier(shown, avatar.convention, avatar.splats)
     set_input(shown, nodes.HEAD, head)
+    # In no collection: it is never seen, and lives as long as the splats that point to it.
+    set_input(shown, nodes.NEUTRAL, _neutral_object(f"{shown.name} neutral", avatar))
     # A sibling of the head: the two object spaces are the same, so are the numbers in them.
     shown.parent = head.parent
     shown.matrix_parent_inverse = head.matrix_parent_inverse
     shown.matrix_basis = head.matrix_basis
     return shown
+
+
+def can_refresh(shown: Any, avatar: Avatar) -> bool:
+    """Whether a splat object shows an avatar of the same kind, so that `refresh` is all it takes to show this one."""
+    try:
+        tree = splat_modifier(shown).node_group
+    except StgaError:
+        return False
+    same = (shown.get(tags.CONVENTION), shown.get(tags.ANTIALIASED)) == (avatar.convention, avatar.antialiased)
+    return same and tree == _tree(avatar.convention, avatar.splats)
+
+
+def refresh(shown: Any, attributes: Attributes) -> None:
+    """Show other splats in the same object: display settings, name and users stay.
+
+    attributes: from `avatar_attributes` of an avatar for which `can_refresh` says yes.
+    """
+    _write(shown.data, attributes)
+
+
+def avatar_attributes(avatar: Avatar) -> Attributes:
+    """What `show_avatar` writes, without Blender, so that a thread can prepare it."""
+    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
+    return {
+        **_attributes(avatar.splats),
+        FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
+        nodes.NEUTRAL_AREA: ("FLOAT", "value", np.ascontiguousarray(area, np.float32)),
+    }
 
 
 def check_head(avatar: Avatar, head: Any) -> None:
@@ -48,8 +86,8 @@ def check_head(avatar: Avatar, head: Any) -> None:
 
 def show_world_splats(splats: Splats, name: str) -> Any:
     """The splat object of a world-space set, say a standard 3DGS PLY."""
-    shown = _splat_object(name, splats, bpy.context.scene.collection)
-    _add_modifier(shown, None)
+    shown = _splat_object(name, _attributes(splats), bpy.context.scene.collection)
+    _add_modifier(shown, None, splats)
     return shown
 
 
@@ -62,7 +100,7 @@ def splat_modifier(shown: Any) -> Any:
 
 
 def set_input(shown: Any, name: str, value: Any) -> None:
-    """Set an input of a splat object's modifier by its name, `nodes.ELLIPSOIDS` for one.
+    """Set an input of a splat object's modifier by its name, `nodes.SIZE` for one.
 
     Raises StgaError where the splats have no such input: those in world space follow no head.
     """
@@ -71,6 +109,13 @@ def set_input(shown: Any, name: str, value: Any) -> None:
     if identifier is None:
         raise StgaError(f"{shown.name}: has no display setting {name!r}")
     set_modifier_input(modifier, identifier, value)
+
+
+def get_input(shown: Any, name: str) -> Any:
+    """An input of a splat object's modifier by its name; None where it has no such input."""
+    modifier = splat_modifier(shown)
+    identifier = input_identifier(modifier, name)
+    return None if identifier is None else modifier_input(modifier, identifier)
 
 
 def input_identifier(modifier: Any, name: str) -> str | None:
@@ -92,47 +137,77 @@ def evaluated_splats(shown: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             points = instance.object.data
             return (
                 _read(points, "position", "vector", 3),
-                _read(points, nodes.WORLD_ROTATION, "value", 4),
-                _read(points, nodes.WORLD_SCALE, "vector", 3),
+                _read(points, WORLD_ROTATION, "value", 4),
+                _read(points, WORLD_SCALE, "vector", 3),
             )
     raise StgaError(f"{shown.name}: shows ellipsoids or nothing, expected points")
 
 
-def _splat_object(name: str, splats: Splats, collection: Any) -> Any:
+def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
     """Vertices-only mesh object with the splats' activated values."""
     mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(len(splats))
-    mesh.vertices.foreach_set("co", np.ascontiguousarray(splats.xyz, np.float32).ravel())
-    norm = np.linalg.norm(splats.rotation, axis=-1, keepdims=True)
-    rotation = np.where(norm > 0, splats.rotation / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
-    _attribute(mesh, nodes.XYZ, "FLOAT_VECTOR", "vector", splats.xyz)
-    _attribute(mesh, nodes.ROTATION, "QUATERNION", "value", rotation)
-    _attribute(mesh, nodes.SCALE, "FLOAT_VECTOR", "vector", np.exp(splats.log_scale.astype(np.float64)))
-    _attribute(mesh, OPACITY, "FLOAT", "value", 1 / (1 + np.exp(-splats.opacity.astype(np.float64))))
-    _attribute(mesh, nodes.COLOR, "FLOAT_COLOR", "color", _base_color(splats.sh[:, 0]))
-    for index in range(splats.sh.shape[1] - 1):
-        _attribute(mesh, nodes.SH_REST.format(index), "FLOAT_VECTOR", "vector", splats.sh[:, index + 1])
-    mesh.update()
+    _write(mesh, attributes)
     shown = bpy.data.objects.new(name, mesh)
     shown[tags.KIND] = tags.SPLATS
     collection.objects.link(shown)
     return shown
 
 
-def _add_modifier(shown: Any, convention: str | None) -> None:
-    shown.modifiers.new("STGA Splats", "NODES").node_group = nodes.splat_tree(convention)
+def _neutral_object(name: str, avatar: Avatar) -> Any:
+    mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
+    if avatar.splats.strain_color.shape[1]:
+        for attribute, vectors in strain_attributes(strain_basis(avatar.neutral, avatar.faces)).items():
+            data = mesh.attributes.new(attribute, "FLOAT_VECTOR", "FACE").data
+            data.foreach_set("vector", np.ascontiguousarray(vectors, np.float32).ravel())
+    return bpy.data.objects.new(name, mesh)
+
+
+def _attributes(splats: Splats) -> Attributes:
+    norm = np.linalg.norm(splats.rotation, axis=-1, keepdims=True)
+    rotation = np.where(norm > 0, splats.rotation / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
+    values = {
+        nodes.XYZ: ("FLOAT_VECTOR", "vector", splats.xyz),
+        nodes.ROTATION: ("QUATERNION", "value", rotation),
+        nodes.SCALE: ("FLOAT_VECTOR", "vector", np.exp(splats.log_scale.astype(np.float64))),
+        OPACITY: ("FLOAT", "value", 1 / (1 + np.exp(-splats.opacity.astype(np.float64)))),
+        nodes.COLOR: ("FLOAT_COLOR", "color", _base_color(splats.sh[:, 0])),
+    }
+    for name, coefficients in ((SH, splats.sh), (STRAIN_COLOR, splats.strain_color)):
+        for index in range(coefficients.shape[1]):
+            values[name.format(index)] = ("FLOAT_VECTOR", "vector", coefficients[:, index])
+    return {
+        name: (kind, field, np.ascontiguousarray(array, np.float32).ravel())
+        for name, (kind, field, array) in values.items()
+    }
 
 
 def _base_color(dc: np.ndarray) -> np.ndarray:
     """(N, 4) scene-linear RGBA, as colour attributes are stored; the SH coefficients (N, 3) give sRGB."""
-    srgb = np.clip(0.5 + SH_C0 * np.asarray(dc, np.float64), 0.0, 1.0)
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = srgb_to_linear(np.clip(0.5 + SH_C0 * np.asarray(dc, np.float64), 0.0, 1.0))
     return np.concatenate([linear, np.ones((len(dc), 1))], axis=-1)
 
 
-def _attribute(mesh: Any, name: str, kind: str, field: str, values: np.ndarray, dtype: Any = np.float32) -> None:
-    data = mesh.attributes.new(name, kind, "POINT").data
-    data.foreach_set(field, np.ascontiguousarray(values, dtype).ravel())
+def _write(mesh: Any, attributes: Attributes) -> None:
+    """Make the mesh's vertices and attributes these; what there is already is overwritten in place."""
+    positions = attributes[nodes.XYZ][2]
+    if len(mesh.vertices) != len(positions) // 3:
+        mesh.clear_geometry()
+        mesh.vertices.add(len(positions) // 3)
+    mesh.vertices.foreach_set("co", positions)
+    for name, (kind, field, values) in attributes.items():
+        attribute = mesh.attributes.get(name) or mesh.attributes.new(name, kind, "POINT")
+        attribute.data.foreach_set(field, values)
+    mesh.update()
+
+
+def _tree(convention: str | None, splats: Splats) -> Any:
+    return nodes.splat_tree(convention, splats.sh_degree, splats.strain_color.shape[1] > 0)
+
+
+def _add_modifier(shown: Any, convention: str | None, splats: Splats) -> None:
+    modifier = shown.modifiers.new("STGA Splats", "NODES")
+    modifier.node_group = _tree(convention, splats)
+    set_input(shown, nodes.DISPLAY, POINTS)  # the default of a menu does not reach the modifier in every version
 
 
 def _read(points: Any, name: str, field: str, width: int) -> np.ndarray:

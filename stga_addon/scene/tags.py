@@ -11,9 +11,13 @@ CAPTURE = "stga_capture"  # the capture's folder (or a motion's file), absolute
 FLAME_MODEL = "stga_flame_model"  # on the head: the FLAME model file the capture was opened with, or ""
 PRINCIPAL_POINT = "stga_principal_point"  # on the head: how cx and cy of the capture were read
 TIMESTEPS = "stga_timesteps"  # on the head: ints, ascending
+KEY_REGIONS = "stga_key_regions"  # on the head: names, one a line, of what the selection takes as a whole
 CAMERA_INDEX = "stga_camera_index"  # on a camera
 IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
+CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
+ANTIALIASED = "stga_antialiased"  # on the same: `Avatar.antialiased`
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
+RUN = "stga_run"  # on splats that show a training: the run's folder
 
 # Kinds of object.
 ROOT, HEAD, RIG, CAMERA, SPLATS = "root", "head", "rig", "camera", "splats"
@@ -46,6 +50,13 @@ def mark(thing: Any, kind: str, capture: Path) -> None:
 
 
 def find(kind: str, capture: Path) -> list[Any]:
-    """All objects of a kind in the current scene that were made from the capture in folder `capture`."""
+    """All objects of a kind in the current scene that were made from the capture in folder `capture`.
+
+    Objects linked from other files are left out: nothing in them can be changed here.
+    """
     folder = str(capture.resolve())
-    return [thing for thing in bpy.context.scene.objects if thing.get(KIND) == kind and thing.get(CAPTURE) == folder]
+    return [
+        thing
+        for thing in bpy.context.scene.objects
+        if thing.get(KIND) == kind and thing.get(CAPTURE) == folder and thing.library is None
+    ]

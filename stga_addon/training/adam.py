@@ -17,7 +17,8 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> Non
     rates: learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`.
     (STGA, selective training; Adam with a step count per row, because rows are trained unequally often.)
     """
-    by_column = np.zeros((len(state.parameters), state.parameters.sh[0].numel()), np.float32)
+    widest = max(tensor[0].numel() for tensor in state.parameters)  # with constant colour, not `sh`
+    by_column = np.zeros((len(state.parameters), widest), np.float32)
     for row, name in zip(by_column, state.parameters._fields, strict=True):
         row[:] = rates[name]
         if name == "sh":

@@ -9,14 +9,13 @@ metrics.jsonl   one line per evaluation
 
 import json
 import math
-import os
 import re
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,8 +23,11 @@ import torch
 from ..avatar.embedding import CONVENTIONS
 from ..avatar.file import SH_SIZES
 from ..avatar.splats import MAX_SH_DEGREE
+from ..avatar.strain import STRAINS
 from ..errors import StgaError
 from ..files import file_size, partial_name, read_json, read_npz, replacing, write_json, write_npz
+from ..locks import held, owner
+from .plan import Decision, plan_from_json, plan_to_json
 from .settings import SCHEDULES, STRATEGIES, Settings, from_json, to_json
 from .state import TrainState, state_of, tensors_of
 
@@ -35,12 +37,14 @@ FILES = ("run.json", "selection.npz", "checkpoint.npz", "avatar.npz", "metrics.j
 
 @dataclass(frozen=True)
 class Run:
-    """What run.json holds: absolute paths of the capture and of the FLAME model, and the settings."""
+    """What run.json holds: absolute paths of the capture and of the FLAME model, the settings, and what was decided
+    about effects."""
 
     capture: Path
     flame: Path | None
     principal_point: str
     settings: Settings
+    plan: tuple[Decision, ...] = ()
 
 
 @dataclass
@@ -73,6 +77,7 @@ def write_run(folder: Path, run: Run) -> None:
             "flame": None if run.flame is None else str(run.flame),
             "principal_point": run.principal_point,
             "settings": to_json(run.settings),
+            "plan": plan_to_json(run.plan),
         },
     )
 
@@ -91,9 +96,9 @@ def read_run(folder: Path) -> Run:
         flame = values["flame"]
         settings = from_json(values["settings"])
         _check_settings(settings)
-        return Run(
-            Path(values["capture"]), None if flame is None else Path(flame), str(values["principal_point"]), settings
-        )
+        plan = plan_from_json(values.get("plan", []))
+        model = None if flame is None else Path(flame)
+        return Run(Path(values["capture"]), model, str(values["principal_point"]), settings, plan)
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
 
@@ -108,10 +113,14 @@ def _check_settings(settings: Settings) -> None:
             raise ValueError(f"{name} is {getattr(settings, name)!r}")
     for name, (low, high) in _RANGES.items():
         value = getattr(settings, name)
-        if not all(low <= number <= high for number in (value if isinstance(value, tuple) else (value,))):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if value is not None and not all(low <= number <= high for number in numbers):
             raise ValueError(f"{name} is {value!r}, expected {low} to {high}")
     if len(settings.density_span) != 2 or len(settings.background) != 3:
         raise ValueError("density_span or background has another length")
+    for row in settings.exposure:
+        if len(row) != 7 or not all(map(math.isfinite, row)) or min(row[1:4]) <= 0:
+            raise ValueError(f"exposure has the row {row!r}")
 
 
 _CHOICES: dict[str, Collection[str]] = {"strategy": STRATEGIES, "schedule": SCHEDULES, "convention": CONVENTIONS}
@@ -129,6 +138,9 @@ _RANGES: dict[str, tuple[float, float]] = {
     "sh_steps": (0, math.inf),
     "density_span": (0, math.inf),
     "background": (0, 1),
+    "scale": (0.05, 1),
+    "coarse_span": (0, 1),
+    "target_psnr": (0, 200),
 }
 
 
@@ -198,7 +210,8 @@ def _check_state(path: Path, state: TrainState) -> None:
     n, coefficients = len(state), state.parameters.sh.shape[1]
     if coefficients not in SH_SIZES:
         raise StgaError(f"{path}: parameters/sh has {coefficients} coefficients, expected one of {SH_SIZES}")
-    tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "opacity": (), "sh": (coefficients, 3)}
+    strains = STRAINS if state.parameters.strain_color.shape[1] else 0
+    tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "sh": (coefficients, 3), "strain_color": (strains, 3)}
     whole = {"steps": torch.int32, "face": torch.int32, "loose": torch.bool}
     for name, tensor in tensors_of(state).items():
         dtype = whole.get(name, torch.float32)
@@ -252,75 +265,18 @@ def cut_metrics(folder: Path, iteration: int) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Hold the folder for one process, and clear away what a killed one left half written.
 
-    The system's own lock on run.lock ends with its process, however that ends; the file's content, the process, is
-    for people. Raises StgaError while another process holds the folder.
+    Raises StgaError while another process holds the folder.
     """
     path = folder / "run.lock"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        held = _hold(path)
-    except BlockingIOError as error:
-        raise StgaError(f"{folder}: another run is working in this folder (process {_owner(path)})") from error
-    except OSError as error:
-        raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    try:
+    with ExitStack() as lock:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock.enter_context(held(path))
+        except BlockingIOError as error:
+            raise StgaError(f"{folder}: another run is working in this folder (process {owner(path)})") from error
+        except OSError as error:
+            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         for litter in (path for name in FILES for path in folder.glob(partial_name(name, "*"))):
             with suppress(OSError):
                 litter.unlink()
         yield
-    finally:
-        if os.name == "nt":  # where an open file cannot be removed; elsewhere its name goes before the lock does
-            held.close()
-        with suppress(OSError):
-            path.unlink()
-        held.close()
-
-
-def _hold(path: Path) -> IO[str]:
-    """The open and locked lock file. Raises BlockingIOError where another process has locked it."""
-    while True:
-        file = path.open("a+", encoding="ascii")
-        try:
-            _lock(file)
-            # Its last owner may have removed the name between our opening and locking it: then it guards nothing.
-            if os.name == "nt" or _is_named(path, file):
-                file.truncate(0)
-                file.write(str(os.getpid()))
-                file.flush()
-                return file
-        except BaseException:
-            file.close()
-            raise
-        file.close()
-
-
-def _is_named(path: Path, file: IO[str]) -> bool:
-    try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except FileNotFoundError:
-        return False
-
-
-if os.name == "nt":
-    import msvcrt
-
-    def _lock(file: IO[str]) -> None:
-        file.seek(1 << 30)  # far behind the content, which stays readable
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
-        except OSError as error:
-            raise BlockingIOError(error.errno, error.strerror) from error
-        file.seek(0)
-
-else:
-    import fcntl
-
-    def _lock(file: IO[str]) -> None:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _owner(path: Path) -> int:
-    try:
-        return int(path.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return 0

@@ -13,13 +13,16 @@ KEPT = 12
 
 
 class FrameStore:
-    """Face frames by timestep, float64, bounded however long the sequence is."""
+    """Face frames by timestep, float64, bounded however long the sequence is.
+
+    strain: what strain needs of the neutral mesh, None where colours do not follow it.
+    """
 
     def __init__(self, capture: Capture, convention: str, strain: bool = False) -> None:
-        self._capture, self._convention = capture, convention
-        self._strain = strain_basis(capture.neutral, capture.faces) if strain else None
+        self.capture, self.convention = capture, convention
+        self.strain = strain_basis(capture.neutral, capture.faces) if strain else None
         self.of = lru_cache(KEPT)(self._read)
 
     def _read(self, timestep: int) -> FaceFrames:
-        mesh = np.asarray(self._capture.mesh(timestep))
-        return face_frames(mesh, self._capture.faces, self._capture.neutral, self._convention, self._strain)
+        mesh = np.asarray(self.capture.mesh(timestep))
+        return face_frames(mesh, self.capture.faces, self.capture.neutral, self.convention, self.strain)

@@ -21,6 +21,7 @@ class ProgressBar:
         psnr = "" if progress.psnr is None else f", PSNR {progress.psnr:.2f}"
         if progress.iteration:
             figures = f"{progress.per_second:.1f} it/s, loss {progress.loss:.4f}{psnr}, {progress.splats} splats"
-            self._bar.set_postfix_str(figures, refresh=False)
+            outlook = f"; {progress.outlook}" if progress.outlook else ""
+            self._bar.set_postfix_str(figures + outlook, refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False

@@ -1,38 +1,47 @@
 """A whole training run: from a capture to an avatar in a folder, with evaluation, checkpoints and resumption."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from ..avatar.file import Avatar, write_avatar
 from ..capture.loader import ViewLoader
-from ..capture.model import Capture, View
+from ..capture.model import Capture
 from ..errors import StgaError
 from ..selection import select_capture
 from . import folder as run_folder
+from .exposure import even_exposure
 from .folder import Checkpoint, Run
-from .metrics import evaluate
+from .forecast import clock, curve_of, forecast, horizon, level_since
+from .metrics import evaluate, peak_memory_mb
 from .schedule import view_order
 from .settings import to_json
 from .trainer import Trainer
 from .warm import compile_kernels
+from .watch import look, watch_views
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 EVALUATIONS = 10
-"""Evaluations over the budget."""
-MOST_VIEWS = 16
-"""Held-out views that an evaluation during training looks at, evenly spread; it should cost a few per cent."""
+"""Evaluations over a budget in iterations: always the same ones, so that the run repeats."""
+EVALUATION_SHARE = 0.04
+"""Largest share of the training time that evaluations add to a budget in seconds; the last one comes on top."""
+MOST_EVALUATIONS = 40
+"""Evaluations over a budget in seconds, however little they cost."""
+COARSE = 0.5
+"""Size of the images during `Settings.coarse_span`, as a share of the size trained at afterwards."""
 
 
 @dataclass(frozen=True)
 class Progress:
     """What a person sees while it trains: share of the budget, iterations, speed, loss (mean of the last global
-    iterations), PSNR of the last evaluation or None, splat count, seconds left, and what is going on."""
+    iterations), PSNR of the last evaluation or None, splat count, seconds left, what is going on, and what more time
+    is expected to bring. `avatar` makes the avatar as it is now; None before there is one."""
 
     share: float
     iteration: int
@@ -42,6 +51,8 @@ class Progress:
     splats: int
     left_s: float
     message: str = ""
+    outlook: str = ""
+    avatar: Callable[[], Avatar] | None = None
 
 
 Report = Callable[[Progress], bool]
@@ -55,21 +66,25 @@ def train(
     selection: dict[int, np.ndarray] | None = None,
     resume: bool = False,
     report: Report = lambda progress: False,
+    device: str = "cpu",
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
     selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
-    checkpoint to the parameters that an unbroken run would have reached (same seed and number of threads).
+    checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
+    device: one of `device.choose_device`.
     Raises StgaError where the capture has nothing to train on, or the folder is in use or holds another run.
     """
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
+    if run.settings.target_psnr is not None and not capture.views.get("val"):
+        raise StgaError(f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on")
     with run_folder.locked(out):
         if (out / "run.json").exists() and not resume:
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
         report(Progress(0, 0, 0, np.nan, None, 0, np.nan, "compiling kernels"))
         compile_kernels()
-        loop = _Loop(capture, out, run, report)
+        loop = _Loop(capture, out, run, report, device)
         if resume and (out / "checkpoint.npz").exists():
             loop.resume()
         else:
@@ -83,12 +98,15 @@ def train(
 class _Loop:
     """The state of `train` between its steps."""
 
-    def __init__(self, capture: Capture, out: Path, run: Run, report: Report) -> None:
-        self.capture, self.out, self.run, self.report = capture, out, run, report
+    def __init__(self, capture: Capture, out: Path, run: Run, report: Report, device: str) -> None:
+        self.capture, self.out, self.run, self.report, self.device = capture, out, run, report, device
         self.settings = run.settings
         self.elapsed, self.best, self.evaluations = 0.0, -np.inf, 0
         self.losses: deque[float] = deque(maxlen=100)
+        self.lines: list[dict[str, Any]] = []
         self.psnr: float | None = None
+        self.outlook = ""
+        self.sights = [look(capture, view) for view in watch_views(capture)]
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start anew: choose triangles, place splats, and write down what is going to happen."""
@@ -96,7 +114,7 @@ class _Loop:
         if selection is None:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
-        self.trainer = Trainer(self.capture, self.settings, selection)
+        self.trainer = Trainer(self.capture, self.settings, selection, device=self.device)
         run_folder.write_selection(self.out, selection)
         run_folder.write_run(self.out, self.run)
         run_folder.cut_metrics(self.out, -1)
@@ -109,27 +127,35 @@ class _Loop:
         face = checkpoint.state.face
         if len(face) and not 0 <= int(face.min()) <= int(face.max()) < len(self.capture.faces):
             raise StgaError(f"{self.out}: its splats stand on triangles that {self.capture.root} does not have")
-        degree = checkpoint.state.splats().sh_degree
-        if degree != self.settings.sh_degree:
-            raise StgaError(f"{self.out}: its splats have SH degree {degree}, run.json says {self.settings.sh_degree}")
-        self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state)
+        splats = checkpoint.state.splats()
+        if splats.sh_degree != self.settings.sh_degree:
+            says = self.settings.sh_degree
+            raise StgaError(f"{self.out}: its splats have SH degree {splats.sh_degree}, run.json says {says}")
+        if bool(splats.strain_color.shape[1]) != self.settings.strain_color:
+            raise StgaError(f"{self.out}: its splats and run.json disagree on whether colours follow strain")
+        self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state, self.device)
         self.trainer.continue_from(checkpoint)
         self.losses.extend(checkpoint.losses)
         self.elapsed, self.best = checkpoint.elapsed_s, checkpoint.best_psnr
         self.evaluations = checkpoint.evaluations
         run_folder.cut_metrics(self.out, checkpoint.iteration)
+        self.lines = run_folder.read_metrics(self.out)
 
     def work(self) -> None:
-        """Train until the budget is spent or the report says stop."""
-        if self._share() >= 1:
+        """Train until the budget is spent, the settings' goal is reached or the report says stop."""
+        if self._share() >= 1 or self._enough():
             return  # a finished run was resumed
         settings, trainer = self.settings, self.trainer
         views = self.capture.views["train"]
         order = view_order(views, settings.views_per_visit, settings.seed, trainer.iteration)
-        background = tuple(round(255 * c) for c in settings.background)
+        red, green, blue = (round(255 * c) for c in settings.background)
+        correct = even_exposure(settings)
         saved, started = self.elapsed, self.elapsed
         first = trainer.iteration
-        with ViewLoader(order, background=background) as loader:  # type: ignore[arg-type]
+        self.clock_began = perf_counter() - (self.lines[-1].get("wall_s", 0.0) if self.lines else 0.0)
+        with ViewLoader(
+            order, lambda position: self._size(first + position), (red, green, blue), correct=correct
+        ) as loader:
             while (share := self._share()) < 1:
                 begin = perf_counter()
                 view, image, mask = next(loader)
@@ -137,8 +163,10 @@ class _Loop:
                 self.elapsed += perf_counter() - begin
                 if loss is not None:
                     self.losses.append(loss)
-                if 1 > self._share() >= (self.evaluations + 1) / EVALUATIONS:
+                if self._due():
                     self._evaluate()
+                    if self._enough():
+                        break
                 if self.elapsed - saved > CHECKPOINT_S:
                     self._save()
                     saved = self.elapsed
@@ -154,28 +182,71 @@ class _Loop:
             return self.elapsed / self.settings.seconds
         return self.trainer.iteration / (self.settings.iterations or 1)
 
+    def _size(self, iteration: int) -> float:
+        """Size of an iteration's image, as a share of the captured one; by the clock, a few images ahead of it."""
+        settings = self.settings
+        share = self._share() if settings.iterations is None else iteration / settings.iterations
+        return settings.scale * (COARSE if share < settings.coarse_span else 1.0)
+
+    def _due(self) -> bool:
+        """Whether to evaluate now; at the end of the budget there is an evaluation anyway."""
+        share = self._share()
+        if share >= 1 or self.settings.seconds is None:
+            return 1 > share >= (self.evaluations + 1) / EVALUATIONS
+        # Before the first one: drawing a view takes about half as long as training it.
+        cost, last = 0.5 * len(self.sights) * self.elapsed / self.trainer.iteration, 0.0
+        if self.lines:
+            cost, last = float(self.lines[-1]["evaluation_s"]), float(self.lines[-1]["seconds"])
+        return self.elapsed - last >= max(self.settings.seconds / MOST_EVALUATIONS, cost / EVALUATION_SHARE)
+
+    def _enough(self) -> bool:
+        """Whether the target is reached, or nothing more is to be gained and the settings say to stop then."""
+        curve, target = curve_of(self.lines), self.settings.target_psnr
+        if target is not None and any(psnr >= target for _, psnr in curve):
+            return True
+        return self.settings.stop_when_flat and level_since(curve) is not None
+
     def _evaluate(self, last: bool = False) -> None:
-        """Look at the held-out views, write the metrics down, and keep the avatar if it is the best so far."""
+        """Look at the held-out views, keep the avatar if it is the best so far, and write the metrics down."""
         share = min(1.0, self._share())
         self.evaluations = max(self.evaluations, int(share * EVALUATIONS))
-        views = watch_views(self.capture)
         begin = perf_counter()
-        line = {
+        line: dict[str, Any] = {
             "iteration": self.trainer.iteration,
             "seconds": round(self.elapsed, 3),
-            "splats": len(self.trainer.state),
+            "splats": len(self.trainer),
         }
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
-        if views:
-            quality = evaluate(lambda view: self.trainer.draw(view, share), views, perceptual=last)
+        if self.sights:
+            quality = evaluate(lambda view: self.trainer.draw(view, share), self.sights, perceptual=last)
             self.psnr = quality.psnr
             line.update(quality.as_json())
-        run_folder.append_metrics(self.out, {**line, "evaluation_s": round(perf_counter() - begin, 3)})
         # Without held-out views the latest avatar counts as the best.
-        if not views or self.psnr is None or self.psnr >= self.best:
+        if not self.sights or self.psnr is None or self.psnr >= self.best:
             self.best = -np.inf if self.psnr is None else self.psnr
             write_avatar(self.out / "avatar.npz", self._avatar())
+        now = perf_counter()
+        line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
+        line["peak_memory_mb"] = peak_memory_mb()
+        self.lines.append(line)
+        self._look_ahead(line)
+        run_folder.append_metrics(self.out, line)
+
+    def _look_ahead(self, line: dict[str, Any]) -> None:
+        """Say what more time will bring, and note it in the line so that it can be checked."""
+        curve, left = curve_of(self.lines), self._left_s()
+        ahead = horizon(self.elapsed, left)
+        coming = None if ahead is None else forecast(curve, ahead)
+        self.outlook = "" if coming is None else str(coming)
+        if coming is not None:
+            line["forecast"] = coming.as_json()
+        level = level_since(curve) if left else None
+        if level is not None:
+            self.outlook = f"no gain since {clock(level)}: more time no longer helps"
+        target, end = self.settings.target_psnr, forecast(curve, left) if left else None
+        if target is not None and end is not None and end.psnr + end.error < target:
+            self.outlook += f"; {target:g} dB is not in sight ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"
 
     def _avatar(self) -> Avatar:
         return Avatar(
@@ -186,6 +257,7 @@ class _Loop:
             to_json(self.settings),
             dict(self.capture.regions),
             self.settings.background,
+            self.settings.antialiased,
         )
 
     def _save(self) -> None:
@@ -199,22 +271,23 @@ class _Loop:
         )  # fmt: skip
 
     def _progress(self, per_second: float) -> Progress:
-        share = min(1.0, self._share())
-        if self.settings.seconds is not None:
-            left = self.settings.seconds - self.elapsed
-        else:
-            left = ((self.settings.iterations or 0) - self.trainer.iteration) / max(per_second, 1e-9)
-        loss = float(np.mean(self.losses)) if self.losses else np.nan
-        count = len(self.trainer.state)
-        return Progress(share, self.trainer.iteration, per_second, loss, self.psnr, count, max(0.0, left), "training")
+        return Progress(
+            min(1.0, self._share()),
+            self.trainer.iteration,
+            per_second,
+            float(np.mean(self.losses)) if self.losses else np.nan,
+            self.psnr,
+            len(self.trainer),
+            self._left_s(),
+            "training",
+            self.outlook,
+            self._avatar,
+        )
+
+    def _left_s(self) -> float:
+        """Seconds of training until the budget is spent, at the speed so far."""
+        share = self._share()
+        return max(0.0, self.elapsed * (1 / share - 1)) if share > 0 else np.nan
 
     def _tell(self, message: str) -> None:
         self.report(Progress(0, 0, 0, np.nan, None, 0, np.nan, message))
-
-
-def watch_views(capture: Capture) -> Sequence[View]:
-    """The held-out views that are looked at while training: at most MOST_VIEWS, evenly spread."""
-    views = capture.views.get("val", ())
-    if len(views) <= MOST_VIEWS:
-        return views
-    return [views[n] for n in np.linspace(0, len(views) - 1, MOST_VIEWS).round().astype(int)]

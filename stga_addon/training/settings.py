@@ -1,15 +1,20 @@
 """Everything that can be set about a training run, with its default and where it comes from."""
 
 import dataclasses
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import StgaError
 from ..selection import SelectionOptions
+from .plan import CHOICES
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
 SCHEDULES = ("default", "paper")
+DEVICES = ("auto", "cpu", "cuda", "warp-cpu")
+"""What may train (see `device`); no part of a run's settings, because a run may go on elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,7 @@ class Rates:
     opacity: float = 5e-2
     sh: float = 2e-2
     sh_rest: float = 1e-3
+    strain_color: float = 5e-3
     position_end: float = 0.05
     end: float = 0.2
 
@@ -59,6 +65,18 @@ class Settings:
     background     colour behind the head in the capture's images, and behind transparent ones
     any_background  where there are masks, put another random colour behind the head in every iteration, so that
                    splats in the background's colour cannot hide in it and alpha becomes right
+    scale, coarse_span   size of the images trained on, as a share of the captured ones; during the first
+                   `coarse_span` of the budget half of that
+    target_psnr    stop when the held-out views reach this many dB
+    stop_when_flat  stop when more time no longer helps (`forecast.level_since`)
+    preset         the preset that these settings began with, or none
+    strain_color   splats carry colour that follows how their triangle deforms (`avatar.strain`)
+    antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
+    teeth          put splats on the rows of teeth that FLAME's mesh is given
+    exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
+                   images, which are taken away when they are read
+    effects        effect -> "on" or "off" where the person has decided, with everything else to be decided from the
+                   capture (`effects.plan`); None: these settings are final
     """
 
     strategy: str = "global"
@@ -89,6 +107,16 @@ class Settings:
     growth: float = 0.25
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     any_background: bool = True
+    scale: float = 1.0
+    coarse_span: float = 0.0
+    target_psnr: float | None = None
+    stop_when_flat: bool = False
+    preset: str | None = None
+    strain_color: bool = False
+    antialiased: bool = False
+    teeth: bool = True
+    exposure: tuple[tuple[float, ...], ...] = ()
+    effects: Mapping[str, str] | None = None
 
 
 PAPER = {
@@ -120,8 +148,35 @@ GAUSSIAN_AVATARS = {
 """GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and released settings)."""
 
 
-def make_settings(strategy: str | None = None, schedule: str = "default", **changes: Any) -> Settings:
-    """Settings of a strategy and schedule with `changes` on top.
+@dataclass(frozen=True)
+class Preset:
+    """A level of quality: what it is for, what differs from the defaults, and how long to train.
+
+    iterations, passes  train so many iterations, but at least so many passes over all training views
+    """
+
+    purpose: str
+    iterations: int
+    passes: float
+    changes: dict[str, Any]
+
+    def iterations_for(self, views: int) -> int:
+        """Iterations for a capture of so many training views."""
+        return max(self.iterations, math.ceil(self.passes * views))
+
+
+PRESETS = {
+    "draft": Preset("a first look", 800, 0.5, {"lattice": 1}),
+    "standard": Preset("everyday work", 3000, 2.0, {}),
+    "final": Preset("the best that a coffee break buys", 9000, 6.0, {"growth": 0.6}),
+}
+"""Fewer splats are ahead in the first seconds, more of them in the end."""
+
+
+def make_settings(
+    strategy: str | None = None, schedule: str = "default", preset: str | None = None, **changes: Any
+) -> Settings:
+    """Settings of a strategy, schedule and preset with `changes` on top.
 
     Without a strategy, the paper's schedule trains selectively and the default one by the default strategy.
     Raises StgaError naming an impossible value.
@@ -132,7 +187,11 @@ def make_settings(strategy: str | None = None, schedule: str = "default", **chan
         raise StgaError(f"--strategy: '{strategy}' is not one of {', '.join(STRATEGIES)}")
     if schedule not in SCHEDULES:
         raise StgaError(f"--schedule: '{schedule}' is not one of {', '.join(SCHEDULES)}")
-    base: dict[str, Any] = {}
+    if preset not in (None, *PRESETS):
+        raise StgaError(f"--preset: '{preset}' is not one of {', '.join(PRESETS)}")
+    base: dict[str, Any] = {"preset": preset}
+    if preset is not None:
+        base.update(PRESETS[preset].changes)
     if schedule == "paper":
         base.update(PAPER)
     if strategy == "gaussian-avatars":
@@ -146,6 +205,10 @@ def make_settings(strategy: str | None = None, schedule: str = "default", **chan
         raise StgaError(f"--seed: {settings.seed} is negative, expected a whole number from 0 up")
     if not 0 <= settings.selection.threshold < float("inf"):
         raise StgaError(f"--threshold: {settings.selection.threshold} is no distance in metres")
+    if settings.effects and (schedule == "paper" or strategy == "gaussian-avatars"):
+        raise StgaError("--effect: trains something else than the paper's letter or GaussianAvatars' method")
+    if settings.target_psnr is not None and not 0 < settings.target_psnr < 200:
+        raise StgaError(f"--target-psnr: {settings.target_psnr} is no PSNR in dB")
     return settings
 
 
@@ -161,7 +224,10 @@ def from_json(values: dict[str, Any]) -> Settings:
     values["rates"] = Rates(**values["rates"])
     for name in ("sh_steps", "density_span", "background"):
         values[name] = tuple(values[name])
+    values["exposure"] = tuple(tuple(float(number) for number in row) for row in values.get("exposure", ()))
     settings = Settings(**values)
+    if settings.effects is not None and not set(settings.effects.values()) <= set(CHOICES):
+        raise TypeError(f"effects is {settings.effects!r}")
     for part in (settings, settings.selection, settings.rates):
         _check_types(part)
     return settings
@@ -170,8 +236,9 @@ def from_json(values: dict[str, Any]) -> Settings:
 def _check_types(part: Any) -> None:
     """Raise TypeError where a plain value is of another type than its field says."""
     for name, hint in get_type_hints(type(part)).items():
-        plain = [kind for kind in (get_args(hint) or (hint,)) if kind in (int, float, str, bool, NoneType)]
-        if get_origin(hint) is tuple or not plain:
+        kinds = get_args(hint) or (hint,)
+        plain = [kind for kind in kinds if kind in (int, float, str, bool, NoneType)]
+        if get_origin(hint) is tuple or len(plain) < len(kinds):
             continue
         value = getattr(part, name)
         wanted = (*plain, int) if float in plain else tuple(plain)

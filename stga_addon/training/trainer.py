@@ -10,51 +10,58 @@ from ..avatar.lattice import lattice_splats
 from ..avatar.splats import Splats
 from ..avatar.strain import STRAINS
 from ..capture.model import Capture, View
-from ..raster.kernels.image_loss import change_background
-from ..raster.kernels.rows import distance_limit, scale_limit
-from ..raster.render import (
-    Parameters,
-    Rendering,
-    Scratch,
-    camera_frames,
-    render_backward,
-    render_forward,
-    touched_tiles,
-)
-from . import adam
 from .density import control_density
+from .device import make_step
 from .folder import Checkpoint
 from .frames import FrameStore
-from .losses import REACH, image_gradient, tile_rectangles, whole_image
 from .schedule import learning_rates, sh_degree, trains_globally
 from .seeds import hull_seeds
 from .settings import Settings
 from .state import TrainState, new_state
+from .step import Batch
 
 SPLIT_SHARE = 0.02
 """Largest share of the splats that one round of density control splits."""
 
 
 class Trainer:
-    """A capture's splats in training.
+    """A capture's splats in training: what is trained when. How an iteration is computed, its `Step` knows.
 
-    state      the splats and their optimiser, replaced by density control
     iteration  how many steps were made
     selection  timestep -> (F,) bool triangles that local iterations train; empty or missing means a global one
     """
 
     def __init__(
-        self, capture: Capture, settings: Settings, selection: dict[int, np.ndarray], state: TrainState | None = None
+        self,
+        capture: Capture,
+        settings: Settings,
+        selection: dict[int, np.ndarray],
+        state: TrainState | None = None,
+        device: str = "cpu",
     ) -> None:
+        """device: one of `choose_device`."""
         self.capture, self.settings, self.selection = capture, settings, selection
         self.frames = FrameStore(capture, settings.convention, settings.strain_color)
-        self.state = new_state(initial_splats(capture, settings)) if state is None else state
+        self._lengths = face_lengths(capture, settings.convention)
+        state = new_state(initial_splats(capture, settings)) if state is None else state
+        self._step = make_step(device, settings, self._lengths, self.frames, state)
         self.iteration, self.visit = 0, -1
-        self.initial_count = len(self.state)
-        self._scratch = Scratch()
+        self.initial_count = len(self)
         self._background = np.array(settings.background, np.float32)
-        self._lengths = _face_lengths(capture, settings.convention)
         self.last_timestep: int | None = None
+
+    def __len__(self) -> int:
+        """How many splats there are."""
+        return len(self._step)
+
+    @property
+    def state(self) -> TrainState:
+        """The splats and their optimiser; a GPU copies them, so not for every iteration."""
+        return self._step.state
+
+    @state.setter
+    def state(self, state: TrainState) -> None:
+        self._step.state = state
 
     def continue_from(self, checkpoint: Checkpoint) -> None:
         """Take over everything that a step depends on."""
@@ -67,89 +74,62 @@ class Trainer:
         target (H, W, 3) uint8 over the settings' background; progress is the share of the budget spent; mask (H, W)
         uint8, with which the background may be exchanged.
 
-        Returns the image loss of a global iteration; a local one sees only part of the image and returns None.
+        Returns the image loss of a global iteration; a local one sees only part of the image and returns None. A GPU
+        tells the losses two iterations late.
         """
-        settings, state = self.settings, self.state
+        settings = self.settings
         self.visit += view.timestep != self.last_timestep
         self.last_timestep = view.timestep
-        focus = None if trains_globally(settings, self.iteration, self.visit, progress) else self._focus(view.timestep)
+        whole = trains_globally(settings, self.iteration, self.visit, progress)
         background = self._background
-        if mask is not None and settings.any_background:
+        if not settings.any_background:
+            mask = None
+        if mask is not None:
             background = np.random.default_rng([settings.seed, self.iteration]).random(3, np.float32)
-            over = self._scratch.take("target", target.shape, np.uint8)
-            change_background(target, mask, 255 * self._background, 255 * background, over)
-            target = over
-        degree = sh_degree(settings, progress)
-        rows, screen, loss = self._differentiate(view, target, background, degree, focus)
-        self._limit(rows)
-        adam.step(state, rows, learning_rates(settings.rates, progress))
-        if focus is None:
-            state.pull.numpy()[rows] += screen[rows]
-            state.seen.numpy()[rows] += 1
+        loss = self._step.train(
+            Batch(
+                view,
+                target,
+                mask,
+                background,
+                sh_degree(settings, progress),
+                None if whole else self._selected(view.timestep),
+                learning_rates(settings.rates, progress),
+            )
+        )
         self.iteration += 1
         self._maintain(progress)
         return loss
 
     def draw(self, view: View, progress: float = 1.0) -> np.ndarray:
         """The view as the splats show it now: a new (3, H, W) float32 image over the background."""
-        return self._render(view, self._background, sh_degree(self.settings, progress)).image.copy()
+        return self._step.draw(view, self._background, sh_degree(self.settings, progress))
 
-    def _differentiate(
-        self, view: View, target: np.ndarray, background: np.ndarray, degree: int, focus: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray, float | None]:
-        """Fill the gradients of the rows that matter; returns those rows, their screen pull and the loss."""
-        settings, height, width = self.settings, view.camera.height, view.camera.width
-        rendering = self._render(view, background, degree, focus)
-        if focus is None:
-            rectangles = whole_image(height, width)
-        else:
-            tiles = touched_tiles(rendering, focus)
-            rectangles = tile_rectangles(tiles, height, width)
-        v_image = self._scratch.take("v_image", (3, height, width))
-        l1, ssim = image_gradient(rendering.image, target, rectangles, settings.ssim_weight, v_image)
-        rows, screen = render_backward(
-            rendering, self.state.arrays(), self.state.face.numpy(), self._seen, v_image,
-            Parameters(*(g.numpy() for g in self.state.gradients)), focus=focus, scratch=self._scratch,
-        )  # fmt: skip
-        loss = (1 - settings.ssim_weight) * l1 + settings.ssim_weight * (1 - ssim)
-        return rows, screen, loss if focus is None else None
-
-    def _render(self, view: View, background: np.ndarray, degree: int, focus: np.ndarray | None = None) -> Rendering:
-        self._seen = camera_frames(self.frames.of(view.timestep), view.camera)
-        return render_forward(
-            self.state.arrays(), self.state.face.numpy(), self._seen, degree, background, focus, REACH,
-            antialiased=self.settings.antialiased, scratch=self._scratch,
-        )  # fmt: skip
-
-    def _focus(self, timestep: int) -> np.ndarray | None:
-        """(N,) bool: the splats on this frame's selected triangles; None where nothing is selected."""
+    def _selected(self, timestep: int) -> np.ndarray | None:
+        """(F,) bool: the frame's selected triangles; None where nothing is selected."""
         faces = self.selection.get(timestep)
-        if faces is None or not faces.any():
-            return None
-        return np.asarray(faces[self.state.face.numpy()])
-
-    def _limit(self, rows: np.ndarray) -> None:
-        settings, state = self.settings, self.state
-        face, loose = state.face.numpy(), state.loose.numpy()
-        if settings.scale_weight:
-            limit = np.float32(settings.scale_limit) * self._lengths
-            gradient = state.gradients.log_scale.numpy()
-            scale_limit(rows, state.parameters.log_scale.numpy(), face, loose, limit, settings.scale_weight, gradient)
-        if settings.distance_weight:
-            limit = np.float32(settings.distance_limit) * self._lengths
-            gradient = state.gradients.xyz.numpy()
-            distance_limit(rows, state.parameters.xyz.numpy(), face, loose, limit, settings.distance_weight, gradient)
+        return faces if faces is not None and faces.any() else None
 
     def _maintain(self, progress: float) -> None:
         """Stray resets and density control, when their time has come."""
         settings = self.settings
-        if settings.stray_every and self.iteration % settings.stray_every == 0:
-            reset_strays(self.state, settings.stray_limit * self._lengths)
         start, end = settings.density_span
-        if settings.density_every and self.iteration % settings.density_every == 0 and start <= progress < end:
-            room = round(self.initial_count * (1 + settings.growth)) - len(self.state)
+        stray = _is_due(settings.stray_every, self.iteration)
+        density = _is_due(settings.density_every, self.iteration) and start <= progress < end
+        if not stray and not density:
+            return
+        state = self.state
+        if stray:
+            reset_strays(state, settings.stray_limit * self._lengths)
+        if density:
+            room = round(self.initial_count * (1 + settings.growth)) - len(state)
             rng = np.random.default_rng([settings.seed, self.iteration])
-            self.state = control_density(self.state, room, SPLIT_SHARE, rng)
+            state = control_density(state, room, SPLIT_SHARE, rng)
+        self.state = state
+
+
+def _is_due(every: int, iteration: int) -> bool:
+    return every > 0 and iteration % every == 0
 
 
 def initial_splats(capture: Capture, settings: Settings) -> Splats:
@@ -157,6 +137,8 @@ def initial_splats(capture: Capture, settings: Settings) -> Splats:
     lattice = lattice_splats(
         capture.neutral, capture.faces, settings.lattice, settings.sh_degree, convention=settings.convention
     )
+    if not settings.teeth:
+        lattice = lattice.rows(~teeth_triangles(capture)[lattice.face])
     strains = STRAINS if settings.strain_color else 0
     lattice = replace(lattice, strain_color=np.zeros((len(lattice), strains, 3), np.float32))
     if not settings.seeds:
@@ -166,6 +148,12 @@ def initial_splats(capture: Capture, settings: Settings) -> Splats:
     seeds = hull_seeds(capture, views, settings.convention, settings.sh_degree)
     seeds = replace(seeds, strain_color=np.zeros((len(seeds), strains, 3), np.float32))
     return Splats(*(np.concatenate([getattr(lattice, n), getattr(seeds, n)]) for n in vars(lattice)))
+
+
+def teeth_triangles(capture: Capture) -> np.ndarray:
+    """(F,) bool: the triangles of the rows of teeth that FLAME's mesh is given; none in any other mesh."""
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    return np.asarray(np.isin(capture.faces, masks.get("teeth", ())).all(axis=1))
 
 
 def reset_strays(state: TrainState, limit: np.ndarray) -> int:
@@ -180,7 +168,7 @@ def reset_strays(state: TrainState, limit: np.ndarray) -> int:
     return int(strays.sum())
 
 
-def _face_lengths(capture: Capture, convention: str) -> np.ndarray:
+def face_lengths(capture: Capture, convention: str) -> np.ndarray:
     """Length (F,) that limits are multiples of, in local units."""
     if convention == "gaussian_avatars":
         return np.ones(len(capture.faces), np.float32)

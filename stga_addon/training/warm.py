@@ -28,7 +28,7 @@ def compile_kernels() -> None:
     state = new_state(pair)
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     seen, face = camera_frames(WORLD, camera), state.face.numpy()
-    rendering = render_forward(state.arrays(), face, seen, 3)
+    rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
     touched_tiles(rendering, np.ones(2, bool))
     gradient = np.empty_like(rendering.image)
     target = np.zeros((16, 16, 3), np.uint8)
@@ -36,8 +36,7 @@ def compile_kernels() -> None:
     mask, over = np.zeros((16, 16), np.uint8), np.empty((16, 16, 3), np.uint8)
     mask.setflags(write=False)
     change_background(target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), over)
-    for image in (target, over):
-        image_gradient(rendering.image, image, whole_image(16, 16), 0.2, gradient)
+    image_gradient(rendering.image, target, whole_image(16, 16), 0.2, gradient)
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     rows, _ = render_backward(rendering, state.arrays(), face, seen, gradient, gradients)
     limits = rows, state.parameters.log_scale.numpy(), face, state.loose.numpy(), np.ones(1, np.float32), 1.0

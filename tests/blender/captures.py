@@ -8,7 +8,7 @@ import numpy as np
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
-from stga_addon.flame.sequence import FlameSequence
+from stga_addon.flame.sequence import FlameSequence, expression_mesh, neutral_mesh, sequence_mesh
 
 
 def strip(vertices: int) -> np.ndarray:
@@ -82,3 +82,19 @@ def flame_sequence(
     }
     shape, offset = rng.normal(size=model.n_identity), rng.normal(0, 0.002, (size, 3))
     return FlameSequence(model, shape, offset, tuple(timesteps), frames.__getitem__)
+
+
+def motion_capture(sequence: FlameSequence, source: Path) -> Capture:
+    """The sequence as what `open_capture` makes of a motion file."""
+    return Capture(
+        root=source,
+        layout="flame",
+        faces=sequence.model.faces,
+        neutral=neutral_mesh(sequence),
+        views={},
+        timesteps=sequence.timesteps,
+        regions={},
+        mesh=lambda timestep: sequence_mesh(sequence, timestep),
+        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        flame=sequence,
+    )

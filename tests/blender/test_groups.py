@@ -8,9 +8,9 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.groups import closure, read_selection, write_selection  # noqa: E402
-from stga_addon.scene.head import import_head, import_motion  # noqa: E402
+from stga_addon.scene.head import import_head  # noqa: E402
 
-from .captures import flame_model, flame_sequence, mesh_capture  # noqa: E402
+from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_reading_and_writing_again_changes_nothing(capture, head):
 def test_a_new_selection_replaces_the_old_and_nothing_else(tmp_path):
     """Fails when stale frames keep their groups, or the rig's own vertex groups are lost with them."""
     sequence = flame_sequence(flame_model(), timesteps=(1, 2))
-    head = import_motion(sequence, tmp_path / "motion.npz")
+    head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
     bones = {group.name: [head.vertex_groups[group.name].weight(3)] for group in head.vertex_groups}
     faces = len(sequence.model.faces)
     write_selection(head, {1: np.ones(faces, bool), 2: np.ones(faces, bool)})

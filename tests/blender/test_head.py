@@ -11,9 +11,9 @@ from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.head import import_head, import_motion  # noqa: E402
+from stga_addon.scene.head import import_head  # noqa: E402
 
-from .captures import flame_model, flame_sequence, mesh_capture  # noqa: E402
+from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 
 
 def at_frame(head, frame: float) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_two_captures_stand_side_by_side(tmp_path):
 def test_a_rig_goes_when_the_capture_has_none_any_more(tmp_path):
     """Fails when a folder that was FLAME and is a mesh capture now keeps an armature that deforms the new mesh."""
     source = tmp_path / "capture"
-    import_motion(flame_sequence(flame_model()), source)
+    import_head(motion_capture(flame_sequence(flame_model()), source))
     capture = mesh_capture(source)
     head = import_head(capture)
     assert not bpy.data.armatures

@@ -1,7 +1,5 @@
 """The operators, called as a script calls them, from the checkout registered as an extension."""
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +11,7 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
+from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
@@ -25,21 +23,29 @@ from stga_addon.scene.groups import closure, read_selection  # noqa: E402
 from stga_addon.scene.splats import evaluated_splats, set_input  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
-OPERATORS = ("import_capture", "select", "train", "show_avatar", "standard_view", "import_ply", "export")
-
-
-@pytest.fixture(scope="module")
-def extension():
-    """The checkout as a package of its own, as Blender imports an extension: only relative imports find their way."""
-    spec = importlib.util.spec_from_file_location(
-        "stga_checkout", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
-    )
-    module = sys.modules["stga_checkout"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.register()
-    yield module
-    module.unregister()
+OPERATORS = (
+    "import_capture",
+    "import_motion",
+    "import_meshes",
+    "select",
+    "toggle_region",
+    "count_selected",
+    "heat_map",
+    "plan_effects",
+    "train",
+    "cancel_training",
+    "dismiss_training",
+    "copy_report",
+    "make_runtime",
+    "test_runtime",
+    "cancel_runtime",
+    "show_avatar",
+    "apply_motion",
+    "standard_view",
+    "more_bounces",
+    "import_ply",
+    "export",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -108,7 +114,7 @@ def test_every_operator_explains_itself(extension):
 
 def test_steps_wait_for_a_capture(extension):
     """Catches steps that run, and fail, before there is anything to work on."""
-    for name in ("select", "train", "show_avatar", "export"):
+    for name in ("select", "train", "show_avatar", "export", "heat_map", "apply_motion"):
         assert not getattr(bpy.ops.stga, name).poll()
         with pytest.raises(RuntimeError, match="Import a capture first"):
             getattr(bpy.ops.stga, name)()
@@ -156,39 +162,6 @@ def test_flame_capture_from_import_to_show(extension, tmp_path):
         scene.frame_set(timestep)
         xyz, _, _ = evaluated_splats(scene.stga.splats)
         np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("layout", ["mesh", "flame"])
-def test_training_in_process(extension, tmp_path, layout):
-    """Catches a train step that does not reach the trainer with this capture, or whose result show cannot read."""
-    for package in ("torch", "numba", "PIL"):
-        pytest.importorskip(package)
-    if layout == "mesh":
-        bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    else:
-        folder, model = write_flame_capture(tmp_path / "capture")
-        bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    bpy.ops.stga.select(threshold=0.0005)
-    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6) == {"FINISHED"}
-    with pytest.raises(RuntimeError, match="already holds a run"):
-        bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6)
-    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), resume=True) == {"FINISHED"}
-    path = bpy.context.scene.stga.avatar
-    assert bpy.ops.stga.show_avatar(filepath=path) == {"FINISHED"}
-    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(read_avatar(Path(path)).splats)
-
-
-def test_training_without_torch_says_what_is_missing(extension, mesh_capture, tmp_path, monkeypatch):
-    """Catches a traceback about imports where a sentence should say which Python lacks what."""
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    monkeypatch.setattr(extension.operators.train, "find_spec", lambda name: None)
-    with pytest.raises(
-        RuntimeError,
-        match=r"^Error: training needs torch, numba, scipy, pillow, platformdirs in Blender's own Python \(.*\): ",
-    ):
-        bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
-    assert not (tmp_path / "run").exists()
 
 
 def test_exports_read_back(extension, mesh_capture, tmp_path):
@@ -262,6 +235,24 @@ def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
     mesh_capture.rename(mesh_capture.with_name("elsewhere"))
     with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
         bpy.ops.stga.select()
+
+
+def test_more_bounces_where_cycles_needs_them(extension):
+    """Catches a hint that shows where nothing has to be done, and a button that lowers what somebody raised."""
+    materials = extension.stga_addon.scene.materials
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.cycles.transparent_max_bounces = 8
+    assert "8 layers" in materials.few_bounces_hint(scene)
+    bpy.ops.stga.more_bounces()
+    assert scene.cycles.transparent_max_bounces == 64
+    assert materials.few_bounces_hint(scene) is None
+    scene.cycles.transparent_max_bounces = 200
+    bpy.ops.stga.more_bounces()
+    assert scene.cycles.transparent_max_bounces == 200
+    scene.cycles.transparent_max_bounces = 8
+    scene.render.engine = "BLENDER_WORKBENCH"
+    assert materials.few_bounces_hint(scene) is None
 
 
 def test_standard_view(extension):

@@ -10,11 +10,12 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.flame.forward import flame_forward  # noqa: E402
 from stga_addon.flame.model import JOINTS  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh  # noqa: E402
+from stga_addon.flame.teeth import with_teeth  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.head import import_head, import_motion  # noqa: E402
+from stga_addon.scene.head import import_head  # noqa: E402
 
-from .captures import flame_model, flame_sequence, mesh_capture  # noqa: E402
+from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 
 TOLERANCE = 2e-6  # metres; float32 skinning of a head half a metre from its origin
 
@@ -47,13 +48,13 @@ def quaternion(axis_angle: np.ndarray) -> np.ndarray:
 def test_tracked_frames_are_the_forward_pass(source):
     """Fails when a joint, a corrective, a weight, a rotation's sense or the translation is not FLAME's."""
     sequence = flame_sequence(flame_model())
-    assert_parity(import_motion(sequence, source), sequence)
+    assert_parity(import_head(motion_capture(sequence, source)), sequence)
 
 
 def test_poses_set_by_hand_are_the_forward_pass(source):
     """Fails when only the imported frames fit: baked pivots, correctives without drivers, unnormalised quaternions."""
     sequence = flame_sequence(flame_model())
-    head = import_motion(sequence, source)
+    head = import_head(motion_capture(sequence, source))
     rig, keys = rig_of(head), head.data.shape_keys
     rig.animation_data.action = keys.animation_data.action = None
     wanted = sequence_frame = flame_sequence(sequence.model, seed=5).frame(4)
@@ -77,14 +78,14 @@ def test_small_rotations_and_offsets_do_not_snap(source):
         return replace(full, expr=full.expr * 0.02, neck_pose=np.full(3, 5e-5), jaw_pose=np.full(3, -5e-5))
 
     small = replace(sequence, frame=frame)
-    head = import_motion(small, source)
+    head = import_head(motion_capture(small, source))
     for timestep in small.timesteps:
         np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(small, timestep), atol=5e-7)
 
 
 def test_drivers_need_no_python_and_no_cycle(source, capfd):
     """Fails when Blender would run the drivers as scripts (refused in files from others) or in an undefined order."""
-    head = import_motion(flame_sequence(flame_model()), source)
+    head = import_head(motion_capture(flame_sequence(flame_model()), source))
     at_frame(head, 5)
     for owner in (rig_of(head), head.data.shape_keys):
         assert owner.animation_data.drivers
@@ -105,16 +106,16 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
         return replace(still, rotation=np.array([0, wrapped, 0]))
 
     turning = replace(sequence, frame=frame)
-    head = import_motion(turning, source)
+    head = import_head(motion_capture(turning, source))
     for timestep in range(11):
         halfway = replace(turning.frame(0), rotation=np.array([0, 0.6 * (timestep + 0.5), 0]))
         expected = flame_forward(model, turning.shape, halfway, turning.static_offset)
         np.testing.assert_allclose(at_frame(head, timestep + 0.5), expected, atol=TOLERANCE)
 
 
-def test_only_the_expressions_in_use_become_keys(source):
-    """Fails when unused components bloat the file, or a used one is missing."""
-    model = flame_model()
+def test_every_slider_is_there(source):
+    """Fails when a component that another person's motion needs has no key, or a slider ends where faces do not."""
+    model = flame_model(identity=12)
     sequence = flame_sequence(model)
 
     def frame(timestep: int):
@@ -123,14 +124,55 @@ def test_only_the_expressions_in_use_become_keys(source):
         return replace(full, expr=used)
 
     sparse = replace(sequence, frame=frame)
-    head = import_motion(sparse, source)
-    names = [key.name for key in head.data.shape_keys.key_blocks if key.name.startswith("expr_")]
-    assert names == ["expr_003", "expr_017"]
+    head = import_head(motion_capture(sparse, source))
+    names = [key.name for key in head.data.shape_keys.key_blocks if not key.name.startswith("pose_")]
+    expected = [f"expr_{k:03d}" for k in range(model.n_expression)] + [f"identity_{k:03d}" for k in range(10)]
+    assert names == ["Basis", *expected]
+    for name in expected:
+        key = head.data.shape_keys.key_blocks[name]
+        assert (key.slider_min, key.slider_max) == (-10, 10)
     assert_parity(head, sparse)
-    head = import_motion(sparse, source, all_expressions=True)
-    names = [key.name for key in head.data.shape_keys.key_blocks if key.name.startswith("expr_")]
-    assert len(names) == model.n_expression
-    assert_parity(head, sparse)
+
+
+def test_identity_sliders_are_another_person(source):
+    """Fails when joints stay where the tracked person has them, or the sliders count from FLAME's mean face."""
+    sequence = flame_sequence(flame_model())
+    head = import_head(motion_capture(sequence, source))
+    rng = np.random.default_rng(8)
+    other = rng.normal(0, 2, sequence.model.n_identity)
+    for component, value in enumerate(other):
+        head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = value
+    grown = replace(sequence, shape=sequence.shape + other)
+    for timestep in grown.timesteps:
+        np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(grown, timestep), atol=1e-5)
+    for component in range(len(other)):
+        head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = 0
+    assert_parity(head, sequence)
+
+
+def test_the_published_topology_with_teeth(source, shared_data):
+    """Fails when parity holds for a hundred random vertices and is lost at the size and scale of FLAME itself."""
+    with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
+        template, identity, faces = data["v_template"], data["shapedirs"], data["faces"].astype(np.int32)
+    small = flame_model(vertices=len(template), components=20, identity=0)
+    model = with_teeth(
+        replace(
+            small,
+            v_template=template.astype(np.float64),
+            shapedirs=np.concatenate([identity, small.shapedirs / 3], axis=2),
+            n_identity=identity.shape[2],
+            faces=faces,
+        )
+    )
+    sequence = flame_sequence(model, timesteps=(1, 2))
+    head = import_head(motion_capture(sequence, source))
+    assert_parity(head, sequence)
+    other = np.zeros(model.n_identity)
+    other[:10] = np.random.default_rng(4).normal(0, 2, 10)
+    for component, value in enumerate(other[:10]):
+        head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = value
+    grown = replace(sequence, shape=sequence.shape + other)
+    np.testing.assert_allclose(at_frame(head, 2), sequence_mesh(grown, 2), atol=1e-5)
 
 
 def test_joints_that_stay_need_no_helper_bones(source):
@@ -138,7 +180,7 @@ def test_joints_that_stay_need_no_helper_bones(source):
     model = flame_model()
     model.shapedirs[model.j_regressor.any(axis=0)] = 0
     sequence = flame_sequence(model)
-    head = import_motion(sequence, source)
+    head = import_head(motion_capture(sequence, source))
     assert [bone.name for bone in rig_of(head).data.bones] == list(JOINTS)
     assert not rig_of(head).animation_data.drivers
     assert {group.name for group in head.vertex_groups} == set(JOINTS)
@@ -149,7 +191,7 @@ def test_offsets_per_frame_become_keys(source):
     """Fails when dynamic_offset is dropped, does not move the joints, or comes without a word."""
     sequence = flame_sequence(flame_model(), dynamic=True)
     said = []
-    head = import_motion(sequence, source, warn=said.append)
+    head = import_head(motion_capture(sequence, source), warn=said.append)
     assert len(said) == 1
     assert "dynamic_offset" in said[0]
     assert_parity(head, sequence)
@@ -164,10 +206,10 @@ def test_coefficients_beyond_the_sliders_are_told(source):
         return replace(full, expr=full.expr + np.eye(len(full.expr))[7] * (12 if timestep == 5 else 0))
 
     said = []
-    import_motion(replace(sequence, frame=frame), source, warn=said.append)
+    import_head(motion_capture(replace(sequence, frame=frame), source), warn=said.append)
     assert len(said) == 1
     assert "expr 7" in said[0]
-    assert "timestep 5" in said[0]
+    assert "frame 5" in said[0]
 
 
 def test_a_flame_capture_imports_as_a_rig(tmp_path):
@@ -189,11 +231,11 @@ def test_a_flame_capture_imports_as_a_rig(tmp_path):
 
 def test_importing_again_replaces_the_rig(source):
     """Fails when a second import doubles rig, modifier or drivers, or leaves actions behind."""
-    first = import_motion(flame_sequence(flame_model(), dynamic=True), source, warn=lambda sentence: None)
+    first = import_head(motion_capture(flame_sequence(flame_model(), dynamic=True), source), warn=lambda sentence: None)
     rig = rig_of(first)
     counts = [len(blocks) for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)]
     sequence = flame_sequence(flame_model(seed=2), seed=2)
-    head = import_motion(sequence, source)
+    head = import_head(motion_capture(sequence, source))
     assert head == first
     assert rig_of(head) == rig
     assert counts == [
@@ -208,7 +250,7 @@ def test_the_rig_keeps_what_was_active(source):
     mine = bpy.data.objects.new("mine", None)
     bpy.context.scene.collection.objects.link(mine)
     bpy.context.view_layer.objects.active = mine
-    head = import_motion(flame_sequence(flame_model()), source)
+    head = import_head(motion_capture(flame_sequence(flame_model()), source))
     assert bpy.context.view_layer.objects.active == mine
     assert set(bpy.data.objects) == {mine, head, head.parent, rig_of(head)}
 
@@ -216,7 +258,7 @@ def test_the_rig_keeps_what_was_active(source):
 def test_a_saved_rig_shows_the_same(source, tmp_path):
     """Fails when drivers, keyframes or bindings do not survive saving and opening."""
     sequence = flame_sequence(flame_model())
-    name = import_motion(sequence, source).name
+    name = import_head(motion_capture(sequence, source)).name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))

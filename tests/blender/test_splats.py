@@ -14,8 +14,10 @@ from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import nodes  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.materials import DISPLAY_COLOR, OPACITY  # noqa: E402
-from stga_addon.scene.splats import evaluated_splats, set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.materials import DISPLAY_COLOR, EXTENT, OPACITY  # noqa: E402
+from stga_addon.scene.node_colors import SH  # noqa: E402
+from stga_addon.scene.node_display import ELLIPSOIDS, QUADS  # noqa: E402
+from stga_addon.scene.splats import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
 
 FRAMES = (1, 5, 9)
 
@@ -152,10 +154,93 @@ def test_attributes_hold_activated_values():
     splats = replace(avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32))
     mesh = show_avatar(replace(avatar, splats=splats), animated_head(avatar.neutral, avatar.faces)).data
     assert [item.value for item in mesh.attributes[OPACITY].data] == pytest.approx([0.5] * 50)
-    # sRGB middle grey is 21.4 % of white in linear light.
-    assert list(mesh.attributes[nodes.COLOR].data[7].color) == pytest.approx([0.21404, 0.21404, 0.21404, 1], abs=1e-4)
     assert list(mesh.attributes[nodes.SCALE].data[3].vector) == pytest.approx(np.exp(splats.log_scale[3]), rel=1e-5)
-    assert [nodes.SH_REST.format(i) in mesh.attributes for i in range(4)] == [True, True, True, False]
+    assert [SH.format(i) in mesh.attributes for i in range(5)] == [True, True, True, True, False]
+
+
+def displayed_colors(shown) -> np.ndarray:
+    """(N, 3) scene-linear colours of the displayed points."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    points = next(i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD")
+    color = np.empty(4 * len(points.points), np.float32)
+    points.attributes[DISPLAY_COLOR].data.foreach_get("color", color)
+    return color.reshape(-1, 4)[:, :3]
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    srgb = np.clip(srgb, 0, 1)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def active_camera(location=(0.0, 0.0, 0.0)):
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location = location
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    return camera
+
+
+def test_constant_colours_are_scene_linear():
+    """Catches sRGB shown where Blender expects scene-linear, and colours that leave 0…1."""
+    splats = replace(random_splats(1, 300, degree=0), sh=np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3))
+    expected = linear(0.5 + 0.28209479177387814 * splats.sh[:, 0])
+    assert expected.min() == 0
+    assert expected.max() == 1
+    np.testing.assert_allclose(displayed_colors(show_world_splats(splats, "scan")), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_colours_follow_the_active_camera(degree):
+    """Catches harmonics of another order or sign, and directions in the world's instead of the splats' own space."""
+    kernels = pytest.importorskip("stga_addon.raster.kernels.project")
+    avatar = avatar_of("stga", 400)
+    sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
+    avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown = show_avatar(avatar, head)
+    camera = active_camera((0.3, -0.9, 1.2))
+    bpy.context.scene.frame_set(5)
+    at = np.linalg.inv(np.array(shown.matrix_world, np.float64)) @ [*camera.location, 1]
+    direction = evaluated_splats(shown)[0] - at[:3]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    basis = np.zeros((400, 16), np.float32)
+    for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
+        kernels._basis(degree, x, y, z, row)
+    seen = 0.5 + np.einsum("nk,nkc->nc", basis[:, : sh.shape[1]], sh)
+    np.testing.assert_allclose(displayed_colors(shown), linear(seen), atol=2e-4)
+    set_input(shown, nodes.VIEW_DEPENDENT, False)
+    np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + 0.28209479177387814 * sh[:, 0]), atol=2e-6)
+
+
+def test_colours_follow_strain():
+    """Catches strain of another triangle, in other axes or not averaged, against numpy on the deformed mesh."""
+    avatar = avatar_of("stga", 1500)
+    colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3, 3)).astype(np.float32)
+    splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors)
+    flat = avatar.neutral.copy()
+    flat[avatar.faces[7, 2]] = flat[avatar.faces[7, 1]]  # triangles without area have no strain
+    avatar = replace(avatar, splats=splats, neutral=flat)
+    head = animated_head(flat, avatar.faces)
+    shown = show_avatar(avatar, head)
+    seen = {}
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        frames = avatar.frames(evaluated_vertices(head))
+        assert np.abs(frames.strain).max() > 0.5
+        seen[frame] = displayed_colors(shown)
+        expected = 0.5 + 0.28209479177387814 * to_world(splats, frames).sh[:, 0]
+        np.testing.assert_allclose(seen[frame], linear(expected), atol=1e-3)
+    assert np.abs(seen[1] - seen[9]).max() > 0.1
+
+
+def test_no_strain_nodes_without_strain_colours():
+    """Catches the cost of strain on every avatar that does not know it."""
+    avatar = avatar_of("stga", 10)
+    show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    (tree,) = bpy.data.node_groups
+    names = [socket.default_value for node in tree.nodes for socket in node.inputs if socket.type == "STRING"]
+    assert "stga_face" in names
+    assert not [name for name in names if "strain" in name]
 
 
 def test_display_inputs():
@@ -170,7 +255,9 @@ def test_display_inputs():
     set_input(shown, nodes.PERCENTAGE, 25.0)
     assert 400 < len(evaluated_splats(shown)[0]) < 600
     set_input(shown, nodes.PERCENTAGE, 100.0)
-    set_input(shown, nodes.ELLIPSOIDS, True)
+    assert get_input(shown, nodes.SIZE) == 1.0
+    assert get_input(shown, "Colour of the sea") is None
+    set_input(shown, nodes.DISPLAY, ELLIPSOIDS)
     with pytest.raises(StgaError, match="ellipsoids"):
         evaluated_splats(shown)
 
@@ -180,7 +267,7 @@ def test_ellipsoids_are_the_splats_own_shape():
     avatar = avatar_of("stga", 200)
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
-    set_input(shown, nodes.ELLIPSOIDS, True)
+    set_input(shown, nodes.DISPLAY, ELLIPSOIDS)
     set_input(shown, nodes.SIZE, 2.0)
     bpy.context.scene.frame_set(5)
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -196,6 +283,29 @@ def test_ellipsoids_are_the_splats_own_shape():
     np.testing.assert_allclose(local[:, :3, 0], 2 * np.exp(expected.log_scale[:, :1]) * axis_x, atol=1e-5)
 
 
+def test_quads_face_the_camera_and_cover_the_ellipsoid():
+    """Catches quads seen edge-on, and quads that a stretched splat leaves behind: both cut Gaussians off."""
+    avatar = avatar_of("stga", 200)
+    shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    camera = active_camera((0.4, -1.0, 1.3))
+    bpy.context.scene.frame_set(5)
+    centre, _, _ = evaluated_splats(shown)
+    set_input(shown, nodes.DISPLAY, QUADS)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    quads = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
+    to_world = np.array(shown.matrix_world, np.float64)
+    np.testing.assert_allclose(quads[:, :3, 3], centre @ to_world[:3, :3].T + to_world[:3, 3], atol=1e-5)
+    # Seen from the camera each splat is a sphere in the quad's own space, right above the quad's centre.
+    eye = np.linalg.solve(quads, np.broadcast_to([*camera.location, 1.0], (len(quads), 4))[..., None])[:, :3, 0]
+    assert (eye[:, 2] / np.linalg.norm(eye, axis=-1)).min() > 1 - 1e-4
+    set_input(shown, nodes.DISPLAY, ELLIPSOIDS)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    spheres = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
+    shapes = [m[:, :3, :3] @ m[:, :3, :3].transpose(0, 2, 1) for m in (quads, spheres)]
+    np.testing.assert_allclose(shapes[0], shapes[1], rtol=2e-3, atol=1e-10)
+    assert EXTENT == 3.0
+
+
 def test_selection_greys_what_the_frame_freezes():
     """Catches the colouring by another frame's selection, and by neighbours of selected triangles."""
     avatar = avatar_of("stga", 1000)
@@ -207,11 +317,7 @@ def test_selection_greys_what_the_frame_freezes():
     set_input(shown, nodes.SHOW_SELECTION, True)
 
     def grey() -> np.ndarray:
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        points = next(i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD")
-        color = np.empty(4 * len(points.points), np.float32)
-        points.attributes[DISPLAY_COLOR].data.foreach_get("color", color)
-        return np.isclose(color.reshape(-1, 4), nodes.FROZEN_GREY).all(1)
+        return np.isclose(displayed_colors(shown), nodes.FROZEN_GREY[:3]).all(1)
 
     bpy.context.scene.frame_set(5)
     assert 0 < selected.sum() < 1000
@@ -221,6 +327,10 @@ def test_selection_greys_what_the_frame_freezes():
     bpy.context.scene.frame_set(5)
     set_input(shown, nodes.SHOW_SELECTION, False)
     assert not grey().any()
+    set_input(shown, nodes.SELECTED_ONLY, True)
+    assert len(evaluated_splats(shown)[0]) == selected.sum()
+    bpy.context.scene.frame_set(6)
+    assert len(evaluated_splats(shown)[0]) == 1000
 
 
 def test_a_head_of_another_topology_is_refused():
@@ -250,7 +360,8 @@ def test_saved_file_does_not_hold_the_trees_twice(tmp_path: Path):
     assert len(bpy.data.materials) == 2
 
 
-def test_cycles_draws_an_ellipsoid_as_a_gaussian(tmp_path):
+@pytest.mark.parametrize("display", [ELLIPSOIDS, QUADS])
+def test_cycles_draws_an_ellipsoid_as_a_gaussian(display, tmp_path):
     """Catches flat discs, spheres counted front and back, and a density in world instead of the splat's own units."""
     sigma, opacity, size = np.array([0.02, 0.01, 0.005]), 0.8, 48
     one = random_splats(1, 1, degree=0)
@@ -262,7 +373,7 @@ def test_cycles_draws_an_ellipsoid_as_a_gaussian(tmp_path):
         log_scale=np.log(sigma, dtype=np.float32)[None],
         opacity=logit,
     )
-    set_input(show_world_splats(splats, "one"), nodes.ELLIPSOIDS, True)
+    set_input(show_world_splats(splats, "one"), nodes.DISPLAY, display)
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.type, camera.data.ortho_scale, camera.data.clip_start = "ORTHO", 0.12, 0.01

@@ -465,7 +465,7 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
         open_capture(root, model_file, "left")
     with pytest.raises(StgaError, match="is not a folder"):
         open_capture(root / "transforms_train.json")
-    with pytest.raises(StgaError, match="model.npz: has none of expr"):
+    with pytest.raises(StgaError, match=r"model\.npz: has none of expr"):
         open_capture(model_file, model_file)
     plain = tmp_path / "plain"
     plain.mkdir()

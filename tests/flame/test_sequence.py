@@ -166,7 +166,10 @@ def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
         ("expr", np.zeros(4), "expr has shape"),
         ("rotation", np.full((3, 3), np.nan), "rotation holds values that are not finite"),
         ("eyes_pose", np.zeros((3, 5)), "eyes_pose has shape"),
-        ("shape", None, "has no shape"),
+        ("shape", np.full(8, np.inf), "shape holds values that are not finite"),
+        ("pose", np.zeros((3, 9)), r"pose has shape \(3, 9\), expected \(timesteps, 6\) or \(timesteps, 15\)"),
+        ("pose", np.zeros((0, 6)), "pose has shape"),
+        ("pose", np.zeros(6), "pose has shape"),
     ],
 )
 def test_malformed_motions(
@@ -181,8 +184,30 @@ def test_malformed_motions(
         "jaw_pose": np.zeros((3, 3)),
         "eyes_pose": np.zeros((3, 6)),
     }
-    motion.pop(field)
+    motion.pop(field, None)
     if value is not None:
         motion[field] = value
     with pytest.raises(StgaError, match=f"motion.npz: {message}"):
         read_motion(_write(tmp_path / "motion.npz", motion), tiny_flame)
+
+
+def test_plain_expression_and_pose_files(tmp_path: Path, tiny_flame: FlameModel) -> None:
+    # Catches another tracker's names or packing read into the wrong joint, and an identity that is insisted on.
+    rng = np.random.default_rng(20)
+    expr, pose = rng.normal(size=(3, 4)), rng.normal(0, 0.4, (3, 15))
+    short = read_motion(_write(tmp_path / "a.npz", {"exp": expr[:, :2], "pose": pose[:, :6]}), tiny_flame)
+    frame = short.frame(1)
+    np.testing.assert_array_equal(frame.expr, [*expr[1, :2], 0, 0])
+    np.testing.assert_array_equal(frame.rotation, pose[1, :3])
+    np.testing.assert_array_equal(frame.jaw_pose, pose[1, 3:6])
+    assert not np.concatenate([frame.neck_pose, frame.eyes_pose, frame.translation, short.shape]).any()
+    joints = read_motion(_write(tmp_path / "b.npz", {"pose": pose, "betas": np.ones((3, 8))}), tiny_flame)
+    np.testing.assert_array_equal(joints.frame(2).pose, pose[2].reshape(5, 3))
+    np.testing.assert_array_equal(joints.shape, np.ones(8))
+    assert not joints.frame(2).expr.any()
+
+
+def test_a_file_without_motion_is_refused(tmp_path: Path, tiny_flame: FlameModel) -> None:
+    # Catches an avatar or a model file that is imported as a head that never moves.
+    with pytest.raises(StgaError, match=r"other\.npz: has none of expr, rotation"):
+        read_motion(_write(tmp_path / "other.npz", {"xyz": np.zeros((4, 3))}), tiny_flame)

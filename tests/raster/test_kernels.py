@@ -12,7 +12,8 @@ from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.render import Parameters, Scratch, camera_frames, render, render_backward, render_forward
+from stga_addon.raster.autograd import render
+from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_backward, render_forward
 
 NAMES = Parameters._fields[:5]
 # Kernels compute in float32 with a polynomial exp; a pixel sums up to a hundred terms below 1.

@@ -10,8 +10,13 @@ from stga_addon.training.state import TrainState, new_state
 from .toys import bits, random_splats, random_state
 
 RATES = {
-    **{"xyz": 1e-3, "rotation": 5e-3, "log_scale": 2e-2, "opacity": 5e-2},
-    **{"sh": 1e-2, "sh_rest": 1e-3, "strain_color": 4e-3},
+    "xyz": 1e-3,
+    "rotation": 5e-3,
+    "log_scale": 2e-2,
+    "opacity": 5e-2,
+    "sh": 1e-2,
+    "sh_rest": 1e-3,
+    "strain_color": 4e-3,
 }
 
 
@@ -30,10 +35,13 @@ def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
     return rows
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_each_row_is_torchs_adam_with_its_own_history(seed: int) -> None:
-    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε."""
-    state = new_state(random_splats(6, 4, seed))
+@pytest.mark.parametrize(("seed", "degree"), [(0, 1), (1, 1), (2, 3), (3, 0)])
+def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) -> None:
+    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε.
+
+    With constant colour, other parameters have more columns than `sh`.
+    """
+    state = new_state(random_splats(6, 4, seed, degree))
     rng = np.random.default_rng(seed)
     rows = separate_rows(state)
     groups = [{"params": [row[name] for row in rows], "lr": rate} for name, rate in RATES.items()]
@@ -51,7 +59,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int) -> None:
         theirs.step()
         adam.step(state, listed, RATES)
     for n, row in enumerate(rows):
-        for name in ("xyz", "rotation", "log_scale", "opacity"):
+        for name in ("xyz", "rotation", "log_scale", "opacity", "strain_color"):
             # 25 float32 steps of at most the rate each
             np.testing.assert_allclose(
                 getattr(state.parameters, name)[n], row[name].detach(), rtol=1e-5, atol=25 * RATES[name] * 1e-5

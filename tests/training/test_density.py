@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
-from stga_addon.raster.render import Parameters, render
+from stga_addon.raster.autograd import render
+from stga_addon.raster.render import Parameters
 from stga_addon.training.density import FAINT, control_density
 from stga_addon.training.state import TrainState, keep_rows, new_state, tensors_of
 

@@ -14,10 +14,11 @@ from PIL import Image
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
+from stga_addon.training.cpu_step import CpuStep
 from stga_addon.training.metrics import psnr
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import STRATEGIES
-from stga_addon.training.trainer import Trainer, initial_splats
+from stga_addon.training.trainer import Trainer, face_lengths, initial_splats
 
 from .toys import bits, quick_settings
 
@@ -33,6 +34,11 @@ def lower_part(capture: Capture) -> dict[int, np.ndarray]:
 def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) -> Trainer:
     quiet = {"warm_up": 0.0, "global_every": 2, "density_every": 0, "stray_every": 0, "strain_color": True}
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
+
+
+def cpu_step(trainer: Trainer) -> CpuStep:
+    assert isinstance(trainer._step, CpuStep)
+    return trainer._step
 
 
 def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
@@ -84,15 +90,16 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    rows, screen, loss = trainer._differentiate(view, target, WHITE, degree, None)
+    step = cpu_step(trainer)
+    rows, screen, loss = step._differentiate(view, target, WHITE, degree, None)
     full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
     pull, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
-    for buffer in trainer._scratch._buffers.values():
+    for buffer in step._scratch._buffers.values():
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for tensor in trainer.state.gradients:
         tensor.fill_(7.0)
-    rows, screen, loss = trainer._differentiate(view, target, WHITE, degree, focus)
+    rows, screen, loss = step._differentiate(view, target, WHITE, degree, focus)
     assert loss is None
     np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)
@@ -109,8 +116,8 @@ def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
     trainer = make_trainer(toy)
     view, _ = large(view_of(toy, 1))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    everything = len(trainer._render(view, WHITE, 0).tiles)
-    assert 0 < len(trainer._render(view, WHITE, 0, focus).tiles) < 0.8 * everything
+    everything = len(cpu_step(trainer)._render(view, WHITE, 0).tiles)
+    assert 0 < len(cpu_step(trainer)._render(view, WHITE, 0, focus).tiles) < 0.8 * everything
 
 
 @pytest.mark.parametrize("timestep", [0, 4])
@@ -226,5 +233,5 @@ def test_draw_is_a_copy(toy: Capture) -> None:
 def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
     """Catches limits in metres applied to GaussianAvatars' triangle units, and an area without its factor two."""
     areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
-    np.testing.assert_allclose(make_trainer(toy)._lengths, np.sqrt(2 * areas), rtol=1e-5)
-    np.testing.assert_array_equal(make_trainer(toy, "gaussian-avatars")._lengths, 1)
+    np.testing.assert_allclose(face_lengths(toy, "stga"), np.sqrt(2 * areas), rtol=1e-5)
+    np.testing.assert_array_equal(face_lengths(toy, "gaussian_avatars"), 1)

@@ -90,10 +90,25 @@ def fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, bands, pair_spl
 
 
 @jit
-def mark_tiles(rect, focus, visible, marked):
-    """Set marked (tiles_y, tiles_x) bool where a visible (M,) splat of focus (N,) bool reaches; rect (N, 4)."""
+def reaching(rect, visible, drawn):
+    """The splats of visible (M,) int32 that reach a tile of drawn (tiles_y, tiles_x) bool, in their order."""
+    kept = np.empty_like(visible)
+    count = 0
     for n in range(len(visible)):
         i = visible[n]
+        found = False
+        for y in range(rect[i, 1], rect[i, 3]):
+            for x in range(rect[i, 0], rect[i, 2]):
+                found |= drawn[y, x]
+        kept[count] = i
+        count += found
+    return kept[:count]
+
+
+@jit
+def mark_tiles(rect, focus, marked):
+    """Set marked (tiles_y, tiles_x) bool where a splat of focus (N,) bool reaches; rect (N, 4)."""
+    for i in range(len(rect)):
         if focus[i]:
             for y in range(rect[i, 1], rect[i, 3]):
                 for x in range(rect[i, 0], rect[i, 2]):

@@ -1,0 +1,110 @@
+"""What one iteration's time grows with: splats, pixels, the selected share and threads.
+
+    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png]
+
+The demo's head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at 802×550, all in one
+process. More splats are smaller ones, as on a real head: their size falls with the square root of their number. Run it
+on an idle machine. Prints every figure, with the (splat, tile) pairs of the view, and draws them.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import matplotlib
+import numba
+import numpy as np
+from iteration import demo_head, device_step, front_camera, median_ms, two_regions
+
+from stga_addon.avatar.embedding import face_frames
+from stga_addon.raster.render import Parameters, camera_frames, render_forward
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+SPLATS, WIDTH, HEIGHT = 60_000, 802, 550
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement: what was varied, median ms of an iteration, and (splat, tile) pairs in the view."""
+
+    x: float
+    ms: float
+    pairs: int
+
+
+def measure(x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, share: float | None = None) -> Point:
+    """An iteration of `splats` splats at `zoom` times the image size; share: of the splats, selected; None: global."""
+    rng = np.random.default_rng(0)
+    head, mesh, faces = demo_head(splats, rng)
+    camera = front_camera(round(zoom * WIDTH), round(zoom * HEIGHT))
+    target = rng.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
+    step, batch = device_step("cpu", head, mesh, faces, camera, target)
+    if share is not None:
+        batch = replace(batch, selected=two_regions(head, mesh, faces, share))
+    arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
+    seen = camera_frames(face_frames(mesh, faces, mesh), camera)
+    pairs = len(render_forward(arrays, head.face, seen, 3).pair_splat)
+    return Point(x, median_ms(lambda: step.train(batch), repeats), pairs)
+
+
+def threads(count: int, repeats: int) -> Point:
+    """An iteration on `count` threads."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(count)
+    try:
+        return measure(count, repeats)
+    finally:
+        numba.set_num_threads(before)
+
+
+def series(repeats: int) -> dict[str, list[Point]]:
+    """What was varied -> its measurements."""
+    counts = (10_000, 30_000, 60_000, 100_000, 200_000, 500_000, 1_000_000)
+    plans: dict[str, list[Callable[[], Point]]] = {
+        "splats": [lambda n=n: measure(n, repeats if n < 200_000 else max(3, repeats // 5), splats=n) for n in counts],
+        "pixels": [lambda z=z: measure(z * z * WIDTH * HEIGHT, repeats, zoom=z) for z in (0.25, 0.5, 1.0, 1.5, 2.0)],
+        "selected share": [lambda s=s: measure(s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)],
+        "threads": [lambda n=n: threads(n, repeats) for n in range(1, numba.get_num_threads() + 1)],
+    }
+    found = {}
+    for name, measurements in plans.items():
+        found[name] = []
+        for work in measurements:
+            point = work()
+            print(f"{name:<16}{point.x:>12g}{point.pairs:>10} pairs{point.ms:>9.2f} ms", flush=True)
+            found[name].append(point)
+    return found
+
+
+def draw(found: dict[str, list[Point]], path: Path) -> None:
+    figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), constrained_layout=True)
+    for axis, (name, points) in zip(axes, found.items(), strict=True):
+        by_pairs = name in ("splats", "pixels")
+        x = [point.pairs / 1e3 if by_pairs else point.x for point in points]
+        axis.plot(x, [point.ms for point in points], "o-")
+        axis.set_xlabel("thousand (splat, tile) pairs" if by_pairs else name)
+        axis.set_title(f"more {name}" if by_pairs else name, fontsize=10)
+        axis.set_ylim(0)
+        axis.set_xlim(0)
+        for at, point in zip(x, points, strict=True):
+            label = f"{point.x / 1e3:g}k" if by_pairs else ""
+            axis.annotate(label, (at, point.ms), textcoords="offset points", xytext=(-4, 5), fontsize=7, ha="right")
+    axes[0].set_ylabel("ms per iteration")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    found = series(options.repeats)
+    if options.out:
+        draw(found, options.out)
+
+
+if __name__ == "__main__":
+    main()

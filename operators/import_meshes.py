@@ -1,0 +1,39 @@
+"""Tracked meshes → animated head without a capture."""
+
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.capture.meshes import MESH_SUFFIXES
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from . import ids
+from .common import file_path, reporting
+from .import_capture import bring_in
+
+
+class ImportMeshes(bpy.types.Operator):
+    """Import all meshes of a folder, one a frame and all of the same triangles, as one animated head"""
+
+    bl_idname = ids.IMPORT_MESHES
+    bl_label = "Import Mesh Sequence"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    filepath: bpy.props.StringProperty(
+        name="File",
+        description="Any mesh of the sequence; the whole folder is imported",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS,
+    )
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{suffix}" for suffix in MESH_SUFFIXES), options={"HIDDEN"}
+    )
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        path = file_path(self.filepath, "mesh sequence")
+        bring_in(self, context, path if path.is_dir() else path.parent)
+        return {"FINISHED"}

@@ -1,0 +1,14 @@
+"""Registers the render engine and tells it which Python draws where Blender's own cannot."""
+
+import bpy
+
+from ..stga_addon.scene import engine
+from .runtime import training_python
+
+
+def register() -> None:
+    engine.register(lambda: training_python(bpy.context))
+
+
+def unregister() -> None:
+    engine.unregister()

@@ -1,0 +1,47 @@
+"""What a run came to, in a few lines read from its metrics."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..files import replacing
+from ..training.folder import read_metrics, read_run
+from ..training.forecast import clock, curve_of, hits, level_since, missed
+from .pictures import run_chart
+from .results import evaluation_share
+
+CURVE = "curve.png"
+
+
+def conclude(folder: Path) -> list[str]:
+    """The lines for a person whose run has ended; leaves the curve as a picture in the run's folder."""
+    metrics = read_metrics(folder)
+    if curve_of(metrics):
+        with replacing(folder / CURVE) as partial:
+            run_chart(metrics).save(partial, format="PNG")
+    return describe_run(metrics, read_run(folder).settings.target_psnr)
+
+
+def describe_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
+    """Accuracy, where it was reached, the forecasts checked, and what evaluation and memory came to."""
+    if not metrics:
+        return []
+    lines, curve, last = [], curve_of(metrics), metrics[-1]
+    if curve:
+        best = max((line for line in metrics if "psnr" in line), key=lambda line: line["psnr"])
+        parts = [f"{best['psnr']:.2f} dB", f"SSIM {best['ssim']:.4f}"]
+        named = (("psnr_mask", "in the head mask"), ("psnr_selected", "in what moves"))
+        parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
+        lines.append(f"held-out views: {', '.join(parts)}, after {clock(best['seconds'])}, which the avatar shows")
+    if target is not None and curve:
+        reached = any(psnr >= target for _, psnr in curve)
+        lines.append(f"{target:g} dB was reached" if reached else missed(curve, target))
+    level = level_since(curve)
+    if level is not None:
+        lines.append(f"nothing was gained after {clock(level)}: more time does not help with these settings")
+    hit, checked = hits(metrics)
+    if checked:
+        lines.append(f"forecasts: {hit} of {checked} came true within their error")
+    memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
+    lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, on top of it{memory}")
+    return lines

@@ -1,0 +1,230 @@
+"""The training runtime: a Python with torch that trains beside Blender; found, tested or made here.
+
+`python -m stga_addon.runtime test FOLDER PYTHON` and `… make FOLDER` are workers that tell in FOLDER/task (`task`).
+FOLDER/venv is the environment that is made, FOLDER/ready is there once it has passed the test.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from . import task
+from .errors import StgaError
+from .files import replacing
+from .probe import NEEDED
+
+DEVICES = ("auto", "cpu", "cuda")
+SIZES_GB = {"cpu": 1.5, "cuda": 7.0}
+"""Room that a runtime takes: measured, and from the sizes of PyTorch's CUDA packages."""
+CUDA_BUILDS = ("cu130", "cu128", "cu126")
+"""Of PyTorch, newest first; its index keeps them."""
+INDEX = "https://download.pytorch.org/whl/"
+PROBE_S = 180.0
+"""The first import of torch from a slow disk."""
+
+
+def task_folder(folder: Path) -> Path:
+    return folder / "task"
+
+
+def made_python(folder: Path) -> Path | None:
+    """The interpreter of the runtime that was made in `folder`; None where there is none, or it never got ready."""
+    python = venv_python(folder / "venv")
+    return python if (folder / "ready").exists() and python.exists() else None
+
+
+def venv_python(venv: Path) -> Path:
+    return venv / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def missing_here() -> list[str]:
+    """What training needs and this interpreter lacks, as pip calls it."""
+    return [package for module, package in NEEDED.items() if find_spec(module) is None]
+
+
+def testing_arguments(folder: Path, python: str) -> list[str]:
+    """What a worker's interpreter runs, after `-m`, to test another one."""
+    return ["stga_addon.runtime", "test", str(folder), python]
+
+
+def making_arguments(folder: Path, python: str, device: str, wheels: Path | None) -> list[str]:
+    """The same to make a runtime of the interpreter `python`."""
+    offline = ["--wheels", str(wheels)] if wheels else []
+    return ["stga_addon.runtime", "make", str(folder), "--python", python, "--device", device, *offline]
+
+
+def probe(python: str) -> str:
+    """One line on an interpreter that can train: versions and device.
+
+    Raises StgaError where it cannot be started or lacks something, which the sentence names.
+    """
+    command = [python, "-m", "stga_addon.probe"]
+    environment = task.environment(os.environ)
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PROBE_S, check=False)
+    except OSError as error:
+        raise StgaError(f"{python}: cannot be started as a Python interpreter ({error.strerror or error})") from error
+    except subprocess.TimeoutExpired as error:
+        raise StgaError(f"{python}: did not answer within {PROBE_S:.0f} s") from error
+    print(done.stdout + done.stderr, flush=True)
+    try:
+        return describe(python, json.loads(done.stdout.strip().splitlines()[-1]))
+    except (ValueError, IndexError) as error:
+        raise StgaError(f"{python}: is no Python that can run this add-on (exit status {done.returncode})") from error
+
+
+def describe(python: str, report: dict[str, Any]) -> str:
+    """The line of `probe` from what probe.py prints. Raises StgaError where something is missing."""
+    version, found, broken = report["python"], report["found"], report["broken"]
+    if tuple(int(part) for part in version.split(".")[:2]) < (3, 11):
+        raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
+    missing = [package for module, package in NEEDED.items() if module in broken]
+    if missing:
+        why = next((text for text in broken.values() if not text.startswith("ModuleNotFoundError")), "")
+        failed = f" ({why})" if why else ""
+        raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that with pip")
+    return f"Python {version}, torch {found['torch']}, numba {found['numba']}, {report['device']}"
+
+
+def build_for(device: str, nvidia_smi: str | None) -> str:
+    """The build of PyTorch to install: "cpu", or one of CUDA_BUILDS for the driver that `nvidia-smi` reports.
+
+    device: "auto" takes CUDA where there is a driver for it. nvidia_smi: its output, None where there is none.
+    Raises StgaError where CUDA was chosen and the driver cannot do it.
+    """
+    if device == "cpu":
+        return "cpu"
+    reported = re.search(r"CUDA Version:\s*(\d+)\.(\d+)", nvidia_smi or "")
+    newest = (int(reported[1]), int(reported[2])) if reported else (0, 0)
+    for build in CUDA_BUILDS:
+        if (int(build[2:4]), int(build[4:])) <= newest:
+            return build
+    if device == "auto":
+        return "cpu"
+    oldest = f"{CUDA_BUILDS[-1][2:4]}.{CUDA_BUILDS[-1][4:]}"
+    has = f"the NVIDIA driver goes up to CUDA {newest[0]}.{newest[1]}" if reported else "nvidia-smi finds no NVIDIA GPU"
+    raise StgaError(f"{has}, PyTorch needs CUDA {oldest} or newer: update the driver or choose the CPU")
+
+
+def nvidia_smi() -> str | None:
+    """What nvidia-smi prints; None where it is not there or finds no GPU."""
+    try:
+        done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=20, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None
+
+
+def size_gb(build: str) -> float:
+    return SIZES_GB["cpu" if build == "cpu" else "cuda"]
+
+
+def steps(venv: Path, python: str, build: str, wheels: Path | None) -> list[tuple[str, list[str]]]:
+    """(what a person reads, command) in turn; `wheels` is a folder to install from without a network."""
+    pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
+    others = [package for package in NEEDED.values() if package != "torch"]
+    if build != "cpu":
+        others.append("warp-lang")
+    made = ("making the environment", [python, "-m", "venv", "--clear", str(venv)])
+    if wheels is not None:
+        offline = [*pip, "--no-index", "--find-links", str(wheels), "torch", *others]
+        return [made, ("installing from the folder of wheels", offline)]
+    return [
+        made,
+        (f"installing torch ({build})", [*pip, "--index-url", INDEX + build, "torch"]),
+        ("installing the other packages", [*pip, *others]),
+    ]
+
+
+def make(folder: Path, python: str, device: str = "auto", wheels: Path | None = None) -> str:
+    """Make the runtime `folder`/venv of the interpreter `python` and return the line of `probe`.
+
+    Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
+    """
+    venv, ready = folder / "venv", folder / "ready"
+    with task.telling(task_folder(folder)) as teller:
+        build = build_for(device, nvidia_smi())
+        free = shutil.disk_usage(folder).free / 1e9
+        if free < size_gb(build):
+            raise StgaError(f"{folder}: has {free:.1f} GB free, the runtime needs {size_gb(build):.1f} GB")
+        ready.unlink(missing_ok=True)
+        todo = steps(venv, python, build, wheels)
+        try:
+            for number, (message, command) in enumerate(todo):
+                if not _run(teller, number / (len(todo) + 1), message, command):
+                    shutil.rmtree(venv, ignore_errors=True)
+                    return ""
+            teller.tell(len(todo) / (len(todo) + 1), "testing")
+            line = probe(str(venv_python(venv)))
+        except StgaError:
+            shutil.rmtree(venv, ignore_errors=True)
+            raise
+        with replacing(ready) as partial:
+            partial.write_text(line + "\n", encoding="utf-8")
+        teller.tell(1.0, line)
+    return line
+
+
+def try_python(folder: Path, python: str) -> str:
+    """`probe`, telling in the folder's task."""
+    with task.telling(task_folder(folder)) as teller:
+        teller.tell(0.0, "testing")
+        line = probe(python)
+        teller.tell(1.0, line)
+    return line
+
+
+def _run(teller: task.Teller, share: float, message: str, command: Sequence[str]) -> bool:
+    """Run a step whose output goes where this process' goes; False where it was cancelled.
+
+    Raises StgaError where it fails.
+    """
+    print("$ " + " ".join(command), flush=True)
+    try:
+        child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    except OSError as error:
+        raise StgaError(f"{command[0]}: cannot be started ({error.strerror or error})") from error
+    while child.poll() is None:
+        line = task.log_lines(teller.folder, 1)
+        if teller.tell(share, message, line[0].strip() if line else ""):
+            child.terminate()
+            child.wait()
+            return False
+        time.sleep(0.2)
+    if child.returncode:
+        errors = [line for line in task.log_lines(teller.folder, 20) if "error" in line.lower()]
+        raise StgaError(f"{message}: failed, {errors[-1] if errors else f'exit status {child.returncode}'}")
+    return True
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    top = argparse.ArgumentParser(prog="python -m stga_addon.runtime", description=__doc__)
+    commands = top.add_subparsers(dest="command", required=True)
+    tested = commands.add_parser("test")
+    tested.add_argument("folder", type=Path)
+    tested.add_argument("python")
+    made = commands.add_parser("make")
+    made.add_argument("folder", type=Path)
+    made.add_argument("--python", default=sys.executable)
+    made.add_argument("--device", choices=DEVICES, default="auto")
+    made.add_argument("--wheels", type=Path)
+    options = vars(top.parse_args(arguments))
+    try:
+        print({"test": try_python, "make": make}[options.pop("command")](**options))
+    except StgaError as error:
+        print(f"stga: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,101 @@
+"""One iteration on the CPU, with Numba's kernels."""
+
+import numpy as np
+
+from ..capture.model import View
+from ..raster.kernels.image_loss import change_background
+from ..raster.kernels.rows import distance_limit, scale_limit
+from ..raster.render import (
+    Parameters,
+    Rendering,
+    Scratch,
+    camera_frames,
+    render_backward,
+    render_forward,
+    touched_tiles,
+)
+from . import adam
+from .frames import FrameStore
+from .losses import REACH, image_gradient, tile_rectangles, whole_image
+from .settings import Settings
+from .state import TrainState
+from .step import Batch
+
+
+class CpuStep:
+    """Trains in the host's memory: `state` is the splats themselves, and every loss is told at once."""
+
+    def __init__(self, settings: Settings, lengths: np.ndarray, frames: FrameStore, state: TrainState) -> None:
+        self.state = state
+        self._settings, self._lengths, self._frames = settings, lengths, frames
+        self._scratch = Scratch()
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def train(self, batch: Batch) -> float | None:
+        """Make one step; returns the image loss of a global iteration, None of a local one."""
+        state = self.state
+        focus = None if batch.selected is None else batch.selected[state.face.numpy()]
+        rows, screen, loss = self._differentiate(batch.view, self._over(batch), batch.background, batch.degree, focus)
+        self._limit(rows)
+        adam.step(state, rows, batch.rates)
+        if focus is None:
+            state.pull.numpy()[rows] += screen[rows]
+            state.seen.numpy()[rows] += 1
+        return loss
+
+    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+        """The view as the splats show it now: a new (3, H, W) float32 image."""
+        return self._render(view, background, degree).image.copy()
+
+    def _over(self, batch: Batch) -> np.ndarray:
+        """The target over the background that is drawn behind the splats."""
+        if batch.mask is None:
+            return batch.target
+        over = self._scratch.take("target", batch.target.shape, np.uint8)
+        before = np.array(self._settings.background, np.float32)
+        change_background(batch.target, batch.mask, 255 * before, 255 * batch.background, over)
+        read_only = over.view()
+        read_only.setflags(write=False)  # as the loader's are: one type, compiled once
+        return read_only
+
+    def _differentiate(
+        self, view: View, target: np.ndarray, background: np.ndarray, degree: int, focus: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, float | None]:
+        """Fill the gradients of the rows that matter; returns those rows, their screen pull and the loss."""
+        weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
+        rendering = self._render(view, background, degree, focus)
+        if focus is None:
+            rectangles = whole_image(height, width)
+        else:
+            tiles = touched_tiles(rendering, focus)
+            rectangles = tile_rectangles(tiles, height, width)
+        v_image = self._scratch.take("v_image", (3, height, width))
+        l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
+        rows, screen = render_backward(
+            rendering, self.state.arrays(), self.state.face.numpy(), self._seen, v_image,
+            Parameters(*(g.numpy() for g in self.state.gradients)), focus=focus, scratch=self._scratch,
+        )  # fmt: skip
+        loss = (1 - weight) * l1 + weight * (1 - ssim)
+        return rows, screen, loss if focus is None else None
+
+    def _render(self, view: View, background: np.ndarray, degree: int, focus: np.ndarray | None = None) -> Rendering:
+        self._seen = camera_frames(self._frames.of(view.timestep), view.camera)
+        return render_forward(
+            self.state.arrays(), self.state.face.numpy(), self._seen, degree, background, focus, REACH,
+            antialiased=self._settings.antialiased, scratch=self._scratch,
+        )  # fmt: skip
+
+    def _limit(self, rows: np.ndarray) -> None:
+        """Add the gradients of the limits that keep splats near what they cover."""
+        settings, state = self._settings, self.state
+        face, loose = state.face.numpy(), state.loose.numpy()
+        if settings.scale_weight:
+            limit = np.float32(settings.scale_limit) * self._lengths
+            gradient = state.gradients.log_scale.numpy()
+            scale_limit(rows, state.parameters.log_scale.numpy(), face, loose, limit, settings.scale_weight, gradient)
+        if settings.distance_weight:
+            limit = np.float32(settings.distance_limit) * self._lengths
+            gradient = state.gradients.xyz.numpy()
+            distance_limit(rows, state.parameters.xyz.numpy(), face, loose, limit, settings.distance_weight, gradient)

@@ -1,0 +1,125 @@
+"""`blender --background head.blend --command stga …`: commands about the head of the open file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
+
+from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
+from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
+from stga_addon.avatar.ply import read_ply  # noqa: E402
+from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.groups import read_selection  # noqa: E402
+
+
+@pytest.fixture
+def stga(extension):
+    """Run a command as Blender hands it over; returns the exit code."""
+    return lambda *arguments: extension.operators.command_line._run([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(extension, tmp_path) -> Path:
+    return write_mesh_capture(tmp_path / "capture")
+
+
+def save_and_open(path: Path) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+
+
+def show_avatar(path: Path, capture) -> Avatar:
+    faces = ball()[1].astype(np.int32)
+    avatar = Avatar(lattice_splats(capture.neutral, faces, order=0), "stga", capture.neutral.astype(np.float32), faces)
+    write_avatar(path, avatar)
+    bpy.ops.stga.show_avatar(filepath=str(path))
+    return avatar
+
+
+def test_without_a_head_everything_is_named(stga, folder, capsys):
+    """Catches a parser that asks for less than it needs."""
+    assert stga("info", folder) == 0
+    with pytest.raises(SystemExit) as stopped:
+        stga("info")
+    assert stopped.value.code == 2
+    assert "CAPTURE" in capsys.readouterr().err
+
+
+def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capsys):
+    """Catches a command that works on nothing, or on the open head although another capture is named."""
+    bpy.ops.stga.import_capture(directory=str(folder))
+    save_and_open(tmp_path / "head.blend")
+    assert stga("select", "--threshold", 0.0005) == 0
+    assert "320 triangles" in capsys.readouterr().out
+    assert stga("info", write_mesh_capture(tmp_path / "other", timesteps=(0, 5))) == 0
+    assert "other" in capsys.readouterr().out
+    assert stga("info") == 0
+    assert "other" not in capsys.readouterr().out
+    folder.rename(tmp_path / "elsewhere")
+    assert stga("select") == 2
+    assert "is not a folder" in capsys.readouterr().err
+
+
+def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
+    """Catches an export of the tracked frames where the head in the file is animated otherwise."""
+    folder, model = write_flame_capture(tmp_path / "capture")
+    capture = open_capture(folder, model)
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    avatar = show_avatar(tmp_path / "a.npz", capture)
+    head = bpy.context.scene.stga.head
+    keys = head.data.shape_keys
+    keys.animation_data.action = None
+    keys.key_blocks["expr_001"].value = 4.0
+    save_and_open(tmp_path / "head.blend")
+    assert stga("export", "--format", "ply-sequence", "--out", tmp_path / "plys") == 0
+    assert stga("export", tmp_path / "a.npz", "--format", "gaussian-avatars", "--out", tmp_path / "pair") == 0
+    assert sorted(path.name for path in (tmp_path / "plys").iterdir()) == [f"{t:05d}.ply" for t in range(4)]
+    bpy.context.scene.frame_set(2)  # not among the tracked timesteps
+    frames = face_frames(evaluated_vertices(bpy.context.scene.stga.head), avatar.faces, avatar.neutral)
+    expected = to_world(avatar.splats, frames).xyz
+    np.testing.assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
+    with np.load(tmp_path / "pair/flame_param.npz") as pair:
+        np.testing.assert_allclose(pair["expr"][:, 1], 4.0)
+        assert len(pair["expr"]) == 4
+
+
+def test_render_of_the_open_head(stga, tmp_path):
+    """Catches a render verb that cannot find avatar or capture in the file."""
+    pytest.importorskip("numba")
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    show_avatar(tmp_path / "a.npz", open_capture(folder, model))
+    save_and_open(tmp_path / "head.blend")
+    assert stga("render", "--cameras", folder / "transforms_val.json", "--out", tmp_path / "out") == 0
+    assert len(list((tmp_path / "out").glob("*.png"))) == 2
+
+
+@pytest.mark.slow
+def test_training_is_the_panels(stga, folder, tmp_path):
+    """Catches a headless run that ignores painted groups or settings, and so gives other numbers for the same seed."""
+    pytest.importorskip("torch")
+    bpy.ops.stga.import_capture(directory=str(folder))
+    bpy.ops.stga.select(threshold=0.0005)
+    head = bpy.context.scene.stga.head
+    head.vertex_groups["stga_3"].remove(list(range(60)))
+    head.vertex_groups.new(name="stga_0").add(list(range(40)), 1.0, "REPLACE")
+    painted = read_selection(head)
+    save_and_open(tmp_path / "head.blend")
+    options = {"iterations": 8, "strategy": "selective", "seed": 3}
+    assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), wait=True, **options) == {"FINISHED"}
+    arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
+    assert stga("train", "--out", tmp_path / "headless", *arguments) == 0
+    for run in ("panel", "headless"):
+        with np.load(tmp_path / run / "selection.npz") as stored:
+            for timestep, faces in painted.items():
+                np.testing.assert_array_equal(stored[f"{timestep:05d}"], faces)
+    one, other = (read_avatar(tmp_path / run / "avatar.npz").splats for run in ("panel", "headless"))
+    for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))

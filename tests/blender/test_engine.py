@@ -1,0 +1,396 @@
+"""The render engine against `draw_avatar`, through files that Blender writes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+pytest.importorskip("numba")
+
+from mathutils import Matrix  # noqa: E402
+
+from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E402
+from stga_addon.avatar.file import Avatar  # noqa: E402
+from stga_addon.capture.camera import Camera  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.raster.draw import draw_avatar, draw_splats  # noqa: E402
+from stga_addon.raster.kernels.project import _basis  # noqa: E402
+from stga_addon.scene import engine, nodes  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.splats import set_input, show_avatar, show_world_splats  # noqa: E402
+
+from .exr import read_exr  # noqa: E402
+from .test_splats import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
+
+WIDTH, HEIGHT = 96, 64
+SAME = 1 / 255
+
+
+@pytest.fixture(autouse=True)
+def _engine(empty_scene):
+    engine.register(no_python)
+    scene = bpy.context.scene
+    scene.render.engine = engine.ENGINE
+    scene.render.resolution_x, scene.render.resolution_y = WIDTH, HEIGHT
+    scene.render.film_transparent = True
+    scene.view_layers[0].use_pass_z = True
+    yield
+    engine.unregister()
+
+
+def no_python() -> str:
+    raise StgaError("no runtime")
+
+
+def camera_at(lens: float = 60.0, **data: object):
+    """A camera in front of `sphere`'s head, which stands turned around in the world."""
+    camera = active_camera((0.45, -0.85, 1.05))
+    camera.rotation_euler = (1.5, 0.1, 0.15)
+    camera.data.lens = lens
+    camera.data.clip_start = 0.01
+    for name, value in data.items():
+        setattr(camera.data, name, value)
+    return camera
+
+
+def textured(avatar: Avatar, scale: float = -6.0) -> Avatar:
+    """Visible splats in gentle colours."""
+    rng = np.random.default_rng(5)
+    count = len(avatar.splats)
+    sh = rng.normal(0, 0.12, (count, 4, 3)).astype(np.float32)
+    log_scale = rng.normal(scale, 0.3, (count, 3)).astype(np.float32)
+    return replace(avatar, splats=replace(avatar.splats, sh=sh, log_scale=log_scale))
+
+
+def show(avatar: Avatar):
+    head = animated_head(avatar.neutral, avatar.faces)
+    head.hide_render = True
+    shown = show_avatar(avatar, head)
+    bpy.context.scene.frame_set(5)
+    return shown, head
+
+
+def render(folder: Path) -> dict[str, np.ndarray]:
+    """Passes of one image in float: R, G, B, A and Depth, top row first."""
+    settings = bpy.context.scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth, settings.exr_codec = "OPEN_EXR_MULTILAYER", "32", "NONE"
+    bpy.context.scene.render.filepath = str(folder / "image.exr")
+    bpy.ops.render.render(write_still=True)
+    passes = read_exr(folder / "image.exr")
+    wanted = {"R": "Combined.R", "G": "Combined.G", "B": "Combined.B", "A": "Combined.A", "Depth": "Depth.Z"}
+    return {short: next(v for k, v in passes.items() if k.endswith(long)) for short, long in wanted.items()}
+
+
+def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
+    """(3, H, W) display values of an image with alpha, put onto a background in display values."""
+    alpha = passes["A"]
+    straight = np.stack([passes[c] for c in "RGB"]) / np.maximum(alpha, 1e-12)
+    srgb = np.where(straight <= 0.0031308, straight * 12.92, 1.055 * np.maximum(straight, 0) ** (1 / 2.4) - 0.055)
+    return np.clip(srgb * alpha + (1 - alpha) * background, 0, 1)
+
+
+def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT, focal: float | None = None) -> Camera:
+    """The camera by the textbook, in the space of the splats: focal length in pixels, shift in sensor widths."""
+    bpy.context.view_layer.update()
+    data = camera.data
+    across = width if data.sensor_fit == "HORIZONTAL" or (data.sensor_fit == "AUTO" and width >= height) else height
+    sensor = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
+    focal = data.lens / sensor * across
+    pose = np.linalg.inv(np.array(shown.matrix_world, np.float64)) @ np.array(camera.matrix_world, np.float64)
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    cx, cy = width / 2 - data.shift_x * across, height / 2 + data.shift_y * across
+    return Camera(width, height, focal, focal, cx, cy, flip @ np.linalg.inv(pose))
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+@pytest.mark.parametrize("background", [0.0, 1.0])
+def test_same_pixels_as_render(convention, background, tmp_path):
+    """Catches another camera, colour, order or pose than `stga render`'s, and alpha that does not fit the colour."""
+    avatar = textured(avatar_of(convention), -6 if convention == "stga" else -1)
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(), shown)
+    expected = draw_avatar(avatar, evaluated_vertices(head), camera, (background,) * 3)
+    assert np.abs(expected - background).max(0).mean() > 0.1, "nothing to compare"
+    assert np.abs(displayed(render(tmp_path), background) - expected).max() < SAME
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sensor_fit": "VERTICAL", "sensor_height": 20.0},
+        {"sensor_fit": "HORIZONTAL", "shift_x": 0.2, "shift_y": -0.1},
+        {"shift_x": -0.1, "shift_y": 0.15},
+    ],
+)
+@pytest.mark.parametrize("portrait", [False, True])
+def test_cameras_are_blenders(changes, portrait, tmp_path):
+    """Catches a wrong sensor fit, shifts of the wrong sign or unit, and the resolution's percentage."""
+    scene = bpy.context.scene
+    width, height = (HEIGHT, WIDTH) if portrait else (WIDTH, HEIGHT)
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 2 * width, 2 * height, 50
+    avatar = textured(avatar_of("stga"))
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(45.0, **changes), shown, width, height)
+    expected = draw_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
+    assert expected.max() > 0.3
+    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME
+
+
+@pytest.mark.parametrize("crop", [False, True])
+def test_border(crop, tmp_path):
+    """Catches a border that moves the picture."""
+    show(textured(avatar_of("stga")))
+    camera_at()
+    whole = render(tmp_path)["R"]
+    r = bpy.context.scene.render
+    r.use_border, r.use_crop_to_border = True, crop
+    r.border_min_x, r.border_max_x, r.border_min_y, r.border_max_y = 0.3, 0.71, 0.2, 0.77
+    rows, columns = slice(HEIGHT - int(0.77 * HEIGHT), HEIGHT - int(0.2 * HEIGHT)), slice(28, 68)
+    part = render(tmp_path)["R"]
+    assert whole[rows, columns].max() > 0.1
+    np.testing.assert_allclose(part if crop else part[rows, columns], whole[rows, columns], atol=1e-4)
+
+
+def test_world_colour_lies_behind(tmp_path):
+    """Catches a background that is blended in light although the splats were trained in display values."""
+    scene = bpy.context.scene
+    scene.render.film_transparent = False
+    scene.world = bpy.data.worlds.new("world")
+    if scene.world.node_tree is None:  # Blender 4: a new world has no tree
+        scene.world.use_nodes = True
+    background = scene.world.node_tree.nodes["Background"].inputs
+    background["Color"].default_value, background["Strength"].default_value = (0.4, 0.1, 0.2, 1), 0.5
+    avatar = textured(avatar_of("stga"))
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(), shown)
+    behind = 1.055 * np.array([0.2, 0.05, 0.1]) ** (1 / 2.4) - 0.055
+    expected = draw_avatar(avatar, evaluated_vertices(head), camera, tuple(behind))
+    passes = render(tmp_path)
+    assert passes["A"].min() == 1
+    assert np.abs(displayed(passes, 0.0) - expected).max() < SAME
+
+
+def test_colours_come_out_as_trained(tmp_path):
+    """Catches colours that Standard shows otherwise than they were trained: an opaque splat of known sRGB."""
+    one = random_splats(1, 1, degree=0)
+    trained = np.array([0.8, 0.5, 0.1], np.float32)
+    wide = replace(
+        one,
+        xyz=np.zeros((1, 3), np.float32),
+        log_scale=np.full((1, 3), np.log(0.3), np.float32),
+        opacity=np.full(1, 20, np.float32),
+        sh=((trained - 0.5) / 0.28209479177387814).reshape(1, 1, 3),
+    )
+    show_world_splats(wide, "wide")
+    active_camera((0, 0, 1))
+    scene = bpy.context.scene
+    scene.view_settings.view_transform, scene.render.dither_intensity = "Standard", 0
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.render.filepath = str(tmp_path / "image.png")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    pixels = np.empty(WIDTH * HEIGHT * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    middle = pixels.reshape(HEIGHT, WIDTH, 4)[HEIGHT // 2, WIDTH // 2]
+    np.testing.assert_allclose(middle[:3], trained, atol=0.6 / 255)
+    assert middle[3] > 0.99
+
+
+def test_depth_in_metres(tmp_path):
+    """Catches distances instead of depth, and anything but Blender's 1e10 where nothing is."""
+    one = random_splats(1, 2, degree=0)
+    flat = replace(
+        one,
+        xyz=np.array([[-0.2, 0, 0], [0.3, 0, -1]], np.float32),
+        log_scale=np.full((2, 3), np.log(0.03), np.float32),
+        opacity=np.full(2, 9, np.float32),
+    )
+    show_world_splats(flat, "two")
+    active_camera((0, 0, 2))
+    depth = render(tmp_path)["Depth"]
+    assert (depth[:5] == 1e10).all()
+    focal = 50 / 36 * WIDTH
+    for x, z in ((-0.2, 2), (0.3, 3)):
+        assert depth[HEIGHT // 2, int(WIDTH / 2 + focal * x / z)] == pytest.approx(z, abs=1e-5)
+
+
+def test_objects_are_sorted_together(tmp_path):
+    """Catches one object painted over the other, and directions or sizes of a turned and scaled object."""
+    rng = np.random.default_rng(6)
+    scans = []
+    for seed, count in ((0, 300), (1, 200)):
+        splats = random_splats(1, count, degree=2)
+        xyz = rng.normal(0, 0.1, (count, 3)).astype(np.float32)
+        sh = np.random.default_rng(seed).normal(0, 0.1, (count, 9, 3)).astype(np.float32)
+        scans.append(replace(splats, xyz=xyz, sh=sh, log_scale=np.full((count, 3), -3.5, np.float32)))
+    place = Matrix.Translation((0.02, 0.05, 0.1)) @ Matrix.Rotation(0.8, 4, "X")
+    show_world_splats(scans[0], "still")
+    show_world_splats(scans[1], "moved").matrix_world = place
+    camera = active_camera((0, 0, 1.2))
+    bpy.context.view_layer.update()
+    # By hand: splats moved to the world, harmonics evaluated in the direction that their own space sees.
+    spaces = [np.eye(4), np.array(place, np.float64)]
+    reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
+    view = expected_camera(camera, bpy.data.objects["still"])
+    expected = draw_splats(reference, view, (0.0,) * 3)
+    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME
+
+
+def _merged(scans, spaces, eye):
+    """World splats of several, with colours for one eye: constant coefficients only."""
+    parts = []
+    for splats, space in zip(scans, spaces, strict=True):
+        turn = space[:3, :3]
+        frame = FaceFrames(space[None, :3, 3], turn[None], np.ones(1), WORLD.strain)
+        world = to_world(splats, frame)
+        direction = (world.xyz - eye) @ turn
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        basis = np.zeros((len(splats), 16), np.float32)
+        for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
+            _basis(2, x, y, z, row)
+        color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / 0.28209479177387814
+        parts.append(replace(world, sh=color[:, None].astype(np.float32)))
+    names = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "loose", "strain_color")
+    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def test_scaled_objects(tmp_path):
+    """Catches splats that keep their size where their object grows."""
+    splats = replace(random_splats(1, 200), xyz=np.random.default_rng(0).normal(0, 0.1, (200, 3)).astype(np.float32))
+    splats = replace(splats, log_scale=np.full((200, 3), -4.5, np.float32))
+    shown = show_world_splats(splats, "scan")
+    camera = active_camera((0, 0, 3))
+    shown.scale = (2, 2, 2)
+    camera.data.lens = 80
+    large = render(tmp_path)
+    shown.scale, camera.location = (1, 1, 1), (0, 0, 1.5)
+    small = render(tmp_path)
+    assert small["A"].max() > 0.5
+    np.testing.assert_allclose(large["A"], small["A"], atol=SAME)
+    np.testing.assert_allclose(large["R"], small["R"], atol=SAME)
+
+
+def test_strain_colours_and_antialiasing_reach_the_picture(tmp_path):
+    """Catches parts of an avatar that do not survive the way into Blender and back."""
+    avatar = textured(avatar_of("stga"), -8.5)
+    colors = np.random.default_rng(4).normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
+    avatar = replace(avatar, splats=replace(avatar.splats, strain_color=colors), antialiased=True)
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(), shown)
+    plain = replace(avatar, splats=replace(avatar.splats, strain_color=None), antialiased=False)
+    expected, without = (draw_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3) for a in (avatar, plain))
+    assert np.abs(expected - without).max() > 0.05
+    assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < SAME
+
+
+def test_display_settings_count(tmp_path):
+    """Catches settings that only the viewport obeys."""
+    avatar = textured(avatar_of("stga"))
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(), shown)
+    faint = 1 / (1 + np.exp(-avatar.splats.opacity)) < 0.5
+    selected = np.zeros(len(avatar.faces), bool)
+    selected[:60] = True
+    vertices = np.unique(avatar.faces[selected])
+    head.vertex_groups.new(name="stga_5").add(vertices.tolist(), 1.0, "REPLACE")
+    frozen = ~np.isin(avatar.faces, vertices).all(1)[avatar.splats.face]
+    larger = replace(avatar.splats, log_scale=avatar.splats.log_scale + np.float32(np.log(2)))
+    cases = {
+        nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
+        nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
+        nodes.VIEW_DEPENDENT: (False, True, replace(avatar.splats, sh=avatar.splats.sh[:, :1])),
+        nodes.SIZE: (2.0, 1.0, larger),
+        nodes.PERCENTAGE: (0.0, 100.0, avatar.splats.rows(np.zeros(3000, bool))),
+    }
+    for name, (value, default, splats) in cases.items():
+        set_input(shown, name, value)
+        expected = draw_avatar(replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3)
+        assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME, name
+        set_input(shown, name, default)
+    set_input(shown, nodes.SHOW_SELECTION, True)
+    grey = displayed(render(tmp_path), 0.0)
+    assert (
+        np.ptp(grey, axis=0).mean()
+        < np.ptp(draw_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3), axis=0).mean()
+    )
+
+
+def test_only_what_is_visible_is_drawn(tmp_path):
+    """Catches hidden objects in the picture, and instances of a collection left out of it."""
+    splats = replace(
+        random_splats(1, 50), xyz=np.zeros((50, 3), np.float32), log_scale=np.full((50, 3), -4, np.float32)
+    )
+    shown = show_world_splats(splats, "scan")
+    active_camera((0, 0, 1))
+    assert render(tmp_path)["A"].max() > 0.5
+    shown.hide_render = True
+    assert render(tmp_path)["A"].max() == 0
+    shown.hide_render = False
+    collection = bpy.data.collections.new("away")
+    bpy.context.scene.collection.objects.unlink(shown)
+    collection.objects.link(shown)
+    assert render(tmp_path)["A"].max() == 0
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type, instance.instance_collection = "COLLECTION", collection
+    instance.location = (0.2, 0, 0)
+    bpy.context.scene.collection.objects.link(instance)
+    alpha = render(tmp_path)["A"]
+    assert alpha[:, : WIDTH // 2].max() == 0
+    assert alpha[:, WIDTH // 2 :].max() > 0.5
+
+
+def test_animation(tmp_path):
+    """Catches splats that stay where they were on the first frame."""
+    show(textured(avatar_of("stga")))
+    camera_at()
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end, scene.frame_step = 1, 9, 8
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.filepath = str(tmp_path / "frame_")
+    bpy.ops.render.render(animation=True)
+    first, last = (_png(tmp_path / f"frame_{frame:04d}.png") for frame in (1, 9))
+    assert np.abs(first - last).max() > 0.1
+
+
+def _png(path: Path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels
+
+
+@pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])
+def test_cameras_that_cannot_be_drawn_through(kind):
+    """Catches a picture that is silently of another kind than the camera."""
+    if kind is not None:
+        camera_at(type=kind)
+    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is no perspective camera"):
+        bpy.ops.render.render()
+
+
+def test_a_head_that_was_changed_is_one_sentence():
+    """Catches splats scattered over a subdivided mesh, and a traceback."""
+    shown, head = show(avatar_of("stga", 10))
+    camera_at()
+    head.modifiers.new("finer", "SUBSURF")
+    with pytest.raises(RuntimeError, match="head: has other triangles than head splats"):
+        bpy.ops.render.render()
+    set_input(shown, nodes.HEAD, None)
+    with pytest.raises(RuntimeError, match="has no head to follow"):
+        bpy.ops.render.render()
+
+
+def test_panels_forget_the_engine():
+    """Catches panels that keep an engine's name after it is gone."""
+
+    def panels() -> list[str]:
+        every = bpy.types.Panel.__subclasses__()
+        return [panel.__name__ for panel in every if engine.ENGINE in getattr(panel, "COMPAT_ENGINES", ())]
+
+    engine.unregister()
+    assert not panels()
+    engine.register(no_python)

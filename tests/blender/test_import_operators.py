@@ -1,0 +1,161 @@
+"""Importing heads without a capture, and importing again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import (  # noqa: E402
+    ball,
+    flame_parameters,
+    moved,
+    write_flame_capture,
+    write_flame_model,
+    write_mesh,
+    write_mesh_capture,
+)
+
+from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("extension")
+
+
+@pytest.fixture
+def model(tmp_path) -> Path:
+    return write_flame_model(tmp_path / "model.npz")
+
+
+def write_motion(path: Path, timesteps: int = 4) -> Path:
+    """All timesteps in one file, as VHAP's tracker leaves it."""
+    frames = [flame_parameters(timestep) for timestep in range(timesteps)]
+    moving = {name: np.concatenate([f[name] for f in frames]) for name, value in frames[0].items() if value.ndim == 2}
+    np.savez(path, **moving, shape=frames[0]["shape"], static_offset=frames[0]["static_offset"])
+    return path
+
+
+def write_meshes(folder: Path, timesteps: int = 3) -> Path:
+    folder.mkdir()
+    vertices, faces = ball()
+    for timestep in range(timesteps):
+        write_mesh(folder / f"{timestep:03d}.obj", moved(timestep, vertices), faces)
+    return folder / "001.obj"
+
+
+def state_of_file() -> dict[str, list[str]]:
+    kinds = (
+        "objects",
+        "meshes",
+        "actions",
+        "armatures",
+        "collections",
+        "node_groups",
+        "materials",
+        "cameras",
+        "images",
+    )
+    return {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds}
+
+
+def test_a_motion_file_is_a_rig(tmp_path, model):
+    """Catches a motion that can be imported and then not worked with, because there is no folder around it."""
+    path = write_motion(tmp_path / "tracked_flame_params_30.npz")
+    assert bpy.ops.stga.import_motion(filepath=str(path), flame=str(model)) == {"FINISHED"}
+    scene, capture = bpy.context.scene, open_capture(path, model)
+    assert (scene.frame_start, scene.frame_end) == (0, 3)
+    for timestep in capture.timesteps:
+        scene.frame_set(timestep)
+        np.testing.assert_allclose(evaluated_vertices(scene.stga.head), capture.mesh(timestep), atol=2e-6)
+    assert bpy.ops.stga.select(threshold=0.001) == {"FINISHED"}
+
+
+def test_a_folder_of_meshes_by_one_of_them(tmp_path):
+    """Catches an import of the one mesh that was clicked."""
+    path = write_meshes(tmp_path / "meshes")
+    assert bpy.ops.stga.import_meshes(filepath=str(path)) == {"FINISHED"}
+    bpy.context.scene.frame_set(2)
+    head = bpy.context.scene.stga.head
+    np.testing.assert_allclose(evaluated_vertices(head), moved(2, ball()[0]), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["capture", "flame", "motion", "meshes"])
+def test_importing_again_doubles_nothing(tmp_path, model, kind):
+    """Catches a second head, rig, camera, action or image for the same source."""
+
+    def bring() -> None:
+        if kind == "capture":
+            bpy.ops.stga.import_capture(directory=str(tmp_path / "capture"))
+        elif kind == "flame":
+            bpy.ops.stga.import_capture(directory=str(tmp_path / "capture"), flame=str(model))
+        elif kind == "motion":
+            bpy.ops.stga.import_motion(filepath=str(tmp_path / "motion.npz"), flame=str(model))
+        else:
+            bpy.ops.stga.import_meshes(filepath=str(tmp_path / "meshes/001.obj"))
+
+    write = {"capture": write_mesh_capture, "flame": write_flame_capture}
+    write_motion(tmp_path / "motion.npz")
+    write_meshes(tmp_path / "meshes")
+    if kind in write:
+        write[kind](tmp_path / "capture")
+    bring()
+    once = state_of_file()
+    bring()
+    assert state_of_file() == once
+
+
+def test_importing_again_keeps_what_an_artist_painted(tmp_path):
+    """Catches regions, materials and selections that vanish because a capture was read again."""
+    folder = write_mesh_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder))
+    head = bpy.context.scene.stga.head
+    head.vertex_groups.new(name="dimple").add([3, 4, 5], 1.0, "REPLACE")
+    head.vertex_groups.new(name="stga_3").add([7], 0.7, "REPLACE")
+    head.data.materials.append(bpy.data.materials.new("skin"))
+    bpy.ops.stga.import_capture(directory=str(folder))
+    assert bpy.context.scene.stga.head == head
+    assert head.vertex_groups["dimple"].weight(4) == 1.0
+    assert head.vertex_groups["stga_3"].weight(7) == pytest.approx(0.7)
+    assert [material.name for material in head.data.materials] == ["skin"]
+    bpy.context.scene.frame_set(3)
+    np.testing.assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
+
+
+def test_wrong_files_change_nothing(tmp_path, model):
+    """Catches half an import, a traceback, and a sentence that does not name the file."""
+    (tmp_path / "noise.npz").write_bytes(b"no archive")
+    np.savez(tmp_path / "other.npz", xyz=np.zeros(3))
+    (tmp_path / "empty").mkdir()
+    before = state_of_file()
+    for name, message in (("noise.npz", "noise"), ("other.npz", "has none of expr"), ("gone.npz", "gone")):
+        with pytest.raises(RuntimeError, match=message):
+            bpy.ops.stga.import_motion(filepath=str(tmp_path / name), flame=str(model))
+    with pytest.raises(RuntimeError, match="choose your FLAME model in the add-on's preferences"):
+        bpy.ops.stga.import_motion(filepath=str(tmp_path / "other.npz"))
+    with pytest.raises(RuntimeError, match="no model"):
+        bpy.ops.stga.import_motion(filepath=str(write_motion(tmp_path / "a.npz")), flame=str(tmp_path / "no model.npz"))
+    with pytest.raises(RuntimeError, match="is not a capture"):
+        bpy.ops.stga.import_meshes(filepath=str(tmp_path / "empty/a.obj"))
+    assert state_of_file() == before
+    assert bpy.context.scene.stga.head is None
+
+
+def test_linked_heads_are_left_alone(tmp_path):
+    """Catches changes to, or tracebacks about, what belongs to another file."""
+    folder = write_mesh_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder))
+    name = bpy.context.scene.stga.head.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, target):
+        target.objects = [name]
+    linked = target.objects[0]
+    bpy.context.scene.collection.objects.link(linked)
+    bpy.context.scene.stga.head = linked
+    for operator in ("select", "heat_map", "apply_motion"):
+        with pytest.raises(RuntimeError, match="linked from another file"):
+            getattr(bpy.ops.stga, operator)()
+    bpy.ops.stga.import_capture(directory=str(folder))  # its own, beside the linked one
+    assert bpy.context.scene.stga.head != linked
+    assert bpy.context.scene.stga.head.library is None

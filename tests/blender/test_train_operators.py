@@ -1,0 +1,262 @@
+"""Training from Blender: in its own process, in a worker's, and what the panel sees of it. Timers need a window: here
+their function is called by hand."""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
+
+from stga_addon.avatar.file import read_avatar  # noqa: E402
+from stga_addon.files import read_npz, write_json  # noqa: E402
+from stga_addon.scene.splats import evaluated_splats  # noqa: E402
+
+from .test_operators import write_ball_avatar  # noqa: E402
+
+
+@pytest.fixture
+def head(extension, tmp_path):
+    """The head of a mesh capture, with a selection."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    bpy.ops.stga.select(threshold=0.0005)
+    return bpy.context.scene.stga.head
+
+
+@pytest.fixture
+def worker(extension, head, tmp_path):
+    """A stand-in for a worker of the scene's job: the test says what it does."""
+    from contextlib import ExitStack
+
+    task, job, watch = (extension.stga_addon.task, extension.stga_addon.job, extension.operators.watch)
+    with ExitStack() as stack:
+        run = tmp_path / "run"
+        settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
+        job.write_job(run, job.Job(tmp_path / "capture", None, "vhap", settings))
+        watch.set_job(bpy.context.scene, run)
+        teller = stack.enter_context(task.telling(job.folder_of(run)))
+        teller.tell(0.25, "training")
+        teller.run, teller.leave = run, stack.close
+        yield teller
+
+
+def tick_until(watch, done: Callable[[], bool]) -> None:
+    for _ in range(200):
+        watch.tick()
+        if done():
+            return
+        time.sleep(0.02)
+    raise AssertionError("waited in vain")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["mesh", "flame"])
+def test_training_in_process(extension, tmp_path, layout):
+    """Catches a train step that does not reach the trainer with this capture, or whose result show cannot read."""
+    for package in ("torch", "numba", "PIL"):
+        pytest.importorskip(package)
+    if layout == "mesh":
+        bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    else:
+        folder, model = write_flame_capture(tmp_path / "capture")
+        bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    bpy.ops.stga.select(threshold=0.0005)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6) == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="already holds a run"):
+        bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=6)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), resume=True) == {"FINISHED"}
+    path = bpy.context.scene.stga.avatar
+    assert bpy.ops.stga.show_avatar(filepath=path) == {"FINISHED"}
+    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(read_avatar(Path(path)).splats)
+
+
+@pytest.mark.slow
+def test_a_worker_trains_the_same(head, tmp_path):
+    """Catches painted groups or settings that reach the one kind of training and not the other."""
+    pytest.importorskip("torch")
+    chosen = {"iterations": 8, "seed": 5, "strategy": "selective"}
+    assert bpy.ops.stga.train(directory=str(tmp_path / "here"), **chosen) == {"FINISHED"}
+    assert bpy.ops.stga.train(directory=str(tmp_path / "there"), python=sys.executable, **chosen) == {"FINISHED"}
+    here, there = (read_npz(tmp_path / run / "avatar.npz") for run in ("here", "there"))
+    for name in here:
+        np.testing.assert_array_equal(here[name], there[name], err_msg=name)
+    painted = read_npz(tmp_path / "there/selection.npz")
+    assert painted["00003"].any()
+    assert not painted["00000"].any()
+
+
+def test_without_a_runtime_training_says_what_to_do(extension, head, tmp_path, monkeypatch):
+    """Catches a traceback about imports where a sentence should say which Python lacks what."""
+    monkeypatch.setattr(extension.stga_addon.runtime, "find_spec", lambda name: None)
+    monkeypatch.setattr(extension.operators.train, "missing_here", lambda: ["torch"])
+    expected = r"^Error: training needs a runtime.*Blender's own Python \(.*\) lacks torch, numba, scipy, pillow, "
+    with pytest.raises(RuntimeError, match=expected):
+        bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_mistakes_of_training_are_sentences(head, tmp_path):
+    """Catches tracebacks and silence for an unsaved .blend, an impossible folder, and an interpreter that is none."""
+    (tmp_path / "file").write_text("")
+    python = str(tmp_path / "no_python")
+    for arguments, sentence in (
+        ({"directory": ""}, "run folder: no path given"),
+        ({"directory": "//run"}, "relative to the .blend file, which has not been saved yet"),
+        ({"directory": str(tmp_path / "file")}, "cannot be written"),
+        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run that could be resumed"),
+        ({"directory": str(tmp_path / "run"), "python": python}, "no_python: cannot be started as a Python"),
+    ):
+        with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
+            bpy.ops.stga.train(**{"iterations": 2, **arguments})
+    assert bpy.ops.stga.train.poll()
+    (tmp_path / "capture").rename(tmp_path / "elsewhere")
+    with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
+        bpy.ops.stga.train(directory=str(tmp_path / "run"))
+
+
+@pytest.mark.slow
+def test_a_failing_worker_is_a_sentence(head, tmp_path):
+    """Catches a background render farm that takes a failed training for a finished one."""
+    (tmp_path / "capture/transforms_train.json").write_text("{")
+    with pytest.raises(RuntimeError, match=r"^Error: .*transforms_train\.json: is not valid JSON"):
+        bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=sys.executable)
+
+
+def test_a_living_worker_is_not_disturbed(worker):
+    """Catches a second worker in the same folder, and a dismissed job whose worker goes on unseen."""
+    assert not bpy.ops.stga.train.poll()
+    assert not bpy.ops.stga.dismiss_training.poll()
+    assert bpy.ops.stga.cancel_training() == {"FINISHED"}
+    assert worker.tell(0.5, "training")
+    worker.leave()
+    assert not bpy.ops.stga.cancel_training.poll()
+    assert bpy.ops.stga.train.poll()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert not (worker.run / "job").exists()
+    assert bpy.context.scene.stga.job == ""
+    assert not bpy.ops.stga.dismiss_training.poll()
+
+
+def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
+    """Catches a new object for each preview, display settings that are lost, and splats whose number may not change."""
+    watch, scene = extension.operators.watch, bpy.context.scene
+    preview = worker.folder / "preview.npz"
+    write_ball_avatar(preview)
+    tick_until(watch, lambda: scene.stga.splats is not None)
+    shown = scene.stga.splats
+    assert scene.stga.head.hide_render
+    count = len(evaluated_splats(shown)[0])
+    objects = len(bpy.data.objects)
+
+    avatar = read_avatar(preview)
+    keep = np.arange(count) % 3 > 0
+    fewer = type(avatar.splats)(**{name: array[keep] for name, array in vars(avatar.splats).items()})
+    fewer.xyz[:] += 0.01
+    extension.stga_addon.avatar.file.write_avatar(preview, type(avatar)(**{**vars(avatar), "splats": fewer}))
+    tick_until(watch, lambda: len(shown.data.vertices) == keep.sum())
+    bpy.context.view_layer.update()
+    assert len(evaluated_splats(shown)[0]) == keep.sum()
+    assert len(bpy.data.objects) == objects
+    assert scene.stga.splats == shown
+
+    scene.stga.live_preview = False
+    write_ball_avatar(preview)
+    for _ in range(5):
+        assert watch.tick() is not None
+        time.sleep(0.02)
+    assert len(shown.data.vertices) == keep.sum()
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_end_reaches_the_scene_once(extension, worker, wanted):
+    """Catches a result that is not shown, shown although it is not wanted, or shown again at every reopening."""
+    watch, scene = extension.operators.watch, bpy.context.scene
+    scene.stga.show_result = wanted
+    write_ball_avatar(worker.run / "avatar.npz")
+    worker.leave()
+    tick_until(watch, lambda: scene.stga.job_ended)
+    assert scene.stga.avatar == str(worker.run / "avatar.npz")
+    assert (scene.stga.splats is not None) == wanted
+    assert watch.tick() is None
+    if wanted:
+        bpy.data.objects.remove(scene.stga.splats)
+        assert watch.tick() is None
+        assert scene.stga.splats is None
+
+
+def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
+    """Catches a job that a saved file forgets: its worker goes on while Blender is closed, and may end meanwhile."""
+    watch = extension.operators.watch
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert watch.tick() is None
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    assert watch.tick() is not None
+    assert not bpy.ops.stga.train.poll()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    write_ball_avatar(worker.run / "avatar.npz")
+    worker.leave()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    tick_until(watch, lambda: bpy.context.scene.stga.job_ended)
+    assert bpy.context.scene.stga.splats is not None
+
+
+def test_a_blend_that_moved(extension, worker, tmp_path):
+    """Catches a job that is lost when file and run move together, and silence when the file moves alone."""
+    watch, scene = extension.operators.watch, bpy.context.scene
+    worker.leave()
+    scene.stga.run_folder, scene.stga.show_result = "//run", False
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    (tmp_path / "run").rename(moved / "run")
+    bpy.ops.wm.save_as_mainfile(filepath=str(moved / "head.blend"))
+    assert watch.run_of(bpy.context.scene) == moved / "run"
+    tick_until(watch, lambda: bpy.context.scene.stga.job_ended)
+    (moved / "run").rename(moved / "gone")
+    assert watch.snapshot_of(bpy.context.scene).state == "none"
+    assert watch.run_of(bpy.context.scene) == tmp_path / "run"
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+
+
+def test_undo_does_not_lose_the_worker(extension, worker):
+    """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
+    watch, scene = extension.operators.watch, bpy.context.scene
+    watch.tick()
+    scene.stga.job = ""
+    assert watch.tick() is not None
+    assert scene.stga.job == str(worker.run)
+
+
+def test_a_worker_that_died(extension, worker):
+    """Catches a progress bar that stands still for ever, and a report that says less than is known."""
+    watch = extension.operators.watch
+    (worker.folder / "worker.log").write_text("Killed\n")
+    write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
+    last = watch.snapshot_of(bpy.context.scene)
+    assert last.state.is_mishap
+    assert last.tail == ("Killed",)
+    assert watch.tick() is None
+
+
+@pytest.mark.slow
+def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
+    """Catches a runtime that a script cannot make or test, and a network used although Blender is offline."""
+    monkeypatch.setattr(extension.operators.runtime, "runtime_folder", lambda create=False: tmp_path / "runtime")
+    python = str(tmp_path / "python")
+    with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
+        bpy.ops.stga.test_runtime(python=python)
+    if not bpy.app.online_access:
+        with pytest.raises(RuntimeError, match="Allow Online Access"):
+            bpy.ops.stga.make_runtime()
+    with pytest.raises(RuntimeError, match="is not a folder; expected one of wheel files"):
+        bpy.ops.stga.make_runtime(wheels=str(tmp_path / "none"))
+    (tmp_path / "wheels").mkdir()
+    with pytest.raises(RuntimeError, match=r"installing from the folder of wheels: failed, .*No matching distribution"):
+        bpy.ops.stga.make_runtime(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
+    assert not bpy.ops.stga.cancel_runtime.poll()

@@ -1,0 +1,91 @@
+"""The built zip in every supported Blender: install, import, select, train, show, reenact, export, save, uninstall.
+
+The versions are Pythons with that bpy, named by environment variables; one that is not named skips.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+from capture.factory import ball, write_flame_capture
+
+from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.ply import read_ply
+from stga_addon.capture.open import open_capture
+from stga_addon.errors import StgaError
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.sequence import read_motion
+from stga_addon.package import ROOT, build_zip, fetch_wheels
+
+# bpy that the tests themselves run in, and others: (version, the variable with the path of a Python that has it)
+VERSIONS = {"this": None, "4.2": "STGA_BPY_4_2", "4.5": "STGA_BPY_4_5", "5.2": "STGA_BPY_5_2"}
+
+
+@pytest.fixture(scope="module")
+def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    try:
+        fetch_wheels(ROOT / "wheels")
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    return build_zip(tmp_path_factory.mktemp("dist"))
+
+
+def python_of(version: str) -> str:
+    variable = VERSIONS[version]
+    python = sys.executable if variable is None else os.environ.get(variable)
+    if not python:
+        pytest.skip(f"no Python with bpy {version}: set {variable} to one")
+    return python
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_whole_workflow(version: str, zip_file: Path, tmp_path: Path) -> None:
+    """Catches what works in the checkout, or in one Blender, and not in the zip, or in another."""
+    python = python_of(version)
+    folder, model = write_flame_capture(tmp_path / "capture")
+    model.rename(tmp_path / "model.npz")
+    capture = open_capture(folder, tmp_path / "model.npz")
+    faces = ball()[1].astype(np.int32)
+    avatar = Avatar(lattice_splats(capture.neutral, faces, order=0), "stga", capture.neutral.astype(np.float32), faces)
+    write_avatar(tmp_path / "a.npz", avatar)
+    rng = np.random.default_rng(2)
+    other = {"expr": rng.normal(size=(5, 2)), "pose": rng.normal(0, 0.3, (5, 15)), "shape": np.ones(4)}
+    np.savez(tmp_path / "other.npz", **other)
+
+    result = run(python, zip_file, tmp_path)
+    assert version == "this" or result["version"].startswith(version)
+    assert max(result["counted"]) > 0
+    assert result["left"] == []
+    assert result["trained"] == (tmp_path / "run/avatar.npz").is_file() == (tmp_path / "pictures").is_dir()
+    own = capture.flame
+    assert own is not None
+    pair = read_motion(tmp_path / "pair/flame_param.npz", own.model)
+    for row in range(5):
+        pose = other["pose"][row]
+        frame = FlameFrame(other["expr"][row], pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:])
+        mesh = flame_forward(own.model, own.shape, frame, own.static_offset)
+        expected = to_world(avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral)).xyz
+        np.testing.assert_allclose(read_ply(tmp_path / f"plys/{1 + row:05d}.ply").xyz, expected, atol=1e-5)
+        np.testing.assert_allclose(pair.frame(row).pose, frame.pose, atol=1e-5)
+        if 1 + row == result["frame"]:
+            np.testing.assert_allclose(np.reshape(result["shown"], (-1, 3)), expected, atol=1e-5)
+
+
+def run(python: str, archive: Path, folder: Path) -> dict[str, object]:
+    """What `workflow.py` reports, from a fresh Blender profile."""
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile")}
+    command = [python, str(Path(__file__).with_name("workflow.py")), str(archive), str(folder)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))
+    return json.loads(line.removeprefix("RESULT "))

@@ -1,0 +1,80 @@
+"""An artist's way through the installed extension; run by `test_versions.py` in a Python of its own with some bpy.
+
+    python workflow.py ZIP FOLDER
+
+FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. Prints RESULT and JSON.
+"""
+
+import importlib
+import importlib.util
+import json
+import os
+import sys
+from pathlib import Path
+
+import bpy
+
+MODULE = "bl_ext.user_default.stga"
+
+
+def main(archive: str, folder: Path) -> dict[str, object]:
+    bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.preferences.addon_enable(module=MODULE)
+    ops = bpy.ops.stga
+
+    ops.import_capture(directory=str(folder / "capture"), flame=str(folder / "model.npz"))
+    ops.select(threshold=0.0005)
+    counted = [row.triangles for row in bpy.context.scene.stga.selected_frames]
+    ops.heat_map()
+    ops.heat_map(show=False)
+    trained = can_train()
+    if trained:
+        ops.train(directory=str(folder / "run"), iterations=3)
+    ops.show_avatar(filepath=str(folder / "a.npz"))
+    ops.apply_motion(filepath=str(folder / "other.npz"), start=1)
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
+    ops.export(filepath=str(folder / "pair"), format="gaussian-avatars")
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "head.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "head.blend"))
+    ops.export(filepath=str(folder / "plys"), format="ply-sequence")
+    shown, frame = positions(), bpy.context.scene.frame_current
+    if trained:
+        cameras, out = str(folder / "capture/transforms_test.json"), str(folder / "pictures")
+        command_line = importlib.import_module(MODULE + ".operators.command_line")
+        assert command_line._run(["render", "--cameras", cameras, "--out", out]) == 0
+
+    bpy.ops.preferences.addon_disable(module=MODULE)
+    repos = bpy.context.preferences.extensions.repos
+    index = next(i for i, repo in enumerate(repos) if repo.module == "user_default")
+    bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
+    left = [name for name in dir(bpy.types) if name.startswith("STGA_")]
+    left += [path.name for path in Path(repos[index].directory).glob("stga*")]
+    return {
+        "version": bpy.app.version_string,
+        "counted": counted,
+        "trained": trained,
+        "shown": shown,
+        "frame": frame,
+        "left": left,
+    }
+
+
+def can_train() -> bool:
+    return all(importlib.util.find_spec(name) for name in ("torch", "numba", "scipy", "PIL", "platformdirs"))
+
+
+def positions() -> list[float]:
+    """Of the splats that are displayed, in the capture's coordinates."""
+    bpy.context.scene.frame_set(4)
+    for instance in bpy.context.evaluated_depsgraph_get().object_instances:
+        if instance.object.type == "POINTCLOUD":
+            values = [0.0] * 3 * len(instance.object.data.points)
+            instance.object.data.attributes["position"].data.foreach_get("vector", values)
+            return values
+    return []
+
+
+if __name__ == "__main__":
+    print("RESULT " + json.dumps(main(sys.argv[1], Path(sys.argv[2]))), flush=True)
+    os._exit(0)  # the module bpy 4.2 crashes when its Python ends where a property has an update function

@@ -1,0 +1,138 @@
+"""Captures of a ball that deforms, painted triangle by triangle, of which it is known what colours depend on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image, ImageDraw
+
+from stga_addon.avatar.strain import face_strain, strain_basis
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.model import Capture, View
+
+SIZE, FOCAL, SUPERSAMPLED = 100, 420.0, 3
+NOISE = 1.5  # levels
+
+Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""(strain (F, 3), unit direction from the camera (F, 3), unit place on the ball (F, 3)) -> levels (F,) that are added
+to the triangles' own colours."""
+
+
+def nothing(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+    return np.zeros(len(strain))
+
+
+def wrinkles(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Darker where the first edge shrinks."""
+    return 30 * strain[:, 0]
+
+
+def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """A light beside the cameras, mirrored where the ball is polished."""
+    mirrored = direction - 2 * np.einsum("fi,fi->f", direction, place)[:, None] * place
+    light = np.array([0.3, 0.4, 0.86])
+    return 60 * np.clip(mirrored @ light, 0, 1) ** 3
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, what else colours depend on, the colour
+    behind the ball, and how far timesteps deform it."""
+
+    cameras: int = 8
+    timesteps: int = 8
+    paint: Paint = nothing
+    gain: np.ndarray | None = None
+    offset: np.ndarray | None = None
+    background: tuple[int, int, int] = (255, 255, 255)
+    deformed: float = 1.0
+    masks: bool = True
+    seed: int = 0
+
+
+def photograph(folder: Path, scene: Scene) -> Capture:
+    """Write the scene's images; every camera and timestep is for training."""
+    ball = trimesh.creation.icosphere(3, 0.1)
+    vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int32)
+    rng = np.random.default_rng(scene.seed)
+    place = vertices[faces].mean(1) / 0.1
+    colors = 120 + 40 * np.sin(place @ rng.normal(0, 4, (3, 3))) + rng.uniform(-8, 8, (len(faces), 1))
+    meshes = {t: _deform(vertices, t, scene.deformed) for t in range(scene.timesteps)}
+    basis = strain_basis(vertices, faces)
+    views = []
+    for t, mesh in meshes.items():
+        strain = face_strain(basis, mesh)
+        for c in range(scene.cameras):
+            camera = _camera(c, scene.cameras)
+            away = mesh[faces].mean(1) - camera.position
+            seen = colors + scene.paint(strain, away / np.linalg.norm(away, axis=1, keepdims=True), place)[:, None]
+            if scene.gain is not None:
+                seen = seen * scene.gain[c]
+            if scene.offset is not None:
+                seen = seen + scene.offset[c]
+            picture, mask = _draw(mesh, faces, camera, seen)
+            noisy = picture + rng.normal(0, NOISE, picture.shape)
+            image = np.where(mask[..., None] > 0, noisy, np.array(scene.background))
+            views.append(_keep(folder, t, c, camera, image, mask if scene.masks else None))
+    return Capture(
+        root=folder,
+        layout="mesh",
+        faces=faces,
+        neutral=vertices,
+        views={"train": tuple(views)},
+        timesteps=tuple(meshes),
+        regions={},
+        mesh=meshes.__getitem__,
+        expression_mesh=lambda timestep, zero_pose: meshes[timestep],
+    )
+
+
+def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:
+    """Waves along the surface, of another length and phase in every timestep."""
+    rng = np.random.default_rng([7, timestep])
+    moved = vertices.copy()
+    for axis in range(3):
+        waves = np.sin(vertices @ rng.normal(0, 30, 3) + rng.uniform(0, 6))
+        moved[:, axis] += 0.004 * amount * waves * rng.uniform(0.5, 1)
+    return moved
+
+
+def _camera(number: int, count: int) -> Camera:
+    angle = np.linspace(-0.9, 0.9, count)[number] if count > 1 else 0.0
+    height = 0.3 * (-1) ** number
+    back = np.array([np.sin(angle) * np.cos(height), np.sin(height), np.cos(angle) * np.cos(height)])
+    right = np.cross([0, 1, 0], back) / np.linalg.norm(np.cross([0, 1, 0], back))
+    rotation = np.stack([right, -np.cross(back, right), -back])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = rotation, -rotation @ back
+    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, view)
+
+
+def _draw(mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Picture (SIZE, SIZE, 3) float and mask (SIZE, SIZE) uint8, drawn large and shrunk."""
+    p = mesh @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = SUPERSAMPLED * (p[:, :2] / p[:, 2:] * FOCAL + SIZE / 2) - 0.5
+    large = (SUPERSAMPLED * SIZE, SUPERSAMPLED * SIZE)
+    picture, mask = Image.new("RGB", large), Image.new("L", large)
+    draw, cover = ImageDraw.Draw(picture), ImageDraw.Draw(mask)
+    levels = np.clip(colors, 0, 255).round().astype(int)
+    for face in np.argsort(-p[faces, 2].mean(1)).tolist():
+        corners = pixels[faces[face]].ravel().tolist()
+        draw.polygon(corners, fill=tuple(levels[face].tolist()))
+        cover.polygon(corners, fill=255)
+    blocks = (SIZE, SUPERSAMPLED, SIZE, SUPERSAMPLED)
+    coverage = np.asarray(mask, float).reshape(blocks).mean((1, 3))
+    colour = np.asarray(picture, float).reshape(*blocks, 3).sum((1, 3))
+    weight = np.maximum(coverage / 255 * SUPERSAMPLED**2, 1e-9)
+    return colour / weight[..., None], np.where(coverage > 127, 255, 0).astype(np.uint8)
+
+
+def _keep(folder: Path, t: int, c: int, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> View:
+    name = f"{t:05d}_{c:02d}.png"
+    Image.fromarray(np.clip(image, 0, 255).round().astype(np.uint8)).save(folder / name)
+    mask_path = None if mask is None else folder / f"mask_{name}"
+    if mask_path is not None:
+        Image.fromarray(mask).save(mask_path)
+    return View(t, c, camera, name, folder / name, mask_path)

@@ -1,0 +1,114 @@
+"""What is off costs nothing: no arrays, no calls."""
+
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.images import read_view
+from stga_addon.effects.plan import plan_effects
+from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
+from stga_addon.training import cpu_step, frames, run, trainer
+from stga_addon.training.exposure import even_exposure
+from stga_addon.training.folder import Run, read_checkpoint
+from stga_addon.training.settings import make_settings
+from stga_addon.training.trainer import initial_splats
+
+from .test_rules import unlike_cameras
+
+# What each effect calls, by where the call is made from.
+CALLS = {
+    "background": (cpu_step, "change_background"),
+    "seeds": (trainer, "hull_seeds"),
+    "density": (trainer, "control_density"),
+    "selection": (run, "select_capture"),
+    "strain-color": (frames, "strain_basis"),
+}
+ITERATIONS = 12
+
+
+def train(capture, folder, monkeypatch, choice):
+    """Train with all effects on or off; how often each was called, and the checkpoint."""
+    names = dict.fromkeys((*CALLS, "view-color", "antialiasing"), choice)
+    wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up=0.0)
+    settings, plan = plan_effects(capture, wanted)
+    if settings.density_every:
+        settings = replace(settings, density_every=2, density_span=(0.0, 1.0))
+    calls: Counter[str] = Counter()
+    for effect, (module, name) in CALLS.items():
+        monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
+    run.train(capture, folder, Run(capture.root, None, "vhap", settings, plan))
+    return calls, read_checkpoint(folder).state.splats()
+
+
+def counting(calls, effect, function):
+    def counted(*arguments, **more):
+        calls[effect] += 1
+        return function(*arguments, **more)
+
+    return counted
+
+
+def test_off_calls_nothing(painted, tmp_path, monkeypatch):
+    """Catches work and memory that an effect takes although it is off."""
+    calls, splats = train(painted(), tmp_path, monkeypatch, "off")
+    assert calls == {}
+    assert splats.sh.shape[1] == 1
+    assert splats.strain_color.size == 0
+    assert len(splats) == 6 * len(painted().faces)
+
+
+def test_on_calls_all(painted, tmp_path, monkeypatch):
+    """Catches an effect that is on in name only, and with it a test above that counts in vain."""
+    calls, splats = train(painted(), tmp_path, monkeypatch, "on")
+    assert set(calls) == set(CALLS)
+    assert calls["background"] == ITERATIONS
+    assert splats.sh.shape[1] == 16
+    assert splats.strain_color.shape[1] == 3
+
+
+def test_exposure_is_taken_away(painted):
+    """Catches gains and offsets applied the wrong way round, to the background, or to a camera they are not of."""
+    gain, offset = unlike_cameras()
+    rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
+    correct = even_exposure(make_settings(iterations=1, exposure=rows))
+    assert correct is not None
+    alike, unlike = painted(), painted(gain=gain, offset=offset)
+    for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
+        (_, expected, _), (view, image, mask) = read_view(same), read_view(other)
+        before, after = (abs(i.astype(int) - expected)[mask > 0].mean() for i in (image, correct(view, image, mask)))
+        assert after < 1.0
+        assert before > 2 * after
+        assert (correct(view, image, mask)[mask == 0] == image[mask == 0]).all()
+    stranger = replace(view, camera_index=99)
+    assert correct(stranger, image, mask) is image
+
+
+def test_no_exposure_is_no_pass():
+    """Catches images that are copied for nothing."""
+    assert even_exposure(make_settings(iterations=1)) is None
+
+
+def test_no_splats_on_teeth(painted):
+    """Catches splats that are placed, trained and drawn where nothing will ever be seen."""
+    capture = painted()
+    vertices = len(capture.neutral)
+    rows = np.zeros((120, 3)) + capture.neutral[0] + np.random.default_rng(0).normal(0, 0.002, (120, 3))
+    faces = np.concatenate([capture.faces, teeth_faces(vertices)])
+    masks = {"teeth": np.arange(vertices, vertices + 120)}
+    flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
+    toothed = replace(capture, faces=faces, neutral=np.concatenate([capture.neutral, rows]), flame=flame)
+    for kept in (True, False):
+        splats = initial_splats(toothed, make_settings(iterations=1, seeds=False, teeth=kept))
+        on_teeth = (splats.face >= len(capture.faces)).sum()
+        assert on_teeth == (6 * TEETH_FACES if kept else 0)
+        assert len(splats) - on_teeth == 6 * len(capture.faces)
+
+
+@pytest.mark.parametrize("choice", ["on", "off"])
+def test_antialiasing_reaches_the_kernels(painted, choice):
+    """Catches an effect that is decided and then forgotten."""
+    settings, _ = plan_effects(painted(), make_settings(iterations=1, effects={"antialiasing": choice}))
+    assert settings.antialiased == (choice == "on")

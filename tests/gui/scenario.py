@@ -1,0 +1,170 @@
+"""Runs inside a Blender with a window, started by test_scenario.py: trains as a person would, and mistreats the worker.
+
+`blender [FILE] --python scenario.py -- PART RESULT CAPTURE BLEND PYTHON`: PART is the name of a function below, RESULT
+the JSON file that says what was seen.
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+PART, RESULT, CAPTURE, BLEND, PYTHON = sys.argv[sys.argv.index("--") + 1 :]
+STEP_S, PATIENCE_S = 0.1, 180.0
+seen: dict[str, Any] = {"ticks_ms": [], "ticks_cpu_ms": []}
+
+extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
+watch = sys.modules[f"{extension}.operators.watch"]
+runtime_folder = sys.modules[f"{extension}.operators.runtime"].runtime_folder
+task_folder = sys.modules[f"{extension}.stga_addon.runtime"].task_folder
+
+
+def timed_tick(tick: Callable[[], float | None] = watch.tick) -> float | None:
+    begin, cpu = time.perf_counter(), time.thread_time()
+    try:
+        return tick()
+    finally:
+        seen["ticks_ms"].append(round(1000 * (time.perf_counter() - begin), 2))
+        seen["ticks_cpu_ms"].append(round(1000 * (time.thread_time() - cpu), 2))
+
+
+def chosen() -> Any:
+    return bpy.context.scene.stga
+
+
+def state() -> str:
+    return str(watch.snapshot_of(bpy.context.scene).state)
+
+
+def figures() -> dict[str, float]:
+    return dict(watch.snapshot_of(bpy.context.scene).status.figures)
+
+
+def is_training() -> bool:
+    return state() == "working" and figures().get("iteration", 0) > 0
+
+
+def splats() -> int:
+    return 0 if chosen().splats is None else len(chosen().splats.data.vertices)
+
+
+def job_folder() -> Path:
+    return watch.folder_of(watch.run_of(bpy.context.scene))
+
+
+def first() -> Iterator[Callable[[], bool]]:
+    """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the worker at work."""
+    bpy.context.preferences.addons[extension].preferences.runtime_python = PYTHON
+    bpy.ops.wm.save_userpref()
+    bpy.ops.stga.test_runtime()
+    runtime = task_folder(runtime_folder())
+    yield lambda: not watch.snapshot(runtime).state.is_alive
+    seen["runtime"] = watch.snapshot(runtime).status.message or watch.snapshot(runtime).status.error
+    bpy.ops.stga.import_capture(directory=CAPTURE)
+    bpy.ops.stga.select()
+    bpy.ops.wm.save_as_mainfile(filepath=BLEND)
+    begin = time.perf_counter()
+    bpy.ops.stga.train(directory="//run", minutes=30)
+    seen["start_ms"] = round(1000 * (time.perf_counter() - begin), 1)
+    yield lambda: is_training() and splats() > 0
+    seen["figures"] = figures()
+    before = splats_at_work()
+    yield lambda: splats_at_work() != before
+    seen["refreshed"] = True
+
+    bpy.ops.stga.cancel_training()
+    yield lambda: state() == "cancelled" and chosen().job_ended
+    seen["cancelled"] = {"avatar": Path(chosen().avatar).exists(), "splats": splats()}
+
+    bpy.ops.stga.train(directory="//run", resume=True)
+    yield is_training
+    seen["resumed at"] = figures()["iteration"]
+    os.kill(int((job_folder() / "worker.lock").read_text()), signal.SIGKILL)
+    yield lambda: state() == "lost"
+    seen["lost"] = watch.snapshot_of(bpy.context.scene).status.error
+    bpy.ops.stga.copy_report()
+    seen["clipboard"] = bpy.context.window_manager.clipboard
+
+    bpy.ops.stga.train(directory="//run", resume=True)
+    yield is_training
+    bpy.ops.ed.undo_push(message="before")
+    with in_window():
+        while chosen().job and bpy.ops.ed.undo.poll():
+            bpy.ops.ed.undo()
+    seen["undone"] = chosen().job
+    yield lambda: is_training() and chosen().job != ""
+    with in_window():
+        while bpy.ops.ed.redo.poll():
+            bpy.ops.ed.redo()
+    yield is_training
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=BLEND)
+    yield is_training
+    before = figures()["iteration"]
+    yield lambda: figures()["iteration"] > before
+    seen["reopened"] = True
+    seen["left"] = int((job_folder() / "worker.lock").read_text())
+    bpy.ops.wm.save_mainfile()
+
+
+def second() -> Iterator[Callable[[], bool]]:
+    """Find the worker that went on while Blender was closed; then a short run that ends by itself."""
+    seen["found"] = int((job_folder() / "worker.lock").read_text())
+    yield is_training
+    bpy.ops.stga.cancel_training()
+    yield lambda: state() == "cancelled" and chosen().job_ended
+    try:
+        bpy.ops.stga.train(directory="//run", minutes=1)
+    except RuntimeError as error:
+        seen["refused"] = str(error)
+    bpy.ops.stga.train(directory="//short", iterations=30)
+    yield lambda: state() == "finished" and chosen().job_ended
+    seen["finished"] = {"avatar": chosen().avatar, "splats": splats()}
+    bpy.ops.stga.dismiss_training()
+    seen["dismissed"] = chosen().job == ""
+
+
+def in_window() -> Any:
+    """A timer's context has none, and undo wants one."""
+    return bpy.context.temp_override(window=bpy.context.window_manager.windows[0])
+
+
+def splats_at_work() -> list[float]:
+    """Where the first splats are: training moves them."""
+    mesh = chosen().splats.data
+    return [value for vertex in mesh.vertices[:20] for value in vertex.co]
+
+
+class Player:
+    """Takes a part's steps, one after another as their conditions come true."""
+
+    def __init__(self, part: Iterator[Callable[[], bool]]) -> None:
+        self.part, self.until, self.since = part, (lambda: True), time.monotonic()
+
+    def __call__(self) -> float | None:
+        try:
+            if self.until():
+                self.until, self.since = next(self.part), time.monotonic()
+            elif time.monotonic() - self.since > PATIENCE_S:
+                raise TimeoutError(f"waited in vain: {state()}, {figures()}, {sorted(seen)}")
+            return STEP_S
+        except StopIteration:
+            pass
+        except Exception:
+            seen["traceback"] = traceback.format_exc()
+        Path(RESULT).write_text(json.dumps(seen))
+        bpy.ops.wm.quit_blender()
+        return None
+
+
+bpy.app.timers.unregister(watch.tick) if bpy.app.timers.is_registered(watch.tick) else None
+watch.tick = timed_tick
+watch.follow()
+bpy.app.timers.register(Player({"first": first, "second": second}[PART]()), first_interval=1.0, persistent=True)

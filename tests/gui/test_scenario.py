@@ -1,0 +1,76 @@
+"""The Train step in a Blender with a window: `make test-gui`, with the command that starts it in STGA_BLENDER."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture.factory import write_mesh_capture
+
+from stga_addon.package import build_zip
+from stga_addon.task import ask_to_stop
+
+ROOT = Path(__file__).resolve().parents[2]
+BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
+pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with an empty Blender profile in which the built zip is installed."""
+    folder = tmp_path_factory.mktemp("gui")
+    archive = build_zip(folder)
+    blender(folder, "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
+    yield folder
+    for job in folder.glob("*/job"):  # whatever failed: no worker stays behind
+        ask_to_stop(job)
+
+
+def blender(home: Path, *arguments: object) -> None:
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home / "profile")}
+    command = [*BLENDER, *map(str, arguments)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
+    (home / "output.txt").open("a").write(done.stdout + done.stderr)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+
+
+def play(home: Path, part: str, *file: object) -> dict[str, Any]:
+    """What a part of scenario.py saw."""
+    result = home / f"{part}.json"
+    script = Path(__file__).with_name("scenario.py")
+    blender(home, *file, "--python", script, "--", part, result, home / "capture", home / "head.blend", sys.executable)
+    seen: dict[str, Any] = json.loads(result.read_text())
+    assert "traceback" not in seen, seen["traceback"]
+    wall, cpu = max(seen["ticks_ms"]), max(seen["ticks_cpu_ms"])
+    print(f"{part}: {len(seen['ticks_ms'])} ticks, of at most {wall} ms by the clock and {cpu} ms of processor time")
+    return seen
+
+
+def test_training_in_a_window(home: Path) -> None:
+    """Catches what only a window has: the timer, its end, undo, reopening, and workers that outlive Blender."""
+    write_mesh_capture(home / "capture")
+    seen = play(home, "first")
+    assert seen["runtime"].startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert {"iteration", "per_second", "left_s", "splats", "memory_mb"} <= set(seen["figures"])
+    assert seen["refreshed"]
+    assert seen["cancelled"]["avatar"]
+    assert seen["cancelled"]["splats"] > 0
+    assert seen["resumed at"] > 0
+    assert "killed by signal 9" in seen["lost"]
+    assert seen["lost"] in seen["clipboard"]
+    assert "worker.log" in seen["clipboard"]
+    assert seen["undone"] == ""
+    assert seen["reopened"]
+    os.kill(seen["left"], 0)  # Blender has quit, the worker goes on
+
+    then = play(home, "second", home / "head.blend")
+    assert then["found"] == seen["left"]
+    assert "already holds a run" in then["refused"]
+    assert then["finished"]["avatar"] == str(home / "short/avatar.npz")
+    assert then["finished"]["splats"] > 0
+    assert then["dismissed"]

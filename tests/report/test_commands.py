@@ -1,0 +1,69 @@
+"""The commands around time and accuracy, as typed."""
+
+from pathlib import Path
+
+import pytest
+from capture import factory
+
+from stga_addon.cli import main
+from stga_addon.report import calibration
+from stga_addon.training.folder import read_run
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every preset takes a millisecond an iteration."""
+    monkeypatch.setattr(calibration, "seconds_per_iteration", lambda *_: 0.001)
+
+
+def test_plan(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches presets that are not told, or without their time."""
+    assert main(["plan", str(toy_root)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
+    assert lines[1].split()[1:6] == ["3000", "iterations", "about", "3", "s"]
+
+
+def test_a_preset_is_trained_for_its_time(
+    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a preset that changes nothing, and one that cannot be overruled."""
+    train = ["train", str(toy_root), "--out"]
+    assert main([*train, str(tmp_path / "timed"), "--preset", "draft", "--target-psnr", "5"]) == 0
+    out = capsys.readouterr().out
+    assert "draft: 800 iterations, 1 s on this machine\n" in out
+    assert "5 dB was reached" in out
+    assert "held-out views: " in out
+    settings = read_run(tmp_path / "timed").settings
+    assert (settings.preset, settings.seconds, settings.lattice, settings.target_psnr) == ("draft", 0.8, 1, 5.0)
+    assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
+    settings = read_run(tmp_path / "counted").settings
+    assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)
+    assert main([*train, str(tmp_path / "counted"), "--resume", "--preset", "draft"]) == 2
+    assert "--preset: this run began with final" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "fast"], "--only: 'fast' is not one of draft, standard"),
+        (["--only", "draft", "--knobs"], "--only: 'draft' is not one of standard, scale-0.5"),
+        (["--seeds", "0"], "--seeds: 0 is not a number of runs"),
+        (["--budget", "0s"], "the budget must be more than nothing"),
+    ],
+)
+def test_impossible_benchmarks(
+    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    """Catches a mistake found only after the first hour."""
+    assert main(["benchmark", str(toy_root), "--out", str(tmp_path / "out"), *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_benchmark_needs_held_out_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an hour of training of which nothing can be said."""
+    root = factory.write_mesh_capture(tmp_path / "one", (0,), range(2))
+    (root / "transforms_val.json").unlink()
+    assert main(["benchmark", str(root), "--out", str(tmp_path / "out")]) == 2
+    assert "has no views to" in capsys.readouterr().err

@@ -1,0 +1,164 @@
+"""The training runtime: which commands make it, what its test says, and how it fails."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stga_addon import runtime, task
+from stga_addon.errors import StgaError
+from stga_addon.probe import NEEDED
+from stga_addon.task import State
+
+SMI = "| NVIDIA-SMI 575.57.08   Driver Version: 575.57.08   CUDA Version: {} |"
+FOUND = {"python": "3.11.7", "found": dict.fromkeys(NEEDED, "1.0"), "broken": {}, "device": "CPU with 4 threads"}
+
+
+@pytest.mark.parametrize(
+    ("device", "driver", "build"),
+    [
+        ("cpu", "13.2", "cpu"),
+        ("auto", None, "cpu"),
+        ("auto", "11.4", "cpu"),
+        ("auto", "12.6", "cu126"),
+        ("auto", "12.9", "cu128"),
+        ("cuda", "12.8", "cu128"),
+        ("cuda", "13.0", "cu130"),
+        ("cuda", "14.1", "cu130"),
+    ],
+)
+def test_the_build_fits_the_driver(device, driver, build):
+    """Catches a PyTorch that the driver is too old for, which then finds no GPU."""
+    assert runtime.build_for(device, SMI.format(driver) if driver else None) == build
+
+
+def test_cuda_that_cannot_be_is_refused():
+    """Catches gigabytes that are downloaded in vain."""
+    with pytest.raises(StgaError, match=r"goes up to CUDA 11\.4, PyTorch needs CUDA 12\.6 or newer"):
+        runtime.build_for("cuda", SMI.format("11.4"))
+    with pytest.raises(StgaError, match="finds no NVIDIA GPU"):
+        runtime.build_for("cuda", None)
+
+
+def test_steps(tmp_path):
+    """Catches torch from the wrong index, a network that offline steps would need, and what is never installed."""
+    online = runtime.steps(tmp_path, "/python", "cu128", None)
+    assert online[0][1][:3] == ["/python", "-m", "venv"]
+    assert online[1][1][-3:] == ["--index-url", "https://download.pytorch.org/whl/cu128", "torch"]
+    assert set(online[2][1]) >= {*NEEDED.values(), "warp-lang"} - {"torch"}
+    assert "torch" not in online[2][1]
+    assert all(command[0] == str(runtime.venv_python(tmp_path)) for _, command in online[1:])
+    offline = runtime.steps(tmp_path, "/python", "cpu", tmp_path / "wheels")
+    assert len(offline) == 2
+    assert "--no-index" in offline[1][1]
+    assert str(tmp_path / "wheels") in offline[1][1]
+    assert set(offline[1][1]) >= set(NEEDED.values())
+    assert "warp-lang" not in offline[1][1]
+
+
+def test_what_an_interpreter_says():
+    """Catches a runtime that is called good and cannot train."""
+    assert runtime.describe("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
+    old = {**FOUND, "python": "3.9.1"}
+    with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
+        runtime.describe("p", old)
+    bare = {**FOUND, "broken": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}}
+    with pytest.raises(StgaError, match=r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"):
+        runtime.describe("p", bare)
+
+
+def test_a_bare_interpreter_is_tested(tmp_path):
+    """Catches a test that needs what it tests for: this one has nothing at all installed."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    python = str(runtime.venv_python(tmp_path / "venv"))
+    with pytest.raises(StgaError, match=r"lacks torch, numba, scipy, pillow, platformdirs, trimesh, tqdm; install"):
+        runtime.probe(python)
+
+
+def test_what_is_no_interpreter(tmp_path):
+    """Catches tracebacks where a path leads to nothing, or to another program."""
+    with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
+        runtime.probe(str(tmp_path / "python"))
+    with pytest.raises(StgaError, match=r"is no Python that can run this add-on \(exit status 1\)"):
+        runtime.probe("false")
+
+
+@pytest.mark.slow
+def test_this_interpreter_can_train(tmp_path):
+    """Catches a probe that misses what is there, and a worker that does not tell."""
+    pytest.importorskip("torch")
+    folder = runtime.task_folder(tmp_path)
+    task.prepare(folder)
+    process = task.start(folder, sys.executable, runtime.testing_arguments(tmp_path, sys.executable))
+    assert process.wait(120) == 0, task.log_lines(folder, 50)
+    seen = task.look(folder, process)
+    assert seen.state == State.FINISHED
+    assert seen.status.message.startswith(f"Python {sys.version.split()[0]}, torch ")
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Only the environment and this package's probe: what pip would do is not this test's."""
+    monkeypatch.setattr(runtime, "nvidia_smi", lambda: None)
+    monkeypatch.setattr(runtime, "SIZES_GB", {"cpu": 0.0, "cuda": 0.0})
+    made = [sys.executable, "-m", "venv", "--clear", "--without-pip"]
+    monkeypatch.setattr(runtime, "steps", lambda venv, *_: [("making the environment", [*made, str(venv)])])
+
+
+def test_a_runtime_is_made(tiny, tmp_path, monkeypatch):
+    """Catches a runtime that is used before it has passed the test, or not found afterwards."""
+    monkeypatch.setattr(runtime, "probe", lambda python: f"good {Path(python).exists()}")
+    python = runtime.venv_python(tmp_path / "venv")
+    python.parent.mkdir(parents=True)
+    python.touch()
+    assert runtime.made_python(tmp_path) is None  # what a killed maker leaves
+    assert runtime.make(tmp_path, sys.executable) == "good True"
+    assert runtime.made_python(tmp_path) == python
+    assert task.read_status(runtime.task_folder(tmp_path)).message == "good True"
+
+
+def test_a_runtime_that_fails_leaves_nothing(tiny, tmp_path):
+    """Catches half an environment that is taken for a runtime the next time."""
+    with pytest.raises(StgaError, match="lacks torch"):
+        runtime.make(tmp_path, sys.executable)
+    assert runtime.made_python(tmp_path) is None
+    assert not (tmp_path / "venv").exists()
+    assert task.look(runtime.task_folder(tmp_path)).state == State.FAILED
+
+
+def test_a_failing_step_names_itself(tiny, tmp_path, monkeypatch):
+    """Catches pip's message lost in a log that nobody opens."""
+    log = runtime.task_folder(tmp_path) / task.LOG
+    script = f"import sys; open({str(log)!r}, 'a').write('ERROR: no matching distribution\\n'); sys.exit(1)"
+    monkeypatch.setattr(runtime, "steps", lambda *_: [("installing torch (cpu)", [sys.executable, "-c", script])])
+    with pytest.raises(StgaError, match=r"installing torch \(cpu\): failed, ERROR: no matching distribution"):
+        runtime.make(tmp_path, sys.executable)
+
+
+def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
+    """Catches a cancel that waits for a download to end, or leaves half an environment."""
+    folder = runtime.task_folder(tmp_path)
+    script = f"import pathlib, time; pathlib.Path({str(folder / 'cancel')!r}).touch(); time.sleep(600)"
+    steps = [
+        ("making the environment", [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")]),
+        ("waiting", [sys.executable, "-c", script]),
+    ]
+    monkeypatch.setattr(runtime, "steps", lambda *_: steps)
+    assert runtime.make(tmp_path, sys.executable) == ""
+    assert task.look(folder).state == State.CANCELLED
+    assert not (tmp_path / "venv").exists()
+
+
+def test_a_disk_too_small_is_refused(tmp_path, monkeypatch):
+    """Catches a full disk after half an hour of downloading."""
+    monkeypatch.setattr(runtime.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
+    with pytest.raises(StgaError, match=r"has 0\.1 GB free, the runtime needs 1\.5 GB"):
+        runtime.make(tmp_path, sys.executable, "cpu")
+
+
+def test_the_probe_runs_by_itself():
+    """Catches a probe that prints something else than one JSON object last."""
+    done = subprocess.run([sys.executable, "-m", "stga_addon.probe"], capture_output=True, text=True, check=True)
+    assert set(json.loads(done.stdout.splitlines()[-1])) == set(FOUND)

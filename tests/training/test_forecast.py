@@ -1,0 +1,157 @@
+"""What a run says about more time, against curves whose future is known."""
+
+import numpy as np
+import pytest
+
+from stga_addon.training.forecast import (
+    FEWEST,
+    Forecast,
+    clock,
+    curve_of,
+    forecast,
+    hits,
+    horizon,
+    level_since,
+    missed,
+)
+
+TIMES = np.arange(1, 31) * 4.0
+
+
+def rising(times: np.ndarray, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Levels off at 36 dB."""
+    return 36 - 20 / np.sqrt(times) + np.random.default_rng(seed).normal(0, noise, len(times))
+
+
+def curve(times: np.ndarray, psnr: np.ndarray) -> list[tuple[float, float]]:
+    return list(zip(times.tolist(), psnr.tolist(), strict=True))
+
+
+def test_a_curve_of_the_models_own_kind_is_continued_exactly() -> None:
+    """Catches a gain over the wrong span, and a slope that is not the curve's."""
+    for count in (FEWEST, 9, 20):
+        seen = curve(TIMES[:count], rising(TIMES[:count]))
+        for ahead in (5.0, 30.0):
+            told = forecast(seen, ahead)
+            assert told is not None
+            end = TIMES[count - 1] + ahead
+            assert told.seconds == end
+            assert told.psnr == pytest.approx(float(rising(np.array([end]))[0]), abs=1e-6)
+            assert told.gain == pytest.approx(told.psnr - seen[-1][1], abs=1e-6)
+
+
+def test_the_error_is_earned() -> None:
+    """Catches an error that does not follow how wrong the earlier forecasts were."""
+    calm, wild = (forecast(curve(TIMES, rising(TIMES, noise)), 20.0) for noise in (0.0, 0.5))
+    assert calm is not None
+    assert wild is not None
+    assert calm.error < 0.3 < wild.error
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.1])
+def test_four_of_five_forecasts_come_true(noise: float) -> None:
+    """Catches an error that is too small to be honest or too large to say anything."""
+    misses, errors = [], []
+    for seed in range(30):
+        psnr = rising(TIMES, noise, seed)
+        for count in range(8, 24):
+            told = forecast(curve(TIMES[:count], psnr[:count]), 16.0)
+            assert told is not None
+            misses.append(abs(told.psnr - psnr[count + 3]))
+            errors.append(told.error)
+    assert 0.7 < np.mean(np.array(misses) <= errors) < 0.95
+    assert np.median(errors) < 3 * np.median(misses)
+
+
+def test_one_bad_evaluation_does_not_tilt_the_forecast() -> None:
+    """Catches least squares: right after splats were put back, an evaluation may be a decibel too low."""
+    psnr = rising(TIMES)
+    psnr[-3] -= 2
+    told = forecast(curve(TIMES, psnr), 20.0)
+    assert told is not None
+    assert told.psnr == pytest.approx(float(rising(TIMES[-1:] + 20)[0]), abs=0.1)
+
+
+def test_nothing_is_said_too_early_or_of_nonsense() -> None:
+    """Catches a division by nothing, and forecasts from two points."""
+    assert forecast([], 10.0) is None
+    assert forecast(curve(TIMES[:3], rising(TIMES[:3])), 10.0) is None
+    assert forecast([(1.0, 20.0), (2.0, 21.0), (2.0, 22.0), (3.0, 23.0)], 10.0) is None
+    assert forecast([(1.0, 20.0), (2.0, np.nan), (3.0, 22.0), (4.0, 23.0)], 10.0) is None
+    assert forecast([(0.0, 20.0), (2.0, 21.0), (3.0, 22.0), (4.0, 23.0)], 10.0) is None
+    same = forecast([(float(t), 30.0) for t in range(1, 9)], 4.0)
+    assert same is not None
+    assert (same.gain, same.psnr) == (0.0, 30.0)
+
+
+def test_horizon() -> None:
+    """Catches forecasts beyond the budget, or farther ahead than what was seen allows."""
+    assert horizon(240, 1000) == 120
+    assert horizon(1000, 65) == 60
+    assert horizon(9, 1000) is None
+    assert horizon(1000, 4) is None
+
+
+def test_level_since() -> None:
+    """Catches a run called finished while it rises, and one that falls and is not."""
+    assert level_since(curve(TIMES, rising(TIMES))) is None
+    fell = np.where(TIMES < 50, rising(TIMES), rising(np.array([48.0])) - (TIMES - 50) / 100)
+    assert level_since(curve(TIMES, fell)) == 48.0
+    assert level_since(curve(TIMES[:12], fell[:12])) is None
+    assert level_since([]) is None
+    assert level_since(curve(TIMES[:3], np.full(3, 30.0))) is None
+
+
+def test_hits() -> None:
+    """Catches forecasts counted that cannot be checked yet, and ones compared with the wrong moment."""
+
+    def told(seconds: float, psnr: float) -> dict[str, float]:
+        return Forecast(seconds, psnr, 0.2, 10.0, 0.0).as_json()
+
+    lines = [
+        {"seconds": 10.0, "psnr": 30.0, "forecast": told(15.0, 31.1)},  # 31.0 came: true
+        {"seconds": 20.0, "psnr": 32.0, "forecast": told(30.0, 32.5)},  # 33.0 came: false
+        {"seconds": 30.0, "psnr": 33.0, "forecast": told(40.0, 33.0)},  # not yet known
+    ]
+    assert hits(lines) == (1, 2)
+    assert hits([]) == (0, 0)
+    assert hits([{"seconds": 1.0}]) == (0, 0)
+
+
+def test_the_curve_leaves_out_what_was_evaluated_twice() -> None:
+    """Catches a run that is stopped at an evaluation, which is then repeated: two points at once have no slope."""
+    lines = [{"seconds": s, "psnr": 19 + s} for s in (1.0, 2.0, 2.0)]
+    lines.append({"seconds": 3.0})
+    assert curve_of(lines) == [(1.0, 20.0), (2.0, 21.0)]
+
+
+def test_why_a_target_was_missed() -> None:
+    """Catches "train longer" where that does not help."""
+    assert "still rose by" in missed(curve(TIMES, rising(TIMES)), 40)
+    fell = np.where(TIMES < 50, rising(TIMES), 30.0)
+    assert "nothing was gained after 48 s" in missed(curve(TIMES, fell), 40)
+    assert "does not rise steadily" in missed(curve(TIMES[:6], -rising(TIMES[:6])), 40)
+    assert missed([(1.0, 20.0)], 40).startswith("40 dB was not reached (best 20.00 dB)")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (4.6, "5 s"),
+        (60, "1 min"),
+        (90, "90 s"),
+        (120, "2 min"),
+        (150, "2.5 min"),
+        (1290, "22 min"),
+        (8000, "2 h 13 min"),
+    ],
+)
+def test_clock(seconds: float, text: str) -> None:
+    """Catches "2.0 min" and "133 min"."""
+    assert clock(seconds) == text
+
+
+def test_forecasts_read_as_people_speak() -> None:
+    """Catches a sign that is lost."""
+    assert str(Forecast(240.0, 30.3, 0.12, 120.0, 0.31)) == "another 2 min: about +0.3 dB (±0.1)"
+    assert str(Forecast(240.0, 30.3, 0.12, 20.0, -0.31)) == "another 20 s: about -0.3 dB (±0.1)"

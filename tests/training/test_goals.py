@@ -1,0 +1,141 @@
+"""When a run evaluates, and when it stops by itself."""
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
+from stga_addon.training import run as run_module
+from stga_addon.training.folder import Run, read_checkpoint, read_metrics
+from stga_addon.training.forecast import hits
+from stga_addon.training.metrics import Quality
+from stga_addon.training.run import EVALUATION_SHARE, Progress, train
+
+from .toys import quick_settings
+
+Evaluate = Callable[..., Quality]
+
+
+def run_of(capture: Capture, **changes: Any) -> Run:
+    return Run(capture.root, None, "vhap", quick_settings("global", **{"lattice": 0, **changes}))
+
+
+def scores(values: Iterator[float]) -> Evaluate:
+    return lambda draw, sights, perceptual: Quality(next(values), 0.5)
+
+
+class Clock:
+    """A clock that only training and evaluation move: by fixed amounts, so that no machine is too slow for the test."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Steps take a second, evaluations three."""
+    clock = Clock()
+    step = run_module.Trainer.step
+
+    def slow_step(*arguments: Any) -> float | None:
+        clock.now += 1
+        return step(*arguments)
+
+    def slow_evaluate(*arguments: Any, **named: Any) -> Quality:
+        clock.now += 3
+        return Quality(20 + np.log(clock.now), 0.5)
+
+    monkeypatch.setattr(run_module, "perf_counter", clock)
+    monkeypatch.setattr(run_module.Trainer, "step", slow_step)
+    monkeypatch.setattr(run_module, "evaluate", slow_evaluate)
+    return clock
+
+
+def test_evaluation_keeps_to_its_share_of_the_time(toy: Capture, tmp_path: Path, clock: Clock) -> None:
+    """Catches evaluations that eat the budget, are counted as training, or hardly ever come."""
+    train(toy, tmp_path, run_of(toy, iterations=None, seconds=400.0))
+    lines = read_metrics(tmp_path)
+    assert read_checkpoint(tmp_path).elapsed_s == 400 == read_checkpoint(tmp_path).iteration
+    assert [line["evaluation_s"] for line in lines] == [3.0] * len(lines)
+    assert EVALUATION_SHARE - 0.01 < 3.0 * (len(lines) - 1) / 400 <= EVALUATION_SHARE
+    assert lines[-1]["wall_s"] == 400 + 3 * len(lines)
+    assert {"peak_memory_mb", "iteration", "seconds", "splats", "psnr"} <= set(lines[-1])
+
+
+def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock) -> None:
+    """Catches forecasts that cannot be checked afterwards, or that nobody sees."""
+    told: list[Progress] = []
+    train(toy, tmp_path, run_of(toy, iterations=200), report=lambda progress: bool(told.append(progress)))
+    lines = read_metrics(tmp_path)
+    assert [line["iteration"] for line in lines if "forecast" in line] == [80, 100, 120, 140, 160, 180]
+    hit, checked = hits(lines)
+    assert 0 < hit <= checked == 6
+    assert any("another" in progress.outlook for progress in told)
+
+
+def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a target that is passed by, and one that a resumed run forgets it has reached."""
+    values = iter([25.0, 29.0, 30.5, 30.5])
+    monkeypatch.setattr(run_module, "evaluate", scores(values))
+    run = run_of(toy, target_psnr=30.0)
+    train(toy, tmp_path, run)
+    assert read_checkpoint(tmp_path).iteration == 30
+    train(toy, tmp_path, run, resume=True)
+    assert read_checkpoint(tmp_path).iteration == 30
+    assert next(values, None) is None
+
+
+def test_a_target_out_of_sight_is_said_while_training(toy: Capture, tmp_path: Path, clock: Clock) -> None:
+    """Catches a person who waits to the end to learn that it was in vain."""
+    told: list[str] = []
+    run = run_of(toy, iterations=100, target_psnr=60.0)
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.outlook)))
+    assert any("60 dB is not in sight" in outlook for outlook in told)
+    assert read_checkpoint(tmp_path).iteration == 100
+
+
+def test_a_target_needs_held_out_views(toy: Capture, tmp_path: Path) -> None:
+    """Catches a run that cannot know when to stop."""
+    bare = replace(toy, views={"train": toy.views["train"]})
+    with pytest.raises(StgaError, match="has no held-out views"):
+        train(bare, tmp_path, run_of(toy, target_psnr=30.0))
+
+
+@pytest.mark.parametrize("stop", [True, False])
+def test_a_run_that_no_longer_improves(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock, stop: bool
+) -> None:
+    """Catches overfitting that nobody is told about, and a run that stops without having been asked to."""
+    falling = (30 - n / 10 for n in count())
+    monkeypatch.setattr(run_module, "evaluate", scores(falling))
+    told: list[str] = []
+    run = run_of(toy, iterations=None, seconds=200.0, stop_when_flat=stop)
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.outlook)))
+    assert (read_checkpoint(tmp_path).iteration < 200) == stop
+    if not stop:
+        assert any(re.fullmatch(r"no gain since \d+ s: more time no longer helps", outlook) for outlook in told)
+
+
+def test_images_grow_where_settings_say_so(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches coarse training that never ends, or whose camera does not fit its image."""
+    seen: list[tuple[int, int]] = []
+    step = run_module.Trainer.step
+
+    def note(trainer: Any, view: Any, target: np.ndarray, *rest: Any) -> float | None:
+        assert target.shape == (view.camera.height, view.camera.width, 3)
+        seen.append(target.shape[:2])
+        return step(trainer, view, target, *rest)
+
+    monkeypatch.setattr(run_module.Trainer, "step", note)
+    train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_span=0.25))
+    assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

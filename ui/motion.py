@@ -1,0 +1,61 @@
+"""The Motion step: another person's motion on this head, and the sliders to move it by hand."""
+
+from typing import Any, ClassVar
+
+import bpy
+
+from ..operators import ids
+from ..operators.common import is_head, settings
+from ..stga_addon.scene.rig import EXPRESSION_KEY, IDENTITY_KEY
+from .step import Step
+
+FIRST_SLIDERS = 10  # the components are sorted by how much they change
+
+
+class MotionPanel(Step, bpy.types.Panel):
+    bl_idname = "STGA_PT_motion"
+    bl_label = "5 Motion"
+
+    def draw(self, context: Any) -> None:
+        layout, chosen = self.layout, settings(context)
+        layout.operator(ids.APPLY_MOTION, text="Apply Motion from File", icon="IMPORT").source = ""
+        row = layout.row(align=True)
+        row.prop(chosen, "motion_source")
+        button = row.row(align=True)
+        button.enabled = chosen.motion_source is not None
+        apply = button.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK")
+        apply.source = chosen.motion_source.name if chosen.motion_source else ""
+
+
+class _Sliders(Step):
+    bl_parent_id = MotionPanel.bl_idname
+    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+    start = ""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return bool(_sliders(context, cls.start))
+
+    def draw(self, context: Any) -> None:
+        column = self.layout.column(align=True)
+        for key in _sliders(context, self.start)[:FIRST_SLIDERS]:
+            column.prop(key, "value", text=key.name, slider=True)
+
+
+class ExpressionPanel(_Sliders, bpy.types.Panel):
+    bl_idname = "STGA_PT_expression"
+    bl_label = "Expression"
+    start = EXPRESSION_KEY
+
+
+class IdentityPanel(_Sliders, bpy.types.Panel):
+    bl_idname = "STGA_PT_identity"
+    bl_label = "Identity"
+    start = IDENTITY_KEY
+
+
+def _sliders(context: Any, start: str) -> list[Any]:
+    head = settings(context).head
+    if not is_head(head) or head.data.shape_keys is None:
+        return []
+    return [key for key in head.data.shape_keys.key_blocks if key.name.startswith(start)]

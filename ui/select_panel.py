@@ -1,0 +1,71 @@
+"""The Select step: what is selected as a whole, how much each frame trains, and where on the head."""
+
+from typing import Any
+
+import bpy
+
+from ..operators import ids
+from ..operators.common import is_head, settings
+from ..operators.select import key_regions, possible_regions
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.heat import is_heat_shown
+from .step import Step
+
+
+class SelectedFrames(bpy.types.UIList):
+    """Frame, triangles and splats, one frame a line; a click goes to the frame."""
+
+    bl_idname = "STGA_UL_selected_frames"
+
+    def draw_item(
+        self, context: Any, layout: Any, data: Any, item: Any, icon: int, active_data: Any, active_propname: str
+    ) -> None:
+        row = layout.row()
+        row.active = item.triangles > 0
+        for value in (item.frame, item.triangles, item.splats):
+            jump = row.operator("wm.context_set_int", text=f"{value:,}", emboss=False)
+            jump.data_path, jump.value = "scene.frame_current", item.frame
+        row.label(icon="PLAY" if item.frame == context.scene.frame_current else "BLANK1")
+
+
+class SelectPanel(Step, bpy.types.Panel):
+    bl_idname = "STGA_PT_select"
+    bl_label = "2 Select"
+
+    def draw(self, context: Any) -> None:
+        layout, chosen = self.layout, settings(context)
+        layout.operator(ids.SELECT, icon="GROUP_VERTEX")
+        if not is_head(chosen.head):
+            return
+        _draw_regions(layout, chosen.head)
+        if chosen.selected_frames:
+            _draw_table(layout, chosen)
+        if any(tags.group_timestep(group.name) is not None for group in chosen.head.vertex_groups):
+            row = layout.row(align=True)
+            row.operator(ids.COUNT_SELECTED, text="Count Again", icon="FILE_REFRESH")
+            shown = is_heat_shown(chosen.head)
+            text = "Hide Heat Map" if shown else "Heat Map"
+            row.operator(ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown).show = not shown
+        else:
+            layout.label(text="No selection yet")
+
+
+def _draw_regions(layout: Any, head: Any) -> None:
+    possible, ticked = possible_regions(head), key_regions(head)
+    if not possible:
+        return
+    layout.label(text="Selected as a Whole")
+    grid = layout.grid_flow(columns=2, align=True, row_major=True)
+    for name in possible:
+        icon = "CHECKBOX_HLT" if name in ticked else "CHECKBOX_DEHLT"
+        grid.operator(ids.TOGGLE_REGION, text=name.replace("_", " "), icon=icon, depress=name in ticked).name = name
+
+
+def _draw_table(layout: Any, chosen: Any) -> None:
+    heading = layout.row()
+    for text in ("Frame", "Triangles", "Splats"):
+        heading.label(text=text)
+    heading.label(icon="BLANK1")
+    layout.template_list(
+        SelectedFrames.bl_idname, "", chosen, "selected_frames", chosen, "selected_row", rows=4, maxrows=8
+    )

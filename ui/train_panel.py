@@ -1,0 +1,83 @@
+"""The Train step: what to train, how far it is, and what went wrong."""
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..operators import ids, watch
+from ..operators.common import package, settings
+from ..operators.plan import chosen_effects
+from ..operators.runtime import has_runtime
+from ..stga_addon.job import describe, folder_of
+from ..stga_addon.task import Snapshot, State
+from ..stga_addon.training.forecast import clock
+from .mishap import draw_mishap
+from .properties import seconds_of_presets
+from .step import Step
+
+
+class TrainPanel(Step, bpy.types.Panel):
+    bl_idname = "STGA_PT_train"
+    bl_label = "3 Train"
+
+    def draw(self, context: Any) -> None:
+        run = watch.run_of(context.scene)
+        now = watch.snapshot_of(context.scene)
+        if now.state.is_alive:
+            _draw_progress(self.layout, context, now)
+            return
+        if run is not None:
+            _draw_end(self.layout, context, run, now)
+        _draw_choices(self.layout, context)
+
+
+def _draw_choices(layout: Any, context: Any) -> None:
+    chosen = settings(context)
+    layout.prop(chosen, "run_folder")
+    layout.prop(chosen, "preset")
+    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
+    if times:
+        layout.label(text=f"Here: {times}", icon="TIME")
+    layout.prop(chosen, "minutes")
+    layout.prop(chosen, "strategy")
+    layout.prop(chosen, "show_result")
+    row = layout.row(align=True)
+    for resume, text, icon in ((False, "Train", "PLAY"), (True, "Resume", "FRAME_NEXT")):
+        train = row.operator(ids.TRAIN, text=text, icon=icon)
+        train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, resume
+        train.strategy, train.preset = chosen.strategy, chosen.preset
+        train.effects = " ".join(chosen_effects(chosen))
+    if not has_runtime(context):
+        layout.label(text="No training runtime yet", icon="INFO")
+        layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()
+
+
+def _draw_progress(layout: Any, context: Any, now: Snapshot) -> None:
+    status = now.status
+    text = {State.STARTING: "starting", State.CANCELLING: "cancelling"}.get(now.state, status.message)
+    layout.progress(factor=status.share, text=f"{100 * status.share:.0f} %  {text}")
+    column = layout.column(align=True)
+    for line in (*describe(status.figures), status.remark):
+        if line:
+            column.label(text=line)
+    layout.prop(settings(context), "live_preview")
+    layout.prop(settings(context), "show_result")
+    layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
+
+
+def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
+    box = layout.box()
+    row = box.row()
+    if now.state == State.NONE:
+        row.label(text="The run is gone", icon="ERROR")
+        draw_mishap(box, context, f"{run}: is not there; was it moved? Choose its folder and press Resume", (), None)
+    elif now.state.is_mishap:
+        row.label(text="Training failed", icon="ERROR")
+        draw_mishap(box, context, now.status.error, now.tail, folder_of(run))
+    else:
+        done = {State.FINISHED: "Trained", State.CANCELLED: "Cancelled, avatar kept"}[now.state]
+        row.label(text=done, icon="CHECKMARK")
+        for line in describe(now.status.figures)[1:]:
+            box.label(text=line)
+    row.operator(ids.DISMISS_TRAINING, text="", icon="X", emboss=False)
