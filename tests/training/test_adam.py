@@ -162,5 +162,7 @@ def test_many_rows() -> None:
         rate = torch.full(value.shape[1:], RATES[name], dtype=torch.float64)
         if name == "sh":
             rate[1:] = RATES["sh_rest"]
-        expected = value - rate * mean / square.sqrt()
-        np.testing.assert_allclose(getattr(state.parameters, name)[rows], expected, rtol=1e-5, atol=1e-6)
+        step = rate * mean / square.sqrt()
+        # Where the random second moment is near zero a step is many rates long, and rounded in proportion.
+        error = (getattr(state.parameters, name)[rows].double() - (value - step)).abs()
+        assert (error <= 1e-6 + 1e-5 * step.abs() + 1e-6 * value.abs()).all(), name
