@@ -69,11 +69,11 @@ class MakeRuntime(bpy.types.Operator):
 
     device: bpy.props.EnumProperty(
         name="Device",
-        description="For which device PyTorch is installed",
+        description="What the environment is to train on",
         items=(
-            ("auto", "Automatic", "CUDA where the driver of an NVIDIA GPU is found, else the CPU"),
+            ("auto", "Automatic", "An NVIDIA GPU where its driver is found, else the CPU"),
             ("cpu", "CPU", "Smaller; trains on every machine"),
-            ("cuda", "CUDA", "For NVIDIA GPUs"),
+            ("cuda", "CUDA", "For NVIDIA GPUs, by the package warp-lang"),
         ),
     )
     wheels: bpy.props.StringProperty(
@@ -104,7 +104,7 @@ class MakeRuntime(bpy.types.Operator):
             layout.prop(self, name)
         column = layout.column(align=True)
         cpu, cuda = runtime.SIZES_GB["cpu"], runtime.SIZES_GB["cuda"]
-        column.label(text=f"Takes about {cpu:.1f} GB for the CPU, {cuda:.0f} GB for CUDA, in")
+        column.label(text=f"Takes about {cpu:.1f} GB for the CPU, {cuda:.1f} GB for CUDA, in")
         column.label(text=str(runtime_folder()))
         if not self.wheels:
             source = "Downloads from pytorch.org and pypi.org"

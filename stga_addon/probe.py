@@ -24,12 +24,20 @@ def main() -> None:
             found[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
         except Exception as error:  # a library that does not load raises what it likes
             broken[name] = f"{type(error).__name__}: {error}".splitlines()[0]
-    device = f"CPU with {os.cpu_count()} threads"
-    if "torch" in found:
-        torch = importlib.import_module("torch")
-        if torch.cuda.is_available():
-            device = str(torch.cuda.get_device_name())
-    print(json.dumps({"python": platform.python_version(), "found": found, "broken": broken, "device": device}))
+    report = {"python": platform.python_version(), "found": found, "broken": broken, "device": _device()}
+    print(json.dumps(report))
+
+
+def _device() -> str:
+    """The GPU that warp-lang finds, or the CPU."""
+    try:
+        warp = importlib.import_module("warp")
+        warp.config.quiet = True
+        if warp.is_cuda_available():
+            return str(warp.get_cuda_device().name)
+    except Exception:  # without the package or a driver that works, there is the CPU
+        pass
+    return f"CPU with {os.cpu_count()} threads"
 
 
 if __name__ == "__main__":

@@ -23,11 +23,12 @@ from .files import replacing
 from .probe import NEEDED
 
 DEVICES = ("auto", "cpu", "cuda")
-SIZES_GB = {"cpu": 1.5, "cuda": 7.0}
-"""Room that a runtime takes: measured, and from the sizes of PyTorch's CUDA packages."""
-CUDA_BUILDS = ("cu130", "cu128", "cu126")
-"""Of PyTorch, newest first; its index keeps them."""
-INDEX = "https://download.pytorch.org/whl/"
+SIZES_GB = {"cpu": 1.5, "cuda": 2.0}
+"""Room that a runtime takes: measured, and with the package warp-lang, which is all that a GPU needs beside."""
+OLDEST_CUDA = 12
+"""Of the driver, for warp-lang."""
+INDEX = "https://download.pytorch.org/whl/cpu"
+"""PyTorch's CPU build: on a GPU, too, the kernels are ours, and its CUDA builds take gigabytes."""
 PROBE_S = 180.0
 """The first import of torch from a slow disk."""
 
@@ -95,24 +96,21 @@ def describe(python: str, report: dict[str, Any]) -> str:
     return f"Python {version}, torch {found['torch']}, numba {found['numba']}, {report['device']}"
 
 
-def build_for(device: str, nvidia_smi: str | None) -> str:
-    """The build of PyTorch to install: "cpu", or one of CUDA_BUILDS for the driver that `nvidia-smi` reports.
+def device_for(device: str, nvidia_smi: str | None) -> str:
+    """The device to install for: "cpu", or "cuda" where the driver that `nvidia-smi` reports is new enough.
 
-    device: "auto" takes CUDA where there is a driver for it. nvidia_smi: its output, None where there is none.
+    device: "auto" takes what there is. nvidia_smi: its output, None where there is none.
     Raises StgaError where CUDA was chosen and the driver cannot do it.
     """
     if device == "cpu":
         return "cpu"
-    reported = re.search(r"CUDA Version:\s*(\d+)\.(\d+)", nvidia_smi or "")
-    newest = (int(reported[1]), int(reported[2])) if reported else (0, 0)
-    for build in CUDA_BUILDS:
-        if (int(build[2:4]), int(build[4:])) <= newest:
-            return build
+    reported = re.search(r"CUDA Version:\s*((\d+)\.\d+)", nvidia_smi or "")
+    if reported and int(reported[2]) >= OLDEST_CUDA:
+        return "cuda"
     if device == "auto":
         return "cpu"
-    oldest = f"{CUDA_BUILDS[-1][2:4]}.{CUDA_BUILDS[-1][4:]}"
-    has = f"the NVIDIA driver goes up to CUDA {newest[0]}.{newest[1]}" if reported else "nvidia-smi finds no NVIDIA GPU"
-    raise StgaError(f"{has}, PyTorch needs CUDA {oldest} or newer: update the driver or choose the CPU")
+    has = f"the NVIDIA driver goes up to CUDA {reported[1]}" if reported else "nvidia-smi finds no NVIDIA GPU"
+    raise StgaError(f"{has}, training needs CUDA {OLDEST_CUDA} or newer: update the driver or choose the CPU")
 
 
 def nvidia_smi() -> str | None:
@@ -124,15 +122,11 @@ def nvidia_smi() -> str | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def size_gb(build: str) -> float:
-    return SIZES_GB["cpu" if build == "cpu" else "cuda"]
-
-
-def steps(venv: Path, python: str, build: str, wheels: Path | None) -> list[tuple[str, list[str]]]:
+def steps(venv: Path, python: str, device: str, wheels: Path | None) -> list[tuple[str, list[str]]]:
     """(what a person reads, command) in turn; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
     others = [package for package in NEEDED.values() if package != "torch"]
-    if build != "cpu":
+    if device == "cuda":
         others.append("warp-lang")
     made = ("making the environment", [python, "-m", "venv", "--clear", str(venv)])
     if wheels is not None:
@@ -140,7 +134,7 @@ def steps(venv: Path, python: str, build: str, wheels: Path | None) -> list[tupl
         return [made, ("installing from the folder of wheels", offline)]
     return [
         made,
-        (f"installing torch ({build})", [*pip, "--index-url", INDEX + build, "torch"]),
+        ("installing torch", [*pip, "--index-url", INDEX, "torch"]),
         ("installing the other packages", [*pip, *others]),
     ]
 
@@ -152,12 +146,12 @@ def make(folder: Path, python: str, device: str = "auto", wheels: Path | None = 
     """
     venv, ready = folder / "venv", folder / "ready"
     with task.telling(task_folder(folder)) as teller:
-        build = build_for(device, nvidia_smi())
+        device = device_for(device, nvidia_smi())
         free = shutil.disk_usage(folder).free / 1e9
-        if free < size_gb(build):
-            raise StgaError(f"{folder}: has {free:.1f} GB free, the runtime needs {size_gb(build):.1f} GB")
+        if free < SIZES_GB[device]:
+            raise StgaError(f"{folder}: has {free:.1f} GB free, the runtime needs {SIZES_GB[device]:.1f} GB")
         ready.unlink(missing_ok=True)
-        todo = steps(venv, python, build, wheels)
+        todo = steps(venv, python, device, wheels)
         try:
             for number, (message, command) in enumerate(todo):
                 if not _run(teller, number / (len(todo) + 1), message, command):
