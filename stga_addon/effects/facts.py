@@ -75,12 +75,11 @@ class Facts:
         """How many times wider the widest pixel is than the narrowest, at the head, over the views looked at."""
         return float(self.samples.ground.max() / self.samples.ground.min())
 
-    @cached_property
-    def pixels_per_splat(self) -> float:
-        """Of a triangle that is seen, at the size trained at: the 90th percentile."""
+    def pixels_per_splat(self, percentile: float) -> float:
+        """Of the triangles that are seen, at the size trained at; 0 where none is."""
         lattice = self.settings.lattice
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
-        return float(np.percentile(pixels, 90)) / ((lattice + 1) * (lattice + 2) / 2) if len(pixels) else 0.0
+        return float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2) if len(pixels) else 0.0
 
     @cached_property
     def beside(self) -> float:

@@ -20,6 +20,8 @@ STILL = 1e-6
 """Stretch that is rounding."""
 PIXEL_RANGE = 1.25
 """Widest over narrowest pixel from which splats narrower than a pixel would look different to different cameras."""
+FINE = 4.0
+"""Pixels a splat below which what keeps splats from being narrower than a pixel changes how they look."""
 EVEN = 6.0
 """Levels of 255 that a background of one colour may scatter by."""
 SAME = 3.0
@@ -91,7 +93,12 @@ def antialiasing(facts: Facts) -> Verdict:
     settings, widest = facts.settings, facts.pixel_range
     if settings.scale < 1 or settings.coarse_span > 0:
         return Verdict(True, "images are trained on at less than the size that they are drawn at")
-    return Verdict(widest > PIXEL_RANGE, f"the widest pixel at the head is {widest:.2f} times the narrowest")
+    if widest > PIXEL_RANGE:
+        return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
+    pixels = facts.pixels_per_splat(50)
+    return Verdict(
+        pixels < FINE, f"pixels are alike at the head, and half of the splats have under {pixels:.1f} of them"
+    )
 
 
 def background(facts: Facts) -> Verdict:
@@ -118,7 +125,7 @@ def seeds(facts: Facts) -> Verdict:
 
 
 def density(facts: Facts) -> Verdict:
-    pixels = facts.pixels_per_splat
+    pixels = facts.pixels_per_splat(90)
     return Verdict(pixels > PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
 
 

@@ -33,14 +33,14 @@ def on(plan):
 def test_plain(painted):
     """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colours is there."""
     plan, settings = planned(painted())
-    assert on(plan) == {"background", "density"}
+    assert on(plan) == {"antialiasing", "background", "density"}
     assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.seeds) == (0, False, (), False)
 
 
 def test_colour_that_follows_strain(painted):
     """Catches wrinkles that are not seen, or are taken for the cameras' doing."""
     plan, settings = planned(painted(paint=wrinkles))
-    assert on(plan) == {"background", "density", "strain-color"}
+    assert on(plan) == {"antialiasing", "background", "density", "strain-color"}
     assert settings.strain_color
     assert float(plan["strain-color"].reason.split("by ")[1].split()[0]) > 5
 
@@ -48,7 +48,7 @@ def test_colour_that_follows_strain(painted):
 def test_colour_that_follows_the_view(painted):
     """Catches gloss that is not seen, or is taken for the cameras' exposure."""
     plan, settings = planned(painted(paint=gloss))
-    assert on(plan) == {"background", "density", "view-color"}
+    assert on(plan) == {"antialiasing", "background", "density", "view-color"}
     assert settings.sh_degree == Settings.sh_degree
 
 
@@ -62,7 +62,7 @@ def test_cameras_of_different_exposure(painted):
     """Catches gains and offsets that are not found, mixed up between cameras, or wrong by more than two levels."""
     gain, offset = unlike_cameras()
     plan, settings = planned(painted(gain=gain, offset=offset))
-    assert on(plan) == {"background", "density", "exposure"}
+    assert on(plan) == {"antialiasing", "background", "density", "exposure"}
     rows = np.array(settings.exposure)
     assert rows[:, 0].tolist() == list(range(8))
     for level in (80, 120, 160):  # what the ball's colours are
@@ -74,7 +74,7 @@ def test_cameras_of_different_exposure(painted):
 def test_one_camera(painted):
     """Catches effects that one camera cannot tell anything about."""
     plan, settings = planned(painted(cameras=1, paint=gloss))
-    assert on(plan) == {"background", "density"}
+    assert on(plan) == {"antialiasing", "background", "density"}
     for name in ("view-color", "exposure", "seeds"):
         with pytest.raises(StgaError, match=f"--effect {name}=on: cannot be, because one camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
@@ -84,7 +84,7 @@ def test_one_camera(painted):
 def test_one_frame(painted):
     """Catches strain that is asked of a single frame, and a static capture that is refused as a whole."""
     plan, _ = planned(painted(timesteps=1, deformed=0.0))
-    assert on(plan) == {"background", "density"}
+    assert on(plan) == {"antialiasing", "background", "density"}
     with pytest.raises(StgaError, match="strain-color=on: cannot be, because the mesh has the same shape"):
         planned(painted(timesteps=1, deformed=0.0), strain_color="on")
     with pytest.raises(StgaError, match="selection=on: cannot be, because no triangle moves"):
@@ -127,10 +127,11 @@ def test_different_pixels(painted):
         replace(view, camera=replace(view.camera, fl_x=840.0, fl_y=840.0)) if view.camera_index == 0 else view
         for view in capture.views["train"]
     ]
-    facts = Facts(replace(capture, views={"train": tuple(views)}), make_settings(iterations=1))
+    facts = Facts(replace(capture, views={"train": tuple(views)}), make_settings(iterations=1, lattice=0))
     assert facts.pixel_range == pytest.approx(2.0, abs=0.1)
     assert rules.antialiasing(facts).on
-    assert not rules.antialiasing(Facts(painted(), make_settings(iterations=1))).on
+    assert not rules.antialiasing(Facts(painted(), make_settings(iterations=1, lattice=0))).on
+    assert rules.antialiasing(Facts(painted(), make_settings(iterations=1))).on  # six splats a triangle are fine ones
 
 
 def test_many_splats_a_pixel(painted):
