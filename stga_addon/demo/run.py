@@ -12,6 +12,7 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture.images import read_image
 from ..capture.model import Capture
 from ..capture.open import open_capture
+from ..effects.plan import decide
 from ..errors import StgaError
 from ..files import replacing, write_json
 from ..raster.draw import draw_avatar
@@ -74,7 +75,8 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 
 
 def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
-    run = Run(capture.root, model.resolve(), "vhap", make_settings(seconds=seconds, seed=SEED))
+    settings = make_settings(seconds=seconds, seed=SEED, effects={})
+    run = decide(Run(capture.root, model.resolve(), "vhap", settings), capture)
     folder = out / "run"
     if (folder / "run.json").exists():
         (folder / "run.json").unlink()  # the demo always starts anew

@@ -175,6 +175,7 @@ class _Loop:
                     break
         self._evaluate(last=True)
         self._save()
+        self.report(self._progress(speed, "trained"))
 
     def _share(self) -> float:
         """Share of the budget spent."""
@@ -270,7 +271,7 @@ class _Loop:
             ),
         )  # fmt: skip
 
-    def _progress(self, per_second: float) -> Progress:
+    def _progress(self, per_second: float, message: str = "training") -> Progress:
         return Progress(
             min(1.0, self._share()),
             self.trainer.iteration,
@@ -279,7 +280,7 @@ class _Loop:
             self.psnr,
             len(self.trainer),
             self._left_s(),
-            "training",
+            message,
             self.outlook,
             self._avatar,
         )

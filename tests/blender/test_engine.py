@@ -30,6 +30,10 @@ SAME = 1 / 255
 
 @pytest.fixture(autouse=True)
 def _engine(empty_scene):
+    # The extension that other tests enable has an engine of this name, too: only one can be registered.
+    other = bpy.types.RenderEngine.bl_rna_get_subclass_py(engine.ENGINE, None)
+    if other is not None:
+        bpy.utils.unregister_class(other)
     engine.register(no_python)
     scene = bpy.context.scene
     scene.render.engine = engine.ENGINE
@@ -38,6 +42,8 @@ def _engine(empty_scene):
     scene.view_layers[0].use_pass_z = True
     yield
     engine.unregister()
+    if other is not None:
+        bpy.utils.register_class(other)
 
 
 def no_python() -> str:

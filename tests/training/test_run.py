@@ -286,10 +286,11 @@ def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path
     """Catches shares that do not end at one, and speeds or losses that are never filled in."""
     told: list[Progress] = []
     train(toy, tmp_path, make_run(toy), report=lambda progress: bool(told.append(progress)))
-    training = [p for p in told if p.iteration]
+    training = [p for p in told if p.message == "training"]
     assert [p.iteration for p in training] == list(range(1, ITERATIONS + 1))
     assert training[-1].share == 1.0
     assert training[-1].left_s == 0.0
     assert all(p.per_second > 0 and np.isfinite(p.loss) for p in training)
-    assert training[-1].psnr is not None
+    assert told[-1].message == "trained"
+    assert told[-1].psnr is not None
     assert {p.message for p in told if not p.iteration} >= {"compiling kernels"}
