@@ -8,7 +8,7 @@ many opaque splats.
 import numpy as np
 from numba import prange
 
-from . import inline_jit, jit, parallel_jit
+from . import inline_jit, parallel_jit, part_jit
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -68,7 +68,7 @@ def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, backgr
         _blend_tile(tiles[k], tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last)
 
 
-@jit
+@part_jit
 def _blend_tile(tile, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last):
     height, width = last.shape
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -140,7 +140,7 @@ def blend_backward(
         )  # fmt: skip
 
 
-@jit
+@part_jit
 def _differentiate_tile(
     tile, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last,
     v_image, v_transmittance, grads,

@@ -8,7 +8,7 @@ maps never reach main memory.
 import numpy as np
 from numba import prange
 
-from . import inline_jit, jit, parallel_jit
+from . import inline_jit, parallel_jit, part_jit
 
 RADIUS = 5
 REACH = 2 * RADIUS
@@ -28,7 +28,7 @@ def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
     )  # fmt: skip
 
 
-@jit
+@part_jit
 def _blur_row(source, offset, out, at, count):
     """Horizontal blur of source[offset + RADIUS : …] to out[at : at + count]; the source row is padded by RADIUS."""
     for x in range(np.uint64(count)):
@@ -47,7 +47,7 @@ def _blur_row(source, offset, out, at, count):
         out[np.uint64(at) + x] = _blur(source, i, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10)
 
 
-@jit
+@part_jit
 def _blur_column(ring, plane, stride, row, out, at, count):
     """Vertical blur of the ring's eleven rows around `row` to out[at : at + count]."""
     base = plane * RING
@@ -81,7 +81,7 @@ def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
         _sweep(np.int64(job), image, target, rectangles, ssim_weight, scale, gradient, sums)
 
 
-@jit
+@part_jit
 def _sweep(job, image, target, rectangles, ssim_weight, scale, gradient, sums):
     """One channel of one rectangle: row by row, the gradient ten rows behind."""
     height, width = image.shape[1], image.shape[2]

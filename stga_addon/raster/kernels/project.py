@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import prange
 
-from . import jit, parallel_jit
+from . import parallel_jit, part_jit
 from .blend import (
     BLUE,
     GREEN,
@@ -41,7 +41,7 @@ SH = np.array(
 """The normalisation constants of the real spherical harmonics up to degree 3, in order of first use."""
 
 
-@jit
+@part_jit
 def _rotation(q0, q1, q2, q3):
     """Rotation matrix entries of a unit quaternion wxyz."""
     return (
@@ -51,7 +51,7 @@ def _rotation(q0, q1, q2, q3):
     )  # fmt: skip
 
 
-@jit
+@part_jit
 def _unit(q0, q1, q2, q3):
     """Unit quaternion and 1 / norm of a quaternion of any length; zero counts as the identity, with 1 / norm = 0.
 
@@ -68,7 +68,7 @@ def _unit(q0, q1, q2, q3):
     return q0 * rn, q1 * rn, q2 * rn, q3 * rn, min(rn * lift, np.float32(1e12))
 
 
-@jit
+@part_jit
 def _basis(degree, x, y, z, b):
     """Real spherical harmonics of the unit direction (x, y, z), written to b (16,)."""
     b[0] = SH[0]
@@ -90,7 +90,7 @@ def _basis(degree, x, y, z, b):
         b[15] = -SH[5] * x * (xx - three * yy)
 
 
-@jit
+@part_jit
 def _basis_gradient(degree, x, y, z, w):
     """Gradient with respect to (x, y, z) of Σ w[k]·basis[k], for w (16,)."""
     gx, gy, gz = ZERO, ZERO, ZERO
@@ -142,7 +142,7 @@ def project_forward(
         )  # fmt: skip
 
 
-@jit
+@part_jit
 def _project_rows(
     begin, end,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
@@ -236,7 +236,7 @@ def _project_rows(
         projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
 
 
-@jit
+@part_jit
 def _tan_limits(fx, fy, cx, cy, width, height):
     """Bounds of x/z and y/z in the projection's Jacobian: the image plus 0.3 of its half field of view."""
     half_x, half_y = HALF * np.float32(width) / fx, HALF * np.float32(height) / fy
@@ -246,7 +246,7 @@ def _tan_limits(fx, fy, cx, cy, width, height):
     return low_x, high_x, low_y, high_y
 
 
-@jit
+@part_jit
 def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
     """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in `project_forward`."""
     low = LOW_PASS
@@ -284,7 +284,7 @@ def project_backward(
         )  # fmt: skip
 
 
-@jit
+@part_jit
 def _differentiate_rows(
     begin, end,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,

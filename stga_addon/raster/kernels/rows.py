@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import prange
 
-from . import jit, parallel_jit
+from . import jit, parallel_jit, part_jit
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 CHUNK = 256
@@ -38,7 +38,7 @@ def adam_rows(rows, steps, parameters, gradients, firsts, seconds, rates, beta1,
             )  # fmt: skip
 
 
-@jit
+@part_jit
 def _adam_block(rows, parameter, gradient, first, second, correct1, correct2, rates, beta1, beta2, epsilon):
     """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorises."""
     width = parameter.shape[1]
@@ -108,6 +108,6 @@ def distance_limit(rows, xyz, face, loose, limit, weight, gradient):
     return norm
 
 
-@jit
+@part_jit
 def _length(v):
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
