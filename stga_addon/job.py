@@ -107,6 +107,8 @@ def work(run: Path, also: "Report | None" = None) -> Path:
     Raises what training raises; the sentence is in the folder, too.
     """
     folder = folder_of(run)
+    if not (folder / JOB).is_file():  # before anything is written into a folder that is none of ours
+        raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
     with task.telling(folder) as teller:
         teller.tell(0.0, "starting")
         from .effects.plan import decide

@@ -185,7 +185,7 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     """Catches a worker whose mishap only its log knows, and a command that ends well although nothing was trained."""
     pytest.importorskip("torch")
     assert main(["job", str(tmp_path / "nothing")]) == 2
-    assert "job.json: cannot be read" in capsys.readouterr().err
+    assert "holds no job" in capsys.readouterr().err
     run = tmp_path / "run"
     write_job(run, new_job(capture))
     (capture / "meshes/00003.obj").write_text("v 0 0 nan\n")

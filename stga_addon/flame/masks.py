@@ -18,11 +18,6 @@ def faces_within(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return np.asarray(np.isin(faces, vertices).all(axis=1))
 
 
-def mask_faces(model: FlameModel) -> dict[str, np.ndarray]:
-    """Every vertex mask of the model as (F,) bool over its triangles."""
-    return {name: faces_within(model.faces, vertices) for name, vertices in model.masks.items()}
-
-
 def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
     """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has is left out."""
     regions = {}

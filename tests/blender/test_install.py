@@ -85,7 +85,7 @@ def test_a_folder_that_is_no_checkout_is_refused(tmp_path):
 
 # A Blender that nobody has installed anything into: training's packages are out of reach, others come from the zip.
 INSTALL = """
-import importlib.machinery, json, os, sys, time
+import importlib.machinery, json, os, sys
 from pathlib import Path
 import bpy
 
@@ -131,14 +131,6 @@ result["frame"], result["xyz"] = scene.frame_current, xyz
 result["groups"] = sum(group.name.startswith("stga_") for group in scene.stga.head.vertex_groups)
 
 bpy.ops.preferences.addon_disable(module=module)
-before = {name for name in sys.modules if name.startswith(module)}
-for name in before:
-    del sys.modules[name]
-start = time.process_time()
-bpy.ops.preferences.addon_enable(module=module)
-result["seconds"] = time.process_time() - start
-
-bpy.ops.preferences.addon_disable(module=module)
 result["left"] = [*commands] + [name for name in names if hasattr(bpy.types, "STGA_OT_" + name)]
 index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
@@ -165,6 +157,5 @@ def test_install_use_and_uninstall(zip_file, shared_data, tmp_path):
     assert result["groups"] > 0
     centres = capture.mesh(result["frame"])[capture.faces].mean(1)
     np.testing.assert_allclose(np.reshape(result["xyz"], (-1, 3)), centres, atol=1e-5)
-    assert result["seconds"] < 0.3
     assert result["left"] == []
     assert result["files"] == []
