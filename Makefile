@@ -23,7 +23,7 @@ lint: .venv/ready
 	$(BIN)/mypy
 
 fuzz: .venv/ready
-	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} $(BIN)/python -m pytest tests/fuzz
+	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} $(BIN)/python -m pytest tests/fuzz tests/numerics/test_generated.py
 
 extension: .venv/ready
 	$(BIN)/python -m stga_addon.package --out dist
