@@ -34,7 +34,7 @@ class ViewLoader:
         views: Iterable[View],
         scale: Callable[[int], float] = lambda position: 1.0,
         background: tuple[int, int, int] = WHITE,
-        queue_bytes: int = 64 << 20,
+        queue_bytes: int = 16 << 20,
         cache_bytes: int = 256 << 20,
         correct: Callable[[View, np.ndarray, np.ndarray | None], np.ndarray] | None = None,
     ) -> None:

@@ -125,7 +125,12 @@ def inside(root: Path, relative: str, where: str) -> Path:
     """
     text = relative.replace("\\", "/")
     parts = posixpath.normpath(text).split("/")
-    if not text or "\0" in text or text.startswith("/") or any(PureWindowsPath(part).drive for part in parts):
+    if (
+        not text
+        or "\0" in text
+        or text.startswith("/")
+        or any(":" in part and PureWindowsPath(part).drive for part in parts)
+    ):
         raise StgaError(f"{where}: {relative!r} is not a path relative to {root}")
     # The first .. leads to the parent, where only a named sibling may follow.
     if parts[:2] == ["..", ".."] or parts == [".."]:
@@ -135,9 +140,10 @@ def inside(root: Path, relative: str, where: str) -> Path:
 
 @dataclass(frozen=True)
 class _Record:
-    """A JSON object with the file it comes from and the place in it, for messages."""
+    """A JSON object with the file it comes from, that file's folder without links, and the place in it for messages."""
 
     path: Path
+    folder: Path
     place: str
     values: dict[str, Any]
 
@@ -174,7 +180,7 @@ class _Record:
             return None
         if not isinstance(value, str):
             raise StgaError(f"{self.where(key)}: expected a relative path, not {value!r}")
-        return inside(self.path.parent.resolve(), value, self.where(key))
+        return inside(self.folder, value, self.where(key))
 
 
 def _split_file(split: str) -> str:
@@ -185,23 +191,33 @@ def _document(path: Path) -> _Record:
     values = read_json(path)
     if not isinstance(values, dict):
         raise StgaError(f"{path}: expected a JSON object with the field frames")
-    return _Record(path, "", values)
+    return _Record(path, path.parent.resolve(), "", values)
 
 
 def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise StgaError(f"{path}: frames: expected a list with one entry per image")
-    shared = _Record(path, "", values)
+    shared = _Record(path, path.parent.resolve(), "", values)
     timed = any(_timestep_key(entry) for entry in values["frames"] if isinstance(entry, dict))
+    cameras: dict[tuple[bytes | float, ...], Camera] = {}
     frames = []
     for number, entry in enumerate(values["frames"]):
         if not isinstance(entry, dict):
             raise StgaError(f"{path}: frames[{number}]: expected an object, not {entry!r:.40}")
-        frames.append(_frame(_Record(path, f"frames[{number}].", entry), shared, timed, principal_point))
+        frames.append(
+            _frame(replace(shared, place=f"frames[{number}].", values=entry), shared, timed, principal_point, cameras)
+        )
     return frames
 
 
-def _frame(record: _Record, shared: _Record, timed: bool, principal_point: str) -> Frame:
+def _frame(
+    record: _Record,
+    shared: _Record,
+    timed: bool,
+    principal_point: str,
+    cameras: dict[tuple[bytes | float, ...], Camera],
+) -> Frame:
+    """cameras: those of earlier frames by what the file says of them; most frames share theirs."""
     image = record.path_of("file_path")
     if image is None:
         raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
@@ -213,11 +229,15 @@ def _frame(record: _Record, shared: _Record, timed: bool, principal_point: str) 
     width, height = _image_size(record, shared, image)
     written = _number(record, shared, "cx", width / 2), _number(record, shared, "cy", height / 2)
     focal = _focal(record, shared, width, height)
-    camera = camera_from_gl(_pose(record), width, height, *focal, *written)
+    matrix = _matrix(record)
+    key_of_camera = matrix.tobytes(), width, height, *focal, *written
+    if key_of_camera not in cameras:
+        camera = camera_from_gl(_pose(record, matrix), width, height, *focal, *written)
+        cameras[key_of_camera] = with_principal_point(camera, written, principal_point)
     view = View(
         timestep=record.natural(key) if key else 0,
         camera_index=record.natural("camera_index") if record.has("camera_index") else -1,
-        camera=with_principal_point(camera, written, principal_point),
+        camera=cameras[key_of_camera],
         # Forward slashes everywhere: what is named after a view must not become a path on Windows alone.
         name=record.values["file_path"].replace("\\", "/"),
         image=image,
@@ -268,12 +288,15 @@ def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[f
     raise StgaError(f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level")
 
 
-def _pose(record: _Record) -> np.ndarray:
-    where = record.where("transform_matrix")
+def _matrix(record: _Record) -> np.ndarray:
     try:
-        matrix = np.array(record.values["transform_matrix"], np.float64)
+        return np.array(record.values["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise StgaError(f"{where}: expected {MATRIX}") from error
+        raise StgaError(f"{record.where('transform_matrix')}: expected {MATRIX}") from error
+
+
+def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
+    where = record.where("transform_matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
     rotation = matrix[:3, :3]

@@ -237,8 +237,9 @@ def test_no_strain_nodes_without_strain_colours():
     """Catches the cost of strain on every avatar that does not know it."""
     avatar = avatar_of("stga", 10)
     show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
-    (tree,) = bpy.data.node_groups
-    names = [socket.default_value for node in tree.nodes for socket in node.inputs if socket.type == "STRING"]
+    trees = bpy.data.node_groups
+    sockets = [socket for tree in trees for node in tree.nodes for socket in node.inputs]
+    names = [socket.default_value for socket in sockets if socket.type == "STRING"]
     assert "stga_face" in names
     assert not [name for name in names if "strain" in name]
 
@@ -355,9 +356,23 @@ def test_saved_file_does_not_hold_the_trees_twice(tmp_path: Path):
     avatar = avatar_of("stga", 10)
     head = animated_head(avatar.neutral, avatar.faces)
     show_avatar(avatar, head)
+    trees = len(bpy.data.node_groups)
     show_avatar(avatar, head)
-    assert len(bpy.data.node_groups) == 1
+    assert len(bpy.data.node_groups) == trees
     assert len(bpy.data.materials) == 2
+
+
+@pytest.mark.parametrize("kind", [("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False)])
+def test_a_tree_is_built_in_small_slices(kind):
+    """Catches what holds Blender up when a live preview first comes: a part that is built with another one, a large
+    tree (the time it takes grows with the square), and parts that are built again."""
+    built = []
+    while nodes.build_slice(*kind):
+        built.append(len(bpy.data.node_groups))
+    assert built == list(range(1, len(built) + 1))
+    assert max(len(tree.nodes) for tree in bpy.data.node_groups) <= 60
+    assert nodes.splat_tree(*kind) == nodes.find_splat_tree(*kind)
+    assert len(bpy.data.node_groups) == len(built)
 
 
 @pytest.mark.parametrize("display", [ELLIPSOIDS, QUADS])

@@ -46,8 +46,9 @@ def play(home: Path, part: str, *file: object) -> dict[str, Any]:
     blender(home, *file, "--python", script, "--", part, result, home / "capture", home / "head.blend", sys.executable)
     seen: dict[str, Any] = json.loads(result.read_text())
     assert "traceback" not in seen, seen["traceback"]
-    wall, cpu = max(seen["ticks_ms"]), max(seen["ticks_cpu_ms"])
-    print(f"{part}: {len(seen['ticks_ms'])} ticks, of at most {wall} ms by the clock and {cpu} ms of processor time")
+    for name, times in seen["held up ms"].items():
+        wall, cpu = (max(column) for column in zip(*times, strict=True)) if times else (0, 0)
+        print(f"{part}, {name}: {len(times)}, each at most {wall:.1f} ms by the clock, {cpu:.1f} ms of processor time")
     return seen
 
 

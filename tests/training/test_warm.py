@@ -16,7 +16,8 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 import stga_addon.raster.kernels as kernels
 from stga_addon.training import run as run_module
-from stga_addon.training.folder import Run, read_metrics
+from stga_addon.training.evaluations import read_metrics
+from stga_addon.training.folder import Run
 from stga_addon.training.settings import make_settings
 from stga_addon.capture.open import open_capture
 
