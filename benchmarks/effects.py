@@ -21,7 +21,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.effects.facts import Facts
 from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import EFFECTS
-from stga_addon.training.folder import Run, read_metrics
+from stga_addon.training.evaluations import read_metrics
+from stga_addon.training.folder import Run
 from stga_addon.training.metrics import measure
 from stga_addon.training.run import train
 from stga_addon.training.settings import make_settings

@@ -18,7 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
-import numba
 import numpy as np
 import trimesh
 
@@ -30,6 +29,7 @@ from stga_addon.demo.head import synthetic_head
 from stga_addon.raster.kernels.bins import count_pairs, depth_order, fill_pairs
 from stga_addon.raster.kernels.blend import blend_backward, blend_forward
 from stga_addon.raster.kernels.project import project_backward, project_forward
+from stga_addon.raster.kernels.threads import threads
 from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_forward
 from stga_addon.training import adam
 from stga_addon.training.device import choose_device, make_step
@@ -128,7 +128,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         "sort by depth": (lambda: depth_order(depth, r.visible), len(rows) * 6 * 8),
         "count pairs": (lambda: count_pairs(rect, order, tiles_x, tiles_y, r.slot_start, r.slot_count), n * 24),
         "fill pairs": (
-            lambda: fill_pairs(rect, order, tiles_x, tiles_y, r.slot_start, r.start, 2, r.pair_splat, r.pair_slot),
+            lambda: fill_pairs(rect, order, tiles_x, tiles_y, r.slot_start, r.start, r.pair_splat, r.pair_slot),
             pairs * 8 + n * 20,
         ),
         "blend": (
@@ -255,7 +255,7 @@ def main() -> None:
 def cpu_table(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, float]:
     """Print the stages beside their floors; returns their times."""
     bandwidth = copy_bandwidth()
-    print(f"{numba.get_num_threads()} threads, copy {bandwidth / 1e9:.1f} GB/s")
+    print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s")
     found = stages(splats, seen, target, repeats)
     print(f"{'stage':<22}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, (ms, moved) in found.items():

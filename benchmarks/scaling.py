@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
-import numba
 import numpy as np
 from iteration import demo_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
+from stga_addon.raster.kernels.threads import set_threads, threads
 from stga_addon.raster.render import Parameters, camera_frames, render_forward
 
 matplotlib.use("Agg")
@@ -50,14 +50,14 @@ def measure(x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, sha
     return Point(x, median_ms(lambda: step.train(batch), repeats), pairs)
 
 
-def threads(count: int, repeats: int) -> Point:
+def on_threads(count: int, repeats: int) -> Point:
     """An iteration on `count` threads."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(count)
+    before = threads()
+    set_threads(count)
     try:
         return measure(count, repeats)
     finally:
-        numba.set_num_threads(before)
+        set_threads(before)
 
 
 def series(repeats: int) -> dict[str, list[Point]]:
@@ -67,7 +67,7 @@ def series(repeats: int) -> dict[str, list[Point]]:
         "splats": [lambda n=n: measure(n, repeats if n < 200_000 else max(3, repeats // 5), splats=n) for n in counts],
         "pixels": [lambda z=z: measure(z * z * WIDTH * HEIGHT, repeats, zoom=z) for z in (0.25, 0.5, 1.0, 1.5, 2.0)],
         "selected share": [lambda s=s: measure(s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)],
-        "threads": [lambda n=n: threads(n, repeats) for n in range(1, numba.get_num_threads() + 1)],
+        "threads": [lambda n=n: on_threads(n, repeats) for n in range(1, threads() + 1)],
     }
     found = {}
     for name, measurements in plans.items():

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import StgaError
@@ -47,6 +48,16 @@ def open_flame_capture(
 def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
     """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views. Raises StgaError."""
     return _flame_capture(path, read_motion(path, _model_for(path, model_file)), {})
+
+
+def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
+    """The FLAME capture with another motion of the same person, and the meshes that it makes."""
+    return replace(
+        capture,
+        mesh=remembered(lambda timestep: sequence_mesh(sequence, timestep), len(sequence.model.v_template)),
+        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        flame=sequence,
+    )
 
 
 def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tuple[View, ...]]) -> Capture:

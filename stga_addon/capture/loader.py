@@ -35,7 +35,7 @@ class ViewLoader:
         scale: Callable[[int], float] = lambda position: 1.0,
         background: tuple[int, int, int] = WHITE,
         queue_bytes: int = 16 << 20,
-        cache_bytes: int = 256 << 20,
+        cache_bytes: int = 224 << 20,
         correct: Callable[[View, np.ndarray, np.ndarray | None], np.ndarray] | None = None,
     ) -> None:
         self.waited_s = 0.0

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from ..capture.camera import Camera
@@ -54,7 +53,7 @@ def _blended(
 ) -> Composition:
     tiles_x, tiles_y = tile_grid(camera)
     bins = sort_into_tiles(depth, rect, camera, Scratch().take)
-    tiles = deal(np.arange(tiles_x * tiles_y, dtype=np.int32), numba.get_num_threads())
+    tiles = deal(np.arange(tiles_x * tiles_y, dtype=np.int32))
 
     def blend() -> tuple[np.ndarray, np.ndarray]:
         image = np.empty((3, camera.height, camera.width), np.float32)

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from ..avatar.embedding import FaceFrames
@@ -13,6 +12,7 @@ from ..capture.camera import Camera
 from .kernels.bins import count_pairs, depth_order, fill_pairs, mark_tiles, reaching
 from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
 from .kernels.project import project_backward, project_forward
+from .kernels.threads import PIECES, threads
 
 BLACK = np.zeros(3, np.float32)
 
@@ -138,7 +138,7 @@ def render_forward(
     drawn = None if focus is None else _near(_touched(rect, focus, (camera.height, camera.width)), reach)
     bins = sort_into_tiles(depth, rect, camera, take, drawn)
     tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
-    tiles = deal(tiles if drawn is None else tiles[drawn.ravel()], numba.get_num_threads())
+    tiles = deal(tiles if drawn is None else tiles[drawn.ravel()])
     image = take("image", (3, camera.height, camera.width))
     transmittance = take("transmittance", (camera.height, camera.width))
     last = take("last", (camera.height, camera.width), np.int32)
@@ -184,8 +184,7 @@ def sort_into_tiles(
     start = count_pairs(rect, order, tiles_x, tiles_y, slot_start, slot_count)
     pair_splat = take("pair_splat", (start[-1],), np.int32)
     pair_slot = take("pair_slot", (start[-1],), np.int32)
-    bands = max(1, min(tiles_y, numba.get_num_threads()))
-    fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, bands, pair_splat, pair_slot)
+    fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, pair_splat, pair_slot)
     return Bins(visible, slot_start, slot_count, start, pair_splat, pair_slot)
 
 
@@ -266,6 +265,7 @@ def _near(tiles: np.ndarray, reach: int) -> np.ndarray:
     return grown
 
 
-def deal(tiles: np.ndarray, threads: int) -> np.ndarray:
-    """Deal tiles out like cards, so that every thread's contiguous share is spread over the whole image."""
-    return np.concatenate([tiles[k::threads] for k in range(threads)])
+def deal(tiles: np.ndarray) -> np.ndarray:
+    """Deal tiles out like cards, so that every piece of a thread's work is spread over the whole image."""
+    pieces = PIECES * threads()
+    return np.concatenate([tiles[k::pieces] for k in range(pieces)])

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -13,6 +12,7 @@ from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
 from stga_addon.raster.autograd import render
+from stga_addon.raster.kernels.threads import set_threads, threads
 from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_backward, render_forward
 
 NAMES = Parameters._fields[:5]
@@ -360,13 +360,13 @@ def test_focused_image_is_the_full_image_within_reach():
 
 def test_results_do_not_depend_on_threads():
     """Catches races, and sums whose order depends on scheduling: a resumed run must equal an unbroken one."""
-    scene, threads = SCENES["opaque layers"], numba.get_num_threads()
+    scene, before = SCENES["opaque layers"], threads()
     many = [kernel_gradients(scene, random_cotangents(scene.camera)) for _ in range(2)]
-    numba.set_num_threads(1)
+    set_threads(1)
     try:
         single = kernel_gradients(scene, random_cotangents(scene.camera))
     finally:
-        numba.set_num_threads(threads)
+        set_threads(before)
     for images, gradients in many:
         for got, want in zip(images, single[0], strict=True):
             np.testing.assert_array_equal(got, want)

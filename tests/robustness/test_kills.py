@@ -22,9 +22,7 @@ KILLS = 100
 def outcome(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     driver = Path(__file__).with_name("kill_driver.py")
     command = [sys.executable, str(driver), str(tmp_path_factory.mktemp("kills")), str(KILLS)]
-    # Of Numba's threads only this kind survives a fork.
-    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

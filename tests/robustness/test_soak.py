@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 import pytest
 from capture import factory
@@ -14,6 +13,7 @@ from training.toys import bits, quick_settings
 from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.raster.kernels.threads import set_threads, threads
 from stga_addon.training.trainer import Trainer
 from stga_addon.training.warm import compile_kernels
 
@@ -43,10 +43,10 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 @pytest.fixture(autouse=True)
-def threads() -> Iterator[None]:
-    before = numba.get_num_threads()
+def as_many_threads_as_before() -> Iterator[None]:
+    before = threads()
     yield
-    numba.set_num_threads(before)
+    set_threads(before)
 
 
 def resident() -> int:
@@ -55,9 +55,9 @@ def resident() -> int:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def soak(capture: Capture, until: int, threads: int, seed: int = 0) -> Soak:
+def soak(capture: Capture, until: int, on: int, seed: int = 0) -> Soak:
     """Train `until` of ITERATIONS steps, each with another view and another random choice of triangles."""
-    numba.set_num_threads(threads)
+    set_threads(on)
     settings = quick_settings(
         "selective", iterations=ITERATIONS, seed=seed, lattice=1, warm_up=0.02, stray_every=STRAYS, stray_limit=0.5,
         density_every=DENSITY, density_span=(0.0, 1.0), growth=0.5, scale_limit=1.0,
@@ -104,7 +104,7 @@ def _mark(trainer: Trainer, found: Soak) -> None:
 @pytest.fixture(scope="module")
 def long(capture: Capture) -> Soak:
     compile_kernels()
-    return soak(capture, ITERATIONS, threads=2)
+    return soak(capture, ITERATIONS, on=2)
 
 
 def test_everything_was_on(long: Soak) -> None:
@@ -142,9 +142,7 @@ def test_memory_is_flat(long: Soak) -> None:
 
 def test_same_seed_same_bits_with_one_thread(capture: Capture, long: Soak) -> None:
     """Catches sums whose order depends on threads, and random numbers that do not come from the seed."""
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("this machine has one core")
     third = ITERATIONS // 3 // MARK * MARK
-    assert soak(capture, third, threads=1).marks == long.marks[: third // MARK]
-    assert soak(capture, MARK, threads=2).marks == long.marks[:1]
-    assert soak(capture, MARK, threads=2, seed=1).marks != long.marks[:1]
+    assert soak(capture, third, on=1).marks == long.marks[: third // MARK]
+    assert soak(capture, MARK, on=3).marks == long.marks[:1]
+    assert soak(capture, MARK, on=2, seed=1).marks != long.marks[:1]

@@ -23,7 +23,8 @@ from stga_addon.capture.open import open_capture
 
 root, out = map(Path, sys.argv[1:])
 modules = [importlib.import_module(f"{kernels.__name__}.{m.name}") for m in pkgutil.iter_modules(kernels.__path__)]
-found = {f.__module__ + "." + f.__name__: f for m in modules for f in vars(m).values() if isinstance(f, Dispatcher)}
+functions = [getattr(f, "__wrapped__", f) for m in modules for f in vars(m).values()]
+found = {f.__module__ + "." + f.__name__: f for f in functions if isinstance(f, Dispatcher)}
 counts = lambda: {name: len(f.signatures) for name, f in found.items()}
 run_module.compile_kernels()
 before = counts()

@@ -34,8 +34,7 @@ def _cached(**options: Any) -> Any:
     return decorate
 
 
-jit = _cached()
-parallel_jit = _cached(parallel=True)
+jit = _cached(nogil=True)
 # What other kernels call. Without forcing LLVM to inline it, a process that compiles calls the function as it was
 # optimised alone, and one that loads the kernel from the cache calls the copy in there, whose last bits differ.
 part_jit = _cached(forceinline=True)

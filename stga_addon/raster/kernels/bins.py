@@ -1,9 +1,9 @@
 """Which splats touch which tile, front to back."""
 
 import numpy as np
-from numba import prange
 
-from . import jit, parallel_jit
+from . import jit
+from .threads import parallel
 
 RADIX_BITS = 11
 
@@ -67,26 +67,23 @@ def count_pairs(rect, order, tiles_x, tiles_y, slot_start, slot_count):
     return start
 
 
-@parallel_jit
-def fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, bands, pair_splat, pair_slot):
-    """Write every tile's splats front to back, `bands` bands of tile rows at a time.
-
-    Each band walks all splats and keeps those in its rows, so no two threads write one list.
-    """
-    for band in prange(bands):
-        low, high = tiles_y * band // bands, tiles_y * (band + 1) // bands
-        place = start[low * tiles_x : high * tiles_x].copy()
-        for n in range(len(order)):
-            i = order[n]
-            x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
-            for y in range(max(low, y0), min(high, y1)):
-                slot = slot_start[i] + (y - y0) * (x1 - x0)
-                for x in range(x0, x1):
-                    at = (y - low) * tiles_x + x
-                    pair_splat[place[at]] = i
-                    pair_slot[place[at]] = slot
-                    place[at] += 1
-                    slot += 1
+# One piece a thread, because each walks all splats.
+@parallel(lambda rect, order, tiles_x, tiles_y, *_: tiles_y, pieces=1)
+@jit
+def fill_pairs(low, high, rect, order, tiles_x, tiles_y, slot_start, start, pair_splat, pair_slot):
+    """Write every tile's splats front to back, for the rows of tiles [low, high)."""
+    place = start[low * tiles_x : high * tiles_x].copy()
+    for n in range(len(order)):
+        i = order[n]
+        x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
+        for y in range(max(low, y0), min(high, y1)):
+            slot = slot_start[i] + (y - y0) * (x1 - x0)
+            for x in range(x0, x1):
+                at = (y - low) * tiles_x + x
+                pair_splat[place[at]] = i
+                pair_slot[place[at]] = slot
+                place[at] += 1
+                slot += 1
 
 
 @jit

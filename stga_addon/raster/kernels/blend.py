@@ -6,9 +6,9 @@ many opaque splats.
 """
 
 import numpy as np
-from numba import prange
 
-from . import inline_jit, parallel_jit, part_jit
+from . import inline_jit, jit
+from .threads import parallel
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -53,8 +53,22 @@ def _row_range(mean_y, extent_y, top):
     return first, last + 1
 
 
-@parallel_jit
-def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last):
+@parallel(lambda tiles, *_: len(tiles))
+@jit
+def blend_forward(
+    first_tile,
+    past_tile,
+    tiles,
+    tiles_x,
+    start,
+    pair_splat,
+    projected,
+    extent_y,
+    background,
+    image,
+    transmittance,
+    last,
+):
     """Render the listed tiles.
 
     tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int32 into the pair
@@ -63,67 +77,65 @@ def blend_forward(tiles, tiles_x, start, pair_splat, projected, extent_y, backgr
     because the backward needs its small values exactly), and last (H, W) int32: one past the last contributing pair
     of the tile, counted from the tile's start.
     """
-    # A function of its own, because Numba takes far longer to compile it inside a parallel loop.
-    for k in prange(len(tiles)):
-        _blend_tile(tiles[k], tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last)
-
-
-@part_jit
-def _blend_tile(tile, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last):
     height, width = last.shape
-    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    x0, y0 = np.float32(left), np.float32(top)
-    s = np.zeros(STATE, np.float32)
-    for p in range(np.uint64(PIXELS)):
-        s[p] = np.float32(1.0)
-        s[ALIVE + p] = np.float32(1.0)
-        s[X + p] = np.float32(np.int64(p) % TILE) + np.float32(0.5)
-        s[Y + p] = np.float32(np.int64(p) // TILE) + np.float32(0.5)
-    begin, end = start[tile], start[tile + 1]
-    for j in range(begin, end):
-        if (j - begin) % 16 == 15:
-            alive = np.float32(0.0)
-            for p in range(np.uint64(PIXELS)):
-                alive += s[ALIVE + p]
-            if alive == np.float32(0.0):
-                break
-        i = pair_splat[j]
-        mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
-        qx = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
-        qy = np.float32(-0.5) * LOG2E * projected[i, PRECISION_Y]
-        shear = projected[i, SHEAR]
-        opacity = projected[i, OPACITY]
-        red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
-        first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
-        order = np.float32(j - begin + 1)
-        for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
-            dy = s[Y + p] - mean_y
-            dx = s[X + p] - mean_x - shear * dy
-            power = qx * dx * dx + qy * dy * dy
-            a = min(ALPHA_MAX, opacity * _exp2(power))
-            a = a * s[ALIVE + p] if a >= ALPHA_MIN else np.float32(0.0)
-            t = s[p]
-            after = t * (np.float32(1.0) - a)
-            goes_on = after > STOP
-            weight = a * t if goes_on else np.float32(0.0)
-            s[ALIVE + p] = s[ALIVE + p] if goes_on else np.float32(0.0)
-            s[p] = after if goes_on else t
-            s[SUM_RED + p] += weight * red
-            s[SUM_GREEN + p] += weight * green
-            s[SUM_BLUE + p] += weight * blue
-            s[LAST + p] = order if weight > np.float32(0.0) else s[LAST + p]
-    for row in range(min(TILE, height - top)):
-        for column in range(min(TILE, width - left)):
-            p = np.uint64(row * TILE + column)
-            image[0, top + row, left + column] = s[SUM_RED + p] + s[p] * background[0]
-            image[1, top + row, left + column] = s[SUM_GREEN + p] + s[p] * background[1]
-            image[2, top + row, left + column] = s[SUM_BLUE + p] + s[p] * background[2]
-            transmittance[top + row, left + column] = s[p]
-            last[top + row, left + column] = np.int32(s[LAST + p])
+    s = np.empty(STATE, np.float32)
+    for k in range(first_tile, past_tile):
+        tile = tiles[k]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        x0, y0 = np.float32(left), np.float32(top)
+        s[:] = np.float32(0.0)
+        for p in range(np.uint64(PIXELS)):
+            s[p] = np.float32(1.0)
+            s[ALIVE + p] = np.float32(1.0)
+            s[X + p] = np.float32(np.int64(p) % TILE) + np.float32(0.5)
+            s[Y + p] = np.float32(np.int64(p) // TILE) + np.float32(0.5)
+        begin, end = start[tile], start[tile + 1]
+        for j in range(begin, end):
+            if (j - begin) % 16 == 15:
+                alive = np.float32(0.0)
+                for p in range(np.uint64(PIXELS)):
+                    alive += s[ALIVE + p]
+                if alive == np.float32(0.0):
+                    break
+            i = pair_splat[j]
+            mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
+            qx = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
+            qy = np.float32(-0.5) * LOG2E * projected[i, PRECISION_Y]
+            shear = projected[i, SHEAR]
+            opacity = projected[i, OPACITY]
+            red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
+            first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
+            order = np.float32(j - begin + 1)
+            for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
+                dy = s[Y + p] - mean_y
+                dx = s[X + p] - mean_x - shear * dy
+                power = qx * dx * dx + qy * dy * dy
+                a = min(ALPHA_MAX, opacity * _exp2(power))
+                a = a * s[ALIVE + p] if a >= ALPHA_MIN else np.float32(0.0)
+                t = s[p]
+                after = t * (np.float32(1.0) - a)
+                goes_on = after > STOP
+                weight = a * t if goes_on else np.float32(0.0)
+                s[ALIVE + p] = s[ALIVE + p] if goes_on else np.float32(0.0)
+                s[p] = after if goes_on else t
+                s[SUM_RED + p] += weight * red
+                s[SUM_GREEN + p] += weight * green
+                s[SUM_BLUE + p] += weight * blue
+                s[LAST + p] = order if weight > np.float32(0.0) else s[LAST + p]
+        for row in range(min(TILE, height - top)):
+            for column in range(min(TILE, width - left)):
+                p = np.uint64(row * TILE + column)
+                image[0, top + row, left + column] = s[SUM_RED + p] + s[p] * background[0]
+                image[1, top + row, left + column] = s[SUM_GREEN + p] + s[p] * background[1]
+                image[2, top + row, left + column] = s[SUM_BLUE + p] + s[p] * background[2]
+                transmittance[top + row, left + column] = s[p]
+                last[top + row, left + column] = np.int32(s[LAST + p])
 
 
-@parallel_jit
+@parallel(lambda tiles, *_: len(tiles))
+@jit
 def blend_backward(
+    first_tile, past_tile,
     tiles, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last,
     v_image, v_transmittance, grads,
 ):  # fmt: skip
@@ -133,95 +145,86 @@ def blend_backward(
     grads (P, 9), with the columns of `projected`; written once each, so the sum per splat is deterministic.
     v_image (3, H, W) and v_transmittance (H, W): gradients of the composited image and of the transmittance.
     """
-    for k in prange(len(tiles)):
-        _differentiate_tile(
-            tiles[k], tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance,
-            last, v_image, v_transmittance, grads,
-        )  # fmt: skip
-
-
-@part_jit
-def _differentiate_tile(
-    tile, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last,
-    v_image, v_transmittance, grads,
-):  # fmt: skip
     height, width = last.shape
-    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    x0, y0 = np.float32(left), np.float32(top)
-    s = np.zeros(STATE, np.float32)
-    deepest = 0
-    for p in range(np.uint64(PIXELS)):
-        s[p] = np.float32(1.0)
-        s[X + p] = np.float32(np.int64(p) % TILE) + np.float32(0.5)
-        s[Y + p] = np.float32(np.int64(p) // TILE) + np.float32(0.5)
-    for row in range(min(TILE, height - top)):
-        for column in range(min(TILE, width - left)):
-            p, y, x = np.uint64(row * TILE + column), top + row, left + column
-            t = transmittance[y, x]
-            s[p] = t
-            vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
-            behind = background[0] * vr + background[1] * vg + background[2] * vb
-            s[BEHIND + p] = t * (behind + v_transmittance[y, x])
-            s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
-            s[LAST + p] = np.float32(last[y, x])
-            deepest = max(deepest, last[y, x])
-    begin = start[tile]
-    for j in range(begin + deepest, start[tile + 1]):
-        slot = pair_slot[j]
-        for c in range(PROJECTED):
-            grads[slot, c] = np.float32(0.0)
-    nearest = begin  # nothing in front of the first wanted pair needs to be walked
-    while nearest < begin + deepest and not wanted[pair_splat[nearest]]:
-        nearest += 1
-    for j in range(begin + deepest - 1, nearest - 1, -1):
-        i = pair_splat[j]
-        mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
-        precision_x, shear, precision_y = projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y]
-        qx, qy = np.float32(-0.5) * LOG2E * precision_x, np.float32(-0.5) * LOG2E * precision_y
-        opacity = projected[i, OPACITY]
-        red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
-        first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
-        order = np.float32(j - begin + 1)
-        for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
-            dy = s[Y + p] - mean_y
-            dx = s[X + p] - mean_x - shear * dy
-            power = qx * dx * dx + qy * dy * dy
-            raw = opacity * _exp2(power)
-            a = min(ALPHA_MAX, raw)
-            a = a if (a >= ALPHA_MIN) and (order <= s[LAST + p]) else np.float32(0.0)
-            ra = np.float32(1.0) / (np.float32(1.0) - a)
-            t = s[p] * ra
-            weight = a * t
-            along = red * s[V_RED + p] + green * s[V_GREEN + p] + blue * s[V_BLUE + p]
-            v_a = t * along - ra * s[BEHIND + p]
-            s[p] = t
-            s[BEHIND + p] += weight * along
-            s[WEIGHT + p] = weight
-            # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
-            s[PULL + p] = a * v_a if raw < ALPHA_MAX else np.float32(0.0)
-        if not wanted[i]:
-            continue  # a frozen splat only has to be stepped through, in the very same arithmetic
-        g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
-        for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
-            dy = s[Y + p] - mean_y
-            dx = s[X + p] - mean_x - shear * dy
-            g, weight = s[PULL + p], s[WEIGHT + p]
-            g0 += g
-            gx += g * dx
-            gy += g * dy
-            gxx += g * dx * dx
-            gxy += g * dx * dy
-            gyy += g * dy * dy
-            gr += weight * s[V_RED + p]
-            gg += weight * s[V_GREEN + p]
-            gb += weight * s[V_BLUE + p]
-        slot = pair_slot[j]
-        grads[slot, MEAN_X] = precision_x * gx
-        grads[slot, MEAN_Y] = precision_y * gy - shear * precision_x * gx
-        grads[slot, PRECISION_X] = np.float32(-0.5) * gxx
-        grads[slot, SHEAR] = precision_x * gxy
-        grads[slot, PRECISION_Y] = np.float32(-0.5) * gyy
-        grads[slot, OPACITY] = g0 / opacity
-        grads[slot, RED] = gr
-        grads[slot, GREEN] = gg
-        grads[slot, BLUE] = gb
+    s = np.empty(STATE, np.float32)
+    for k in range(first_tile, past_tile):
+        tile = tiles[k]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        x0, y0 = np.float32(left), np.float32(top)
+        s[:] = np.float32(0.0)
+        deepest = 0
+        for p in range(np.uint64(PIXELS)):
+            s[p] = np.float32(1.0)
+            s[X + p] = np.float32(np.int64(p) % TILE) + np.float32(0.5)
+            s[Y + p] = np.float32(np.int64(p) // TILE) + np.float32(0.5)
+        for row in range(min(TILE, height - top)):
+            for column in range(min(TILE, width - left)):
+                p, y, x = np.uint64(row * TILE + column), top + row, left + column
+                t = transmittance[y, x]
+                s[p] = t
+                vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
+                behind = background[0] * vr + background[1] * vg + background[2] * vb
+                s[BEHIND + p] = t * (behind + v_transmittance[y, x])
+                s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
+                s[LAST + p] = np.float32(last[y, x])
+                deepest = max(deepest, last[y, x])
+        begin = start[tile]
+        for j in range(begin + deepest, start[tile + 1]):
+            slot = pair_slot[j]
+            for c in range(PROJECTED):
+                grads[slot, c] = np.float32(0.0)
+        nearest = begin  # nothing in front of the first wanted pair needs to be walked
+        while nearest < begin + deepest and not wanted[pair_splat[nearest]]:
+            nearest += 1
+        for j in range(begin + deepest - 1, nearest - 1, -1):
+            i = pair_splat[j]
+            mean_x, mean_y = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
+            precision_x, shear, precision_y = projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y]
+            qx, qy = np.float32(-0.5) * LOG2E * precision_x, np.float32(-0.5) * LOG2E * precision_y
+            opacity = projected[i, OPACITY]
+            red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
+            first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
+            order = np.float32(j - begin + 1)
+            for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
+                dy = s[Y + p] - mean_y
+                dx = s[X + p] - mean_x - shear * dy
+                power = qx * dx * dx + qy * dy * dy
+                raw = opacity * _exp2(power)
+                a = min(ALPHA_MAX, raw)
+                a = a if (a >= ALPHA_MIN) and (order <= s[LAST + p]) else np.float32(0.0)
+                ra = np.float32(1.0) / (np.float32(1.0) - a)
+                t = s[p] * ra
+                weight = a * t
+                along = red * s[V_RED + p] + green * s[V_GREEN + p] + blue * s[V_BLUE + p]
+                v_a = t * along - ra * s[BEHIND + p]
+                s[p] = t
+                s[BEHIND + p] += weight * along
+                s[WEIGHT + p] = weight
+                # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
+                s[PULL + p] = a * v_a if raw < ALPHA_MAX else np.float32(0.0)
+            if not wanted[i]:
+                continue  # a frozen splat only has to be stepped through, in the very same arithmetic
+            g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
+            for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
+                dy = s[Y + p] - mean_y
+                dx = s[X + p] - mean_x - shear * dy
+                g, weight = s[PULL + p], s[WEIGHT + p]
+                g0 += g
+                gx += g * dx
+                gy += g * dy
+                gxx += g * dx * dx
+                gxy += g * dx * dy
+                gyy += g * dy * dy
+                gr += weight * s[V_RED + p]
+                gg += weight * s[V_GREEN + p]
+                gb += weight * s[V_BLUE + p]
+            slot = pair_slot[j]
+            grads[slot, MEAN_X] = precision_x * gx
+            grads[slot, MEAN_Y] = precision_y * gy - shear * precision_x * gx
+            grads[slot, PRECISION_X] = np.float32(-0.5) * gxx
+            grads[slot, SHEAR] = precision_x * gxy
+            grads[slot, PRECISION_Y] = np.float32(-0.5) * gyy
+            grads[slot, OPACITY] = g0 / opacity
+            grads[slot, RED] = gr
+            grads[slot, GREEN] = gg
+            grads[slot, BLUE] = gb

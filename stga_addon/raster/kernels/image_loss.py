@@ -6,9 +6,9 @@ maps never reach main memory.
 """
 
 import numpy as np
-from numba import prange
 
-from . import inline_jit, parallel_jit, part_jit
+from . import inline_jit, jit, part_jit
+from .threads import parallel
 
 RADIUS = 5
 REACH = 2 * RADIUS
@@ -68,121 +68,116 @@ def _blur_column(ring, plane, stride, row, out, at, count):
         )
 
 
-@parallel_jit
-def image_loss(image, target, rectangles, ssim_weight, scale, gradient, sums):
+@parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
+@jit
+def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
     1 / (3·H·W). Reads the image up to REACH pixels around a rectangle. Writes gradient (3, H, W) and, per rectangle,
     sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
     """
-    # A function of its own, because Numba takes far longer to compile it inside a parallel loop.
-    for job in prange(len(rectangles) * 3):
-        _sweep(np.int64(job), image, target, rectangles, ssim_weight, scale, gradient, sums)
-
-
-@part_jit
-def _sweep(job, image, target, rectangles, ssim_weight, scale, gradient, sums):
-    """One channel of one rectangle: row by row, the gradient ten rows behind."""
     height, width = image.shape[1], image.shape[2]
-    r, c = job // 3, job % 3
-    x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
-    # Columns [left, right) hold everything that matters; each row buffer is padded by RADIUS zeros.
-    left, right = max(0, x0 - REACH), min(width, x1 + REACH)
-    span = right - left
-    stride = span + 2 * RADIUS
-    wanted = np.zeros(RING * stride, np.float32)  # the target's last rows, as floats
-    source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
-    first = np.zeros(4 * RING * stride, np.float32)
-    moments = np.zeros(4 * stride, np.float32)
-    slopes = np.zeros(3 * stride, np.float32)
-    second = np.zeros(3 * RING * stride, np.float32)
-    blurred = np.zeros(3 * stride, np.float32)
-    difference, similarity = 0.0, 0.0
-    for row in range(y0 - REACH, y1 + REACH):
-        # 1. horizontal blur of this row's four values
-        inside = 0 <= row < height
-        if inside:
-            keep = (row % RING) * stride
-            for n in range(span):
-                wanted[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
-            for n in range(np.uint64(span)):
-                x, y = image[c, row, np.uint64(left) + n], wanted[np.uint64(keep) + n]
-                source[np.uint64(RADIUS) + n] = x
-                source[np.uint64(stride + RADIUS) + n] = y
-                source[np.uint64(2 * stride + RADIUS) + n] = x * x + y * y
-                source[np.uint64(3 * stride + RADIUS) + n] = x * y
-        for plane in range(4):
-            into = (plane * RING + row % RING) * stride
+    for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
+        r, c = job // 3, job % 3
+        x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
+        # Columns [left, right) hold everything that matters; each row buffer is padded by RADIUS zeros.
+        left, right = max(0, x0 - REACH), min(width, x1 + REACH)
+        span = right - left
+        stride = span + 2 * RADIUS
+        wanted = np.zeros(RING * stride, np.float32)  # the target's last rows, as floats
+        source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
+        first = np.zeros(4 * RING * stride, np.float32)
+        moments = np.zeros(4 * stride, np.float32)
+        slopes = np.zeros(3 * stride, np.float32)
+        second = np.zeros(3 * RING * stride, np.float32)
+        blurred = np.zeros(3 * stride, np.float32)
+        difference, similarity = 0.0, 0.0
+        for row in range(y0 - REACH, y1 + REACH):
+            # 1. horizontal blur of this row's four values
+            inside = 0 <= row < height
             if inside:
-                _blur_row(source, plane * stride, first, into, span)
-            else:
-                first[into : into + span] = ZERO
-        # 2. SSIM of the row five above, and its slopes blurred horizontally
-        middle = row - RADIUS
-        if middle < y0 - RADIUS:
-            continue
-        inside = 0 <= middle < height
-        if inside:
+                keep = (row % RING) * stride
+                for n in range(span):
+                    wanted[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
+                for n in range(np.uint64(span)):
+                    x, y = image[c, row, np.uint64(left) + n], wanted[np.uint64(keep) + n]
+                    source[np.uint64(RADIUS) + n] = x
+                    source[np.uint64(stride + RADIUS) + n] = y
+                    source[np.uint64(2 * stride + RADIUS) + n] = x * x + y * y
+                    source[np.uint64(3 * stride + RADIUS) + n] = x * y
             for plane in range(4):
-                _blur_column(first, plane, stride, middle, moments, plane * stride, span)
-            counted = y0 <= middle < y1
-            total = ZERO
-            for n in range(np.uint64(span)):
-                mx, my = moments[n], moments[np.uint64(stride) + n]
-                squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
-                mxy, mm = mx * my, mx * mx + my * my
-                # Differences of blurred squares: in bright, flat images rounding makes the variances negative and
-                # the covariance larger than their mean, which it can never be.
-                variance = max(ZERO, squares - mm)
-                covariance = min(variance, max(-variance, TWO * (product - mxy)))
-                over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
-                luminance, structure = (TWO * mxy + C1) * over_d, (covariance + C2) * over_e
-                ssim = luminance * structure
-                # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
-                by_product = TWO * luminance * over_e
-                by_squares = -ssim * over_e
-                by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
-                slopes[np.uint64(RADIUS) + n] = by_mean
-                slopes[np.uint64(stride + RADIUS) + n] = by_squares
-                slopes[np.uint64(2 * stride + RADIUS) + n] = by_product
-                held = (n + np.uint64(left) >= np.uint64(x0)) and (n + np.uint64(left) < np.uint64(x1))
-                total += ssim if held else ZERO
-            if counted:
-                similarity += total
-        for plane in range(3):
-            into = (plane * RING + middle % RING) * stride
+                into = (plane * RING + row % RING) * stride
+                if inside:
+                    _blur_row(source, plane * stride, first, into, span)
+                else:
+                    first[into : into + span] = ZERO
+            # 2. SSIM of the row five above, and its slopes blurred horizontally
+            middle = row - RADIUS
+            if middle < y0 - RADIUS:
+                continue
+            inside = 0 <= middle < height
             if inside:
-                _blur_row(slopes, plane * stride, second, into, span)
-            else:
-                second[into : into + span] = ZERO
-        # 3. gradient of the row five above that
-        out = middle - RADIUS
-        if out < y0 or out >= y1 or out < 0 or out >= height:
-            continue
-        for plane in range(3):
-            _blur_column(second, plane, stride, out, blurred, plane * stride, span)
-        absolute = ZERO
-        keep = (out % RING) * stride
-        for n in range(np.uint64(x0 - left), np.uint64(x1 - left)):
-            x, y = image[c, out, np.uint64(left) + n], wanted[np.uint64(keep) + n]
-            sign = ONE if x > y else (-ONE if x < y else ZERO)
-            absolute += abs(x - y)
-            slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
-            gradient[c, out, np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
-        difference += absolute
-    sums[job, 0] = difference
-    sums[job, 1] = similarity
+                for plane in range(4):
+                    _blur_column(first, plane, stride, middle, moments, plane * stride, span)
+                counted = y0 <= middle < y1
+                total = ZERO
+                for n in range(np.uint64(span)):
+                    mx, my = moments[n], moments[np.uint64(stride) + n]
+                    squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
+                    mxy, mm = mx * my, mx * mx + my * my
+                    # Differences of blurred squares: in bright, flat images rounding makes the variances negative and
+                    # the covariance larger than their mean, which it can never be.
+                    variance = max(ZERO, squares - mm)
+                    covariance = min(variance, max(-variance, TWO * (product - mxy)))
+                    over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
+                    luminance, structure = (TWO * mxy + C1) * over_d, (covariance + C2) * over_e
+                    ssim = luminance * structure
+                    # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
+                    by_product = TWO * luminance * over_e
+                    by_squares = -ssim * over_e
+                    by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
+                    slopes[np.uint64(RADIUS) + n] = by_mean
+                    slopes[np.uint64(stride + RADIUS) + n] = by_squares
+                    slopes[np.uint64(2 * stride + RADIUS) + n] = by_product
+                    held = (n + np.uint64(left) >= np.uint64(x0)) and (n + np.uint64(left) < np.uint64(x1))
+                    total += ssim if held else ZERO
+                if counted:
+                    similarity += total
+            for plane in range(3):
+                into = (plane * RING + middle % RING) * stride
+                if inside:
+                    _blur_row(slopes, plane * stride, second, into, span)
+                else:
+                    second[into : into + span] = ZERO
+            # 3. gradient of the row five above that
+            out = middle - RADIUS
+            if out < y0 or out >= y1 or out < 0 or out >= height:
+                continue
+            for plane in range(3):
+                _blur_column(second, plane, stride, out, blurred, plane * stride, span)
+            absolute = ZERO
+            keep = (out % RING) * stride
+            for n in range(np.uint64(x0 - left), np.uint64(x1 - left)):
+                x, y = image[c, out, np.uint64(left) + n], wanted[np.uint64(keep) + n]
+                sign = ONE if x > y else (-ONE if x < y else ZERO)
+                absolute += abs(x - y)
+                slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
+                gradient[c, out, np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+            difference += absolute
+        sums[job, 0] = difference
+        sums[job, 1] = similarity
 
 
-@parallel_jit
-def change_background(image, mask, before, after, out):
+@parallel(lambda image, *_: len(image))
+@jit
+def change_background(first_row, past_row, image, mask, before, after, out):
     """Write image (H, W, 3) uint8, composited over the colour `before`, as it looks over `after`.
 
     mask (H, W) uint8: the foreground's coverage; before, after (3,) float32 in 0…255; out as image.
     image = coverage · foreground + (1 − coverage) · before, so only the second term has to be exchanged.
     """
-    for y in prange(image.shape[0]):
+    for y in range(first_row, past_row):
         for x in range(image.shape[1]):
             clear = np.float32(255 - mask[y, x]) * np.float32(1 / 255)
             for c in range(3):

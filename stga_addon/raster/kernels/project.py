@@ -7,9 +7,8 @@ world's origin loses nothing to float32, and embedded and world-space splats tak
 import math
 
 import numpy as np
-from numba import prange
 
-from . import parallel_jit, part_jit
+from . import jit, part_jit
 from .blend import (
     BLUE,
     GREEN,
@@ -23,13 +22,12 @@ from .blend import (
     SHEAR,
     TILE,
 )
+from .threads import parallel
 
 LOW_PASS = np.float32(0.3)
 """Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
 NEAR = np.float32(0.01)
 LIFT = np.float32(2.0**90)
-CHUNK = 256
-"""Splats that a thread takes at a time."""
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 SH = np.array(
     [
@@ -115,12 +113,14 @@ def _basis_gradient(degree, x, y, z, w):
     return gx, gy, gz
 
 
-@parallel_jit
+@parallel(lambda xyz, *_: len(xyz))
+@jit
 def project_forward(
+    begin, end,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
     depth_as_colour, antialiased, projected, depth, extent_y, rect,
 ):  # fmt: skip
-    """Project N embedded splats.
+    """Project N embedded splats, those in [begin, end).
 
     xyz, rotation (wxyz), log_scale, opacity (logit), sh (N, K, 3), strain_color (N, S, 3), face: as in `Splats`;
     `degree` ≤ the stored.
@@ -133,21 +133,6 @@ def project_forward(
     tile bounds x0, y0, x1, y1: all 0 for a splat that cannot be seen, all −1 for one that is not finite or would be
     wider than float32 can square (some 1e9 pixels).
     """
-    # The loop's body is a function of its own, because Numba takes twice as long to compile it inside a parallel one.
-    for block in prange((len(xyz) + CHUNK - 1) // CHUNK):
-        _project_rows(
-            block * CHUNK, min(len(xyz), (block + 1) * CHUNK),
-            xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens,
-            size, depth_as_colour, antialiased, projected, depth, extent_y, rect,
-        )  # fmt: skip
-
-
-@part_jit
-def _project_rows(
-    begin, end,
-    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, depth, extent_y, rect,
-):  # fmt: skip
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     width, height = size[0], size[1]
@@ -263,8 +248,10 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
     )  # fmt: skip
 
 
-@parallel_jit
+@parallel(lambda *arguments: len(arguments[17]))  # visible
+@jit
 def project_backward(
+    begin, end,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
     depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
     v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
@@ -275,22 +262,6 @@ def project_backward(
     lie in grads (P, 9). screen (N,): length of the gradient with respect to the projected centre in units of half the
     image (what density control asks for), written for each listed splat.
     """
-    for block in prange((len(visible) + CHUNK - 1) // CHUNK):
-        _differentiate_rows(
-            block * CHUNK, min(len(visible), (block + 1) * CHUNK),
-            xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens,
-            size, depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
-            v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
-        )  # fmt: skip
-
-
-@part_jit
-def _differentiate_rows(
-    begin, end,
-    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
-    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
-):  # fmt: skip
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])

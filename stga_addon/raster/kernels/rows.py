@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import prange
 
-from . import jit, parallel_jit, part_jit
+from . import jit, part_jit
+from .threads import parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 CHUNK = 256
@@ -13,19 +13,20 @@ LARGEST = np.float32(1e18)
 """A gradient beyond this counts as broken: its square would make the second moment infinite, and the row NaN."""
 
 
-@parallel_jit
-def adam_rows(rows, steps, parameters, gradients, firsts, seconds, rates, beta1, beta2, epsilon):
+@parallel(lambda rows, *_: len(rows))
+@jit
+def adam_rows(first_row, past_row, rows, steps, parameters, gradients, firsts, seconds, rates, beta1, beta2, epsilon):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
     parameters, gradients, firsts, seconds: equally long tuples of (N, D) arrays; steps (N,) int32; rates (P, max D):
     learning rate by parameter and column. Rows that are not listed are not touched: neither parameters, moments nor
     count. A row whose gradient is not finite, or beyond LARGEST, keeps that parameter and its moments.
-    All parameters in one parallel loop: on a busy machine every further one waits for its slowest thread.
+    All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
-    for block in prange((len(rows) + CHUNK - 1) // CHUNK):
-        begin, end = block * CHUNK, min(len(rows), (block + 1) * CHUNK)
-        correct1, correct2 = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    correct1, correct2 = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    for begin in range(first_row, past_row, CHUNK):
+        end = min(past_row, begin + CHUNK)
         for n in range(begin, end):
             steps[rows[n]] += 1
             count = np.float64(steps[rows[n]])

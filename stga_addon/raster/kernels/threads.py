@@ -1,0 +1,105 @@
+"""Kernels on several threads: they release Python's lock, so Python's own threads do.
+
+Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image loss), hold the lock
+while they run, so that Blender's window waits for a picture drawn in its background, and crash where two threads call
+them at once.
+"""
+
+import os
+from collections.abc import Callable
+from functools import wraps
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any
+
+PIECES = 4
+"""Pieces of work a thread: what one thread is late with, another takes over."""
+
+_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
+_waiting = 0
+"""Threads that were started to take from `_tasks`."""
+
+
+def threads() -> int:
+    """How many threads a kernel runs on: by default, as many as this process may use processors."""
+    return _threads
+
+
+def set_threads(count: int) -> None:
+    """Run kernels on `count` threads from now on, at least one."""
+    global _threads
+    _threads = max(1, count)
+
+
+def parallel(units: Callable[..., int], pieces: int = PIECES) -> Callable[[Any], Callable[..., None]]:
+    """Make kernel(begin, end, *arguments) a function of the arguments alone that runs on all threads.
+
+    units: how many units of work the arguments hold; a kernel must do [begin, end) of them whatever the others do, and
+    write what no other unit writes, so that results do not depend on the threads. pieces: a thread, of equal length.
+    """
+
+    def decorate(kernel: Any) -> Callable[..., None]:
+        @wraps(kernel)
+        def call(*arguments: Any) -> None:
+            _run(kernel, units(*arguments), pieces, arguments)
+
+        return call
+
+    return decorate
+
+
+def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> None:
+    if _threads == 1:
+        kernel(0, units, *arguments)
+        return
+    size = max(1, -(-units // (pieces * _threads)))
+    begins = iter(range(0, units, size))  # shared: under Python's lock, each piece is taken once
+    finished: SimpleQueue[BaseException | None] = SimpleQueue()
+
+    def work() -> None:
+        for begin in begins:
+            kernel(begin, min(begin + size, units), *arguments)
+
+    def help_out() -> None:
+        try:
+            work()
+        except BaseException as error:  # belongs to the caller, who must not wait for ever
+            finished.put(error)
+        else:
+            finished.put(None)
+
+    helpers = min(_threads, -(-units // size)) - 1
+    _start(helpers)
+    for _ in range(helpers):
+        _tasks.put(help_out)
+    try:
+        work()
+    finally:
+        errors = [finished.get() for _ in range(helpers)]
+    for error in errors:
+        if error is not None:
+            raise error
+
+
+def _start(count: int) -> None:
+    """Have at least `count` threads waiting for work."""
+    global _waiting
+    while _waiting < count:
+        _waiting += 1
+        Thread(target=_serve, name="stga kernels", daemon=True).start()
+
+
+def _serve() -> None:
+    while True:
+        _tasks.get()()
+
+
+def _after_fork() -> None:
+    """A forked process has none of its parent's threads."""
+    global _tasks, _waiting
+    _tasks, _waiting = SimpleQueue(), 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
