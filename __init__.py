@@ -9,10 +9,10 @@ def register() -> None:
     """Register everything or nothing. Nothing is imported before Blender asks: this file also lies beside the tests."""
     from . import operators
     from .operators import command_line, render_engine
-    from .ui import panel, preferences, properties
+    from .ui import curve, panel, preferences, properties
 
     with ExitStack() as done:
-        for part in (properties, preferences, operators, render_engine, panel, command_line):
+        for part in (properties, preferences, operators, render_engine, curve, panel, command_line):
             part.register()
             done.callback(part.unregister)
         _registered.enter_context(done.pop_all())

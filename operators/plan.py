@@ -103,7 +103,7 @@ def _show(scene: Any, process: "subprocess.Popen[str]") -> None:
     said, mistakes = process.communicate()
     if process.returncode:
         lines = mistakes.strip().splitlines() or ["the worker ended without a word"]
-        chosen.plan_error = lines[-1].removeprefix("stga: ")
+        chosen.plan_error = lines[-1].removeprefix("stga: ").removeprefix("--effect ")
         return
     chosen.plan_error = ""
     chosen.effects.clear()

@@ -7,7 +7,7 @@ import bpy
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.materials import TRANSPARENT_BOUNCES, view_transform_hint
-from ..stga_addon.scene.splats import Attributes, show_avatar
+from ..stga_addon.scene.splats import Prepared, show_avatar
 from . import ids
 from .common import file_path, head_of, needs_head, reporting, settings
 
@@ -51,13 +51,13 @@ class ShowAvatar(bpy.types.Operator):
 
 
 def show(
-    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, attributes: Attributes | None = None
+    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, prepared: Prepared | None = None
 ) -> Any:
     """Show the avatar on the head; the splat object becomes the one that the scene's panel works on.
 
-    attributes: as `show_avatar` takes them.
+    prepared: as `show_avatar` takes it.
     """
-    shown = show_avatar(avatar, head, name, attributes)
+    shown = show_avatar(avatar, head, name, prepared)
     if hide_head:
         head.hide_render = True
         for layer in scene.view_layers:

@@ -14,7 +14,6 @@ from ..stga_addon.runtime import missing_here
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.groups import painted_selection
-from ..stga_addon.scene.nodes import splat_tree
 from ..stga_addon.training.plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
 from . import ids, watch
@@ -101,8 +100,7 @@ class Train(bpy.types.Operator):
         waits = self.wait or bpy.app.background
         here = waits and not self.python and not missing_here()
         python = "" if here else training_python(context, self.python)
-        job = self._job(head)
-        write_job(run, job, painted_selection(head))
+        write_job(run, self._job(head), painted_selection(head))
         if here:
             watch.set_job(context.scene, run)
             avatar = _work_here(context, run)
@@ -111,7 +109,6 @@ class Train(bpy.types.Operator):
             watch.set_job(context.scene, run)
             watch.started(folder_of(run), process)
             if not waits:
-                _prepare_display(job)
                 return {"FINISHED"}
             avatar = _wait(run, process)
         settings(context).avatar = str(avatar)
@@ -178,12 +175,6 @@ class DismissTraining(bpy.types.Operator):
         watch.forget(folder)
         watch.set_job(context.scene, None)
         return {"FINISHED"}
-
-
-def _prepare_display(job: Job) -> None:
-    """Build the splats' node tree, which takes a moment: now, while that is expected, and not at the first preview."""
-    if job.settings is not None:
-        splat_tree(job.settings.convention, job.settings.sh_degree, job.settings.strain_color)
 
 
 def _work_here(context: Any, run: Path) -> Path:

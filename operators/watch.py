@@ -13,13 +13,15 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.job import PREVIEW, folder_of
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.splats import Attributes, avatar_attributes, can_refresh, check_head, refresh
+from ..stga_addon.scene.splats import Prepared, build_slice, can_refresh, check_head, prepare, refresh
 from ..stga_addon.task import Snapshot, State
 from . import ids
 from .common import is_head
 from .show import show
 
 INTERVAL_S = 0.5
+SLICE_S = 0.02
+"""Until what was begun goes on: Blender never stands still for long, and not at all while nothing is to be shown."""
 
 _snapshots: dict[Path, Snapshot] = {}
 _processes: dict[Path, "Popen[bytes]"] = {}
@@ -82,9 +84,10 @@ def set_job(scene: Any, run: Path | None) -> None:
 
 def tick() -> float | None:
     """Read what is new; what a bpy.app.timers function answers."""
-    jobs = [_follow_job(scene) for scene in bpy.data.scenes if scene.library is None]
-    others = [_look(folder).state.is_alive for folder, last in list(_snapshots.items()) if last.state.is_alive]
-    return INTERVAL_S if any(jobs + others) else None
+    waits = [_follow_job(scene) for scene in bpy.data.scenes if scene.library is None]
+    for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive]:
+        waits.append(INTERVAL_S if _look(folder).state.is_alive else None)
+    return min((wait for wait in waits if wait is not None), default=None)
 
 
 def _look(folder: Path) -> Snapshot:
@@ -95,12 +98,12 @@ def _look(folder: Path) -> Snapshot:
     return now
 
 
-def _follow_job(scene: Any) -> bool:
-    """Bring the scene up to its job; whether there is more to come."""
+def _follow_job(scene: Any) -> float | None:
+    """Bring the scene up to its job; seconds until there may be more to do, None where nothing is to come."""
     chosen = getattr(scene, ids.SETTINGS)
     job = chosen.job or _jobs.get(scene.session_uid, "")
     if not job:
-        return False
+        return None
     if chosen.job != job:
         chosen.job = job
     _jobs[scene.session_uid] = job
@@ -108,45 +111,60 @@ def _follow_job(scene: Any) -> bool:
     assert run is not None
     state = _look(folder_of(run)).state
     if state.is_alive:
-        if chosen.live_preview:
-            _show(scene, folder_of(run) / PREVIEW)
-        return True
+        wait = _show(scene, folder_of(run) / PREVIEW) if chosen.live_preview else None
+        return INTERVAL_S if wait is None else wait
     if state not in (State.FINISHED, State.CANCELLED) or chosen.job_ended:
-        return False
+        return None
     chosen.avatar = str(run / "avatar.npz")
-    chosen.job_ended = not chosen.show_result or _show(scene, run / "avatar.npz")
-    return not chosen.job_ended
+    wait = _show(scene, run / "avatar.npz") if chosen.show_result else None
+    chosen.job_ended = wait is None
+    return wait
 
 
-def _show(scene: Any, path: Path) -> bool:
-    """Show the avatar file on the scene's head once a thread has read it; whether that is done, or cannot be."""
+def _show(scene: Any, path: Path) -> float | None:
+    """Show the avatar file on the scene's head once a thread has read it; a slice at a time.
+
+    Returns seconds until it should be called again; None where the file is shown, or cannot be.
+    """
     chosen = getattr(scene, ids.SETTINGS)
     shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == chosen.job), None)
     if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
-        return False  # neither bears a mesh that changes meanwhile
+        return INTERVAL_S  # neither bears a mesh that changes meanwhile
     try:
         read = _reader.poll(path)
         if read is None:
-            return False
-        if is_head(chosen.head):
-            _present(scene, shown, *read)
+            return INTERVAL_S
+        if is_head(chosen.head) and _present(scene, shown, *read):
+            return SLICE_S
     except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, say where the head is linked
         print(f"stga: {error}")
-    return True
+    _reader.take(path)
+    return None
 
 
-def _present(scene: Any, shown: Any, avatar: Avatar, attributes: Attributes) -> None:
-    """Show the avatar in the object that already shows this job's splats, or in a new one."""
+def _present(scene: Any, shown: Any, avatar: Avatar, prepared: Prepared) -> bool:
+    """Show the avatar in the object that already shows this job's splats, or in a new one; whether there is more to do.
+
+    A new one comes in slices, each call does one.
+    """
     chosen = getattr(scene, ids.SETTINGS)
     check_head(avatar, chosen.head)
     if shown is not None and can_refresh(shown, avatar):
-        refresh(shown, attributes)
-        return
+        refresh(shown, prepared)
+        return False
+    if build_slice(avatar):
+        return True
     if shown is not None:
         bpy.data.objects.remove(shown)
     name = f"{chosen.head.name} {Path(chosen.job).name}"
-    shown = show(scene, avatar, chosen.head, name, attributes=attributes)
+    shown = show(scene, avatar, chosen.head, name, prepared=prepared)
     shown[tags.RUN] = chosen.job
+    if not bpy.app.background:
+        bpy.app.timers.register(_push_undo, first_interval=SLICE_S)  # saving the scene's state takes a slice as well
+    return False
+
+
+def _push_undo() -> None:
     if bpy.ops.ed.undo_push.poll():
         bpy.ops.ed.undo_push(message="Show Training")
 
@@ -156,20 +174,17 @@ class _Reader:
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._coming: dict[Path, Future[tuple[Avatar, Attributes]]] = {}
+        self._coming: dict[Path, Future[tuple[Avatar, Prepared]]] = {}
         self._stamps: dict[Path, tuple[int, int]] = {}
 
-    def poll(self, path: Path) -> tuple[Avatar, Attributes] | None:
-        """What has been read since the last call; None where there is nothing new, or not yet.
+    def poll(self, path: Path) -> tuple[Avatar, Prepared] | None:
+        """What has been read and not been taken; None where there is nothing new, or not yet.
 
         Raises StgaError where the file cannot be read.
         """
         coming = self._coming.get(path)
         if coming is not None:
-            if not coming.done():
-                return None
-            del self._coming[path]
-            return coming.result()
+            return coming.result() if coming.done() else None
         try:
             found = path.stat()
         except OSError as error:
@@ -183,6 +198,10 @@ class _Reader:
             self._coming[path] = self._pool.submit(_read, path)
         return None
 
+    def take(self, path: Path) -> None:
+        """What was read is shown, or never will be: read again once the file has changed."""
+        self._coming.pop(path, None)
+
     def close(self) -> None:
         if self._pool is not None:
             self._pool.shutdown()
@@ -192,9 +211,9 @@ class _Reader:
 _reader = _Reader()
 
 
-def _read(path: Path) -> tuple[Avatar, Attributes]:
+def _read(path: Path) -> tuple[Avatar, Prepared]:
     avatar = read_avatar(path)
-    return avatar, avatar_attributes(avatar)
+    return avatar, prepare(avatar)
 
 
 def _redraw() -> None:
@@ -218,8 +237,9 @@ def register() -> None:
 
 def unregister() -> None:
     bpy.app.handlers.load_post.remove(_after_load)
-    if bpy.app.timers.is_registered(tick):
-        bpy.app.timers.unregister(tick)
+    for timer in (tick, _push_undo):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
     _reader.close()
     for known in (_snapshots, _processes, _jobs):
         known.clear()

@@ -1,6 +1,5 @@
 """The plan below the Train step: each effect, what was decided, and why."""
 
-import textwrap
 from typing import Any, ClassVar
 
 import bpy
@@ -9,9 +8,7 @@ from ..operators import ids
 from ..operators.common import settings
 from ..operators.plan import is_looking
 from .step import Step
-
-COLUMNS = 44
-"""Letters in a line of a sidebar of usual width."""
+from .text import draw_text
 
 
 class EffectsPanel(Step, bpy.types.Panel):
@@ -24,16 +21,17 @@ class EffectsPanel(Step, bpy.types.Panel):
         layout, chosen = self.layout, settings(context)
         looking = is_looking(context.scene)
         layout.operator(ids.PLAN_EFFECTS, text="Looking…" if looking else "Look at Capture", icon="VIEWZOOM")
-        for line in textwrap.wrap(chosen.plan_error, COLUMNS):
-            layout.label(text=line, icon="ERROR" if chosen.plan_error.startswith(line) else "BLANK1")
+        if chosen.plan_error:
+            draw_text(layout, context, chosen.plan_error, "ERROR")
         for row in chosen.effects:
-            self._draw_effect(row)
+            self._draw_effect(context, row)
 
-    def _draw_effect(self, row: Any) -> None:
+    def _draw_effect(self, context: Any, row: Any) -> None:
         box = self.layout.column(align=True)
         split = box.split(factor=0.6)
-        split.label(text=row.name, icon="CHECKBOX_HLT" if row.on else "CHECKBOX_DEHLT")
+        split.label(text=row.name.replace("-", " ").capitalize(), icon="CHECKMARK" if row.on else "REMOVE")
         split.prop(row, "choice", text="")
+        reasons = box.column(align=True)
+        reasons.active = False
         for text in (row.reason, f"costs {row.cost}" if row.on else ""):
-            for line in textwrap.wrap(text, COLUMNS):
-                box.label(text=line, icon="BLANK1")
+            draw_text(reasons, context, text, "BLANK1")

@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from ..operators import ids
+from .text import columns, draw_text
 
 
 def draw_mishap(layout: Any, context: Any, sentence: str, tail: Sequence[str], folder: Path | None) -> None:
     """Draw the sentence, wrapped, and below it the log's last lines; `folder` is the worker's, None without one."""
-    # Blender does not wrap labels; a character is about seven pixels wide.
-    width = max(20, int(context.region.width / (7 * context.preferences.system.ui_scale)) - 4)
-    column = layout.column(align=True)
-    for line in textwrap.wrap(sentence, width):
-        column.label(text=line)
+    draw_text(layout, context, sentence)
+    width = columns(context)
     log = layout.column(align=True)
     log.active = False
     for line in tail:

@@ -12,9 +12,11 @@ from ..operators.runtime import has_runtime
 from ..stga_addon.job import describe, folder_of
 from ..stga_addon.task import Snapshot, State
 from ..stga_addon.training.forecast import clock
+from .curve import draw_curve
 from .mishap import draw_mishap
 from .properties import seconds_of_presets
 from .step import Step
+from .text import draw_text
 
 
 class TrainPanel(Step, bpy.types.Panel):
@@ -25,7 +27,7 @@ class TrainPanel(Step, bpy.types.Panel):
         run = watch.run_of(context.scene)
         now = watch.snapshot_of(context.scene)
         if now.state.is_alive:
-            _draw_progress(self.layout, context, now)
+            _draw_progress(self.layout, context, run, now)
             return
         if run is not None:
             _draw_end(self.layout, context, run, now)
@@ -34,11 +36,11 @@ class TrainPanel(Step, bpy.types.Panel):
 
 def _draw_choices(layout: Any, context: Any) -> None:
     chosen = settings(context)
-    layout.prop(chosen, "run_folder")
+    layout.prop(chosen, "run_folder", text="Folder")
     layout.prop(chosen, "preset")
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
     if times:
-        layout.label(text=f"Here: {times}", icon="TIME")
+        draw_text(layout, context, f"On this machine: {times}", "TIME")
     layout.prop(chosen, "minutes")
     layout.prop(chosen, "strategy")
     layout.prop(chosen, "show_result")
@@ -53,14 +55,14 @@ def _draw_choices(layout: Any, context: Any) -> None:
         layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()
 
 
-def _draw_progress(layout: Any, context: Any, now: Snapshot) -> None:
+def _draw_progress(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
     status = now.status
     text = {State.STARTING: "starting", State.CANCELLING: "cancelling"}.get(now.state, status.message)
     layout.progress(factor=status.share, text=f"{100 * status.share:.0f} %  {text}")
     column = layout.column(align=True)
     for line in (*describe(status.figures), status.remark):
-        if line:
-            column.label(text=line)
+        draw_text(column, context, line)
+    draw_curve(layout, run)
     layout.prop(settings(context), "live_preview")
     layout.prop(settings(context), "show_result")
     layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
@@ -79,5 +81,6 @@ def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
         done = {State.FINISHED: "Trained", State.CANCELLED: "Cancelled, avatar kept"}[now.state]
         row.label(text=done, icon="CHECKMARK")
         for line in describe(now.status.figures)[1:]:
-            box.label(text=line)
+            draw_text(box, context, line)
+        draw_curve(box, run)
     row.operator(ids.DISMISS_TRAINING, text="", icon="X", emboss=False)

@@ -1,8 +1,69 @@
-"""A short hand for writing node trees."""
+"""A short hand for writing node trees, and for making them of small parts."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import bpy
+
+from .. import __version__
+
+_MADE_BY = "stga_version"
+
+
+def new_tree(name: str) -> bpy.types.NodeTree:
+    """An empty geometry node tree that `made_tree` finds again."""
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    tree[_MADE_BY] = __version__
+    return tree
+
+
+def made_tree(name: str) -> bpy.types.NodeTree | None:
+    """The tree of this name that this version of the add-on made, or None: what another version left is not reused."""
+    trees = (tree for tree in bpy.data.node_groups if tree.name.startswith(name) and tree.get(_MADE_BY) == __version__)
+    return next(trees, None)
+
+
+def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
+    """Whether `nodes.splat_tree` made the tree, in this version or another."""
+    return _MADE_BY in tree and bool(tree.is_modifier)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A node group with one output, built once per file.
+
+    Blender looks at a whole tree after each of its edits, so a tree takes time in proportion to the square of its
+    nodes; of parts, it takes little, and can be built in slices between which a person can go on working.
+
+    name     after the dot, which keeps the part out of Blender's menus
+    inputs   name -> kind of socket ("Vector")
+    output   kind of socket
+    build    takes the Nodes to build with and the inputs' sockets, in their order; returns the output's socket
+    """
+
+    name: str
+    inputs: Mapping[str, str]
+    output: str
+    build: Callable[..., bpy.types.NodeSocket]
+
+    def is_made(self) -> bool:
+        return made_tree(f".{self.name}") is not None
+
+    def tree(self) -> bpy.types.NodeTree:
+        """The part's tree, built where the file has none."""
+        made = made_tree(f".{self.name}")
+        if made is not None:
+            return made
+        tree = new_tree(f".{self.name}")
+        tree.interface.new_socket(self.output, in_out="OUTPUT", socket_type=f"NodeSocket{self.output}")
+        for name, kind in self.inputs.items():
+            tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+        given = tree.nodes.new("NodeGroupInput").outputs
+        result = self.build(Nodes(tree), *(given[name] for name in self.inputs))
+        tree.links.new(result, tree.nodes.new("NodeGroupOutput").inputs[self.output])
+        lay_out(tree)
+        return tree
 
 
 class Nodes:
@@ -33,6 +94,11 @@ class Nodes:
     def out(self, kind: str, inputs: dict[str, Any] | None = None, **properties: Any) -> bpy.types.NodeSocket:
         node = self.add(kind, inputs, **properties)
         return next(socket for socket in node.outputs if socket.enabled)
+
+    def part(self, part: Part, *values: Any) -> bpy.types.NodeSocket:
+        """Output of a part; values or sockets for its inputs, in their order."""
+        inputs = dict(zip(part.inputs, values, strict=True))
+        return self.out("GeometryNodeGroup", inputs, node_tree=part.tree())
 
     def math(self, operation: str, *values: Any) -> bpy.types.NodeSocket:
         return self.out("ShaderNodeMath", {"Value": list(values)}, operation=operation)
@@ -86,6 +152,11 @@ class Nodes:
         return self.out(
             "GeometryNodeFieldAtIndex", {"Index": index, "Value": value}, data_type="FLOAT_VECTOR", domain="POINT"
         )
+
+    def corner(self, index: int) -> bpy.types.NodeSocket:
+        """Vertex of a face's corner, in the order in which the face lists its vertices."""
+        corner = self.out("GeometryNodeCornersOfFace", {"Sort Index": index})
+        return self.out("GeometryNodeVertexOfCorner", {"Corner Index": corner})
 
     def on_domain(self, value: Any, data_type: str, domain: str) -> bpy.types.NodeSocket:
         """A field as another domain sees it: faces to points and back are plain means of the touching elements."""

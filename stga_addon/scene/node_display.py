@@ -1,12 +1,13 @@
 """What stands for a splat in Blender: a point, an ellipsoid, a quad that faces the camera, or Blender's own splat."""
 
+from contextlib import suppress
 from typing import Any
 
 import bpy
 
 from .compat import NATIVE_SPLATS
 from .materials import EXTENT, ellipsoid_material, point_material
-from .node_builder import Nodes
+from .node_builder import Nodes, Part
 
 # Attributes that the splats have by now, under the names that Blender's own splats use.
 WORLD_ROTATION = "rotation"
@@ -23,13 +24,10 @@ def shown_as(nodes: Nodes, choice: Any, splats: Any, visible: Any, size: Any) ->
 
     visible: field, which splats; size: factor on their standard deviations.
     """
-    kinds = {
-        POINTS: _points(nodes, splats, visible, size),
-        ELLIPSOIDS: _ellipsoids(nodes, splats, visible, size),
-        QUADS: _quads(nodes, splats, visible, size),
-    }
-    if NATIVE_SPLATS:
-        kinds[NATIVE] = nodes.out("GeometryNodePointsSetType", {"Points": kinds[POINTS], "Type": "GAUSSIAN_SPLAT"})
+    kinds = {name: nodes.part(part, splats, visible, size) for name, part in PARTS.items()}
+    native = _native(nodes, kinds[POINTS]) if NATIVE_SPLATS else None
+    if native is not None:
+        kinds[NATIVE] = native
     menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
     menu.enum_definition.enum_items.clear()
     for name in kinds:
@@ -65,6 +63,17 @@ def _ellipsoids(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types
     )
 
 
+def _native(nodes: Nodes, points: Any) -> bpy.types.NodeSocket | None:
+    """The points as Blender's own splats; None where the menu calls them by no name known from its source."""
+    node = nodes.add("GeometryNodePointsSetType", {"Points": points})
+    for name in ("Gaussian Splat", "Gaussian Splats", "GAUSSIAN_SPLAT"):
+        with suppress(TypeError):  # there is no such item
+            node.inputs["Type"].default_value = name
+            return node.outputs[0]
+    nodes.tree.nodes.remove(node)
+    return None
+
+
 def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
     """Two triangles a splat, which cover its ellipsoid as the scene's active camera sees it.
 
@@ -91,3 +100,11 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
     facing = nodes.out("FunctionNodeCombineTransform", {"Rotation": turn})
     placed = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": [ellipsoid, facing]})
     return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": placed})
+
+
+_INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
+PARTS = {
+    POINTS: Part("STGA Points", _INPUTS, "Geometry", _points),
+    ELLIPSOIDS: Part("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
+    QUADS: Part("STGA Camera Quads", _INPUTS, "Geometry", _quads),
+}

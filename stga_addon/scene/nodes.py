@@ -6,17 +6,17 @@ frames by the splats' face index and composes position, rotation and scale.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import bpy
 
-from .. import __version__
 from ..avatar.embedding import SLIVER, UPRIGHT
 from . import tags
 from .materials import DISPLAY_COLOR, OPACITY
-from .node_builder import Nodes, lay_out
-from .node_colors import FACE, sampled_strain, scene_linear, srgb, view_direction
-from .node_display import POINTS, WORLD_ROTATION, WORLD_SCALE, shown_as
+from .node_builder import Nodes, Part, lay_out, made_tree, new_tree
+from .node_colors import BANDS, DEFORMED, FACE, SCENE_LINEAR, STRAIN, constant, seen_from, view_direction
+from .node_display import PARTS, POINTS, WORLD_ROTATION, WORLD_SCALE, shown_as
 
 # Attributes of the splat object that are read here; the others stand in `node_colors` and `materials`.
 XYZ = "stga_xyz"
@@ -39,26 +39,56 @@ SELECTED_ONLY = "Selected Only"
 FROZEN_GREY = (0.25, 0.25, 0.25, 1.0)
 
 _FROZEN = "stga_frozen"
-
-_MADE_BY = "stga_version"
+_FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = "stga_frame_origin", "stga_frame_rotation", "stga_frame_size"
 
 
 def splat_tree(convention: str | None, degree: int = 0, strained: bool = False) -> bpy.types.NodeTree:
     """The node tree for splats embedded by `convention` ("stga", "gaussian_avatars"), or None for world space.
 
-    degree: of their spherical harmonics; strained: whether their colours follow strain. Built once per file; a tree
-    that another version of the add-on left in the file is not reused.
+    degree: of their spherical harmonics; strained: whether their colours follow strain. Built once per file.
     """
-    name = f"STGA Splats ({convention or 'world'}, SH {degree}{', strain' if strained else ''})"
-    for tree in bpy.data.node_groups:
-        if tree.name.startswith(name) and tree.get(_MADE_BY) == __version__:
-            return tree
-    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    tree[_MADE_BY] = __version__
+    made = find_splat_tree(convention, degree, strained)
+    if made is not None:
+        return made
+    tree = new_tree(_name(convention, degree, strained))
     tree.is_modifier = True
     _declare(tree, convention is not None, degree)
     _build(Nodes(tree), convention, degree, strained)
     return tree
+
+
+def find_splat_tree(convention: str | None, degree: int, strained: bool) -> bpy.types.NodeTree | None:
+    """What `splat_tree` built before in this file, or None."""
+    return made_tree(_name(convention, degree, strained))
+
+
+def build_slice(convention: str | None, degree: int, strained: bool) -> bool:
+    """Build one thing that `splat_tree` needs and the file has not got yet, the tree itself last; whether one was left.
+
+    Where Blender is to go on in between, call it until it answers False.
+    """
+    if find_splat_tree(convention, degree, strained) is not None:
+        return False
+    missing = next((part for part in _parts(convention, degree, strained) if not part.is_made()), None)
+    if missing is not None:
+        missing.tree()
+    else:
+        splat_tree(convention, degree, strained)
+    return True
+
+
+def _parts(convention: str | None, degree: int, strained: bool) -> list[Part]:
+    """What `_build` makes the tree of."""
+    parts = [_PLACED[convention], *PARTS.values(), *BANDS[:degree]]
+    if convention is not None:
+        parts += [_FRAMED[convention], _FROZEN_BY]
+    if degree > 0 or strained:
+        parts.append(SCENE_LINEAR)
+    return parts + ([DEFORMED, STRAIN] if strained else [])
+
+
+def _name(convention: str | None, degree: int, strained: bool) -> str:
+    return f"STGA Splats ({convention or 'world'}, SH {degree}{', strain' if strained else ''})"
 
 
 def _declare(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
@@ -93,43 +123,28 @@ def _declare(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
         only.description = "Hide what the current frame's selection freezes"
 
 
-def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
-    """Whether `splat_tree` made the tree, in this version or another."""
-    return _MADE_BY in tree
-
-
 def _build(nodes: Nodes, convention: str | None, degree: int, strained: bool) -> None:
     inputs = nodes.tree.nodes.new("NodeGroupInput").outputs
-    xyz = nodes.attribute(XYZ, "FLOAT_VECTOR")
-    rotation = nodes.attribute(ROTATION, "QUATERNION")
-    scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
-    strain = None
+    splats, strain, meshes = inputs["Geometry"], None, []
     if convention is not None:
         mesh = nodes.object(inputs[HEAD]).outputs["Geometry"]
-        corners = [_corner(nodes, index) for index in range(3)]
-        origin, turn, size = _sampled_frames(nodes, mesh, convention, corners)
-        xyz = nodes.out("FunctionNodeRotateVector", {"Vector": nodes.scaled(xyz, size), "Rotation": turn})
-        xyz = nodes.vector("ADD", xyz, origin)
-        rotation = nodes.out(
-            "FunctionNodeRotateRotation", {"Rotation": rotation, "Rotate By": turn}, rotation_space="GLOBAL"
-        )
-        scale = nodes.scaled(scale, size)
+        meshes = [nodes.part(_FRAMED[convention], mesh)]
         if strained:
             neutral = nodes.object(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
-            strain = sampled_strain(nodes, mesh, neutral, corners)
-    splats = nodes.out("GeometryNodeSetPosition", {"Geometry": inputs["Geometry"], "Position": xyz})
-    splats = nodes.store(splats, WORLD_ROTATION, rotation, "QUATERNION")
-    splats = nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
+            strain = nodes.part(STRAIN, nodes.part(DEFORMED, mesh, neutral))
+    splats = nodes.part(_PLACED[convention], splats, *meshes)
     color = nodes.attribute(COLOR, "FLOAT_COLOR")
-    if strain is not None:
-        color = scene_linear(nodes, srgb(nodes, 0, None, strain))
+    if strained or degree > 0:
+        constant_color = constant(nodes, strain)
+    if strained:
+        color = nodes.part(SCENE_LINEAR, constant_color)
     if degree > 0:
         direction, has_camera = view_direction(nodes, nodes.out("GeometryNodeInputPosition"))
-        seen = scene_linear(nodes, srgb(nodes, degree, direction, strain))
+        seen = nodes.part(SCENE_LINEAR, seen_from(nodes, constant_color, degree, direction))
         color = nodes.switch("RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, seen)
     visible = _visible(nodes, inputs)
     if convention is not None:
-        splats = nodes.store(splats, _FROZEN, _frozen(nodes, mesh), "BOOLEAN")
+        splats = nodes.store(splats, _FROZEN, nodes.part(_FROZEN_BY, mesh), "BOOLEAN")
         frozen = nodes.attribute(_FROZEN, "BOOLEAN")
         color = nodes.switch("RGBA", nodes.logic("AND", frozen, inputs[SHOW_SELECTION]), color, FROZEN_GREY)
         visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
@@ -150,26 +165,48 @@ def _visible(nodes: Nodes, inputs: Any) -> bpy.types.NodeSocket:
     return nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", draw, inputs[PERCENTAGE]))
 
 
-def _sampled_frames(nodes: Nodes, mesh: Any, convention: str, corners: list[Any]) -> tuple[Any, Any, Any]:
-    """Origin, rotation and scale of each splat's triangle (`avatar.embedding.face_frames` as nodes)."""
+def _framed(convention: str, nodes: Nodes, mesh: Any) -> Any:
+    """The mesh with each triangle's frame (`avatar.embedding.face_frames` as nodes)."""
     # Stored on the mesh first: sampling a stored attribute is cheap, sampling a field computes it again.
     place = nodes.out("GeometryNodeInputPosition")
-    origin, turn, size = _FRAMES[convention](nodes, *(nodes.at(place, corner) for corner in corners))
-    mesh = nodes.store(mesh, "stga_frame_origin", origin, "FLOAT_VECTOR", "FACE")
-    mesh = nodes.store(mesh, "stga_frame_rotation", turn, "QUATERNION", "FACE")
-    mesh = nodes.store(mesh, "stga_frame_size", size, "FLOAT", "FACE")
+    origin, turn, size = _FRAMES[convention](nodes, *(nodes.at(place, nodes.corner(index)) for index in range(3)))
+    mesh = nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
+    mesh = nodes.store(mesh, _FRAME_ROTATION, turn, "QUATERNION", "FACE")
+    return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
+
+
+def _placed(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
+    """The splats where they are in the object's space, with their rotation and scale there; mesh: from `_framed`."""
+    xyz = nodes.attribute(XYZ, "FLOAT_VECTOR")
+    rotation = nodes.attribute(ROTATION, "QUATERNION")
+    scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
+    if convention is not None:
+        origin, turn, size = _sampled_frames(nodes, mesh, convention)
+        xyz = nodes.out("FunctionNodeRotateVector", {"Vector": nodes.scaled(xyz, size), "Rotation": turn})
+        xyz = nodes.vector("ADD", xyz, origin)
+        rotation = nodes.out(
+            "FunctionNodeRotateRotation", {"Rotation": rotation, "Rotate By": turn}, rotation_space="GLOBAL"
+        )
+        scale = nodes.scaled(scale, size)
+    splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
+    splats = nodes.store(splats, WORLD_ROTATION, rotation, "QUATERNION")
+    return nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
+
+
+def _sampled_frames(nodes: Nodes, mesh: Any, convention: str) -> tuple[Any, Any, Any]:
+    """Origin, rotation and scale of each splat's triangle."""
     face = nodes.attribute(FACE, "INT")
 
     def sample(name: str, kind: str) -> Any:
         return nodes.sample(mesh, nodes.attribute(name, kind), face, kind)
 
-    size = sample("stga_frame_size", "FLOAT")
+    size = sample(_FRAME_SIZE, "FLOAT")
     if convention == "stga":
         neutral = nodes.attribute(NEUTRAL_AREA, "FLOAT")
         ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
         # No neutral area, no meaningful ratio: the local metres stay as they are.
         size = nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
-    return sample("stga_frame_origin", "FLOAT_VECTOR"), sample("stga_frame_rotation", "QUATERNION"), size
+    return sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION"), size
 
 
 def _stga_frames(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
@@ -198,12 +235,6 @@ _FRAMES: dict[str, Callable[..., tuple[Any, Any, Any]]] = {
     "stga": _stga_frames,
     "gaussian_avatars": _gaussian_avatars_frames,
 }
-
-
-def _corner(nodes: Nodes, index: int) -> bpy.types.NodeSocket:
-    """Vertex of a triangle's corner, in the order in which the face lists its vertices."""
-    corner = nodes.out("GeometryNodeCornersOfFace", {"Sort Index": index})
-    return nodes.out("GeometryNodeVertexOfCorner", {"Corner Index": corner})
 
 
 def _axes_to_rotation(
@@ -240,3 +271,22 @@ def _frozen(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
     # Compared on the vertices: from there to a face, a boolean holds where all the face's vertices hold.
     frozen = nodes.logic("NIMPLY", exists, nodes.on_domain(chosen, "BOOLEAN", "POINT"))
     return nodes.sample(mesh, frozen, nodes.attribute(FACE, "INT"), "BOOLEAN")
+
+
+_FRAMED = {
+    convention: Part(f"STGA Frames ({convention})", {"Mesh": "Geometry"}, "Geometry", partial(_framed, convention))
+    for convention in _FRAMES
+}
+_PLACED: dict[str | None, Part] = {
+    None: Part("STGA Placed (world)", {"Splats": "Geometry"}, "Geometry", partial(_placed, None)),
+    **{
+        convention: Part(
+            f"STGA Placed ({convention})",
+            {"Splats": "Geometry", "Frames": "Geometry"},
+            "Geometry",
+            partial(_placed, convention),
+        )
+        for convention in _FRAMES
+    },
+}
+_FROZEN_BY = Part("STGA Frozen", {"Mesh": "Geometry"}, "Bool", _frozen)

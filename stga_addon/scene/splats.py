@@ -1,5 +1,6 @@
 """Splats as Blender objects."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import bpy
@@ -15,27 +16,51 @@ from .colors import srgb_to_linear
 from .compat import modifier_input, set_modifier_input
 from .hierarchy import triangle_mesh
 from .materials import OPACITY
+from .node_builder import is_splat_tree
 from .node_colors import FACE, SH, STRAIN_COLOR, strain_attributes
 from .node_display import POINTS, WORLD_ROTATION, WORLD_SCALE
 
 Attributes = dict[str, tuple[str, str, np.ndarray]]
-"""Name -> (data type, the field to set, flat values) of every attribute of a splat object's vertices."""
+"""Name -> (data type, the field to set, flat values) of attributes of a mesh."""
 
 
-def show_avatar(avatar: Avatar, head: Any, name: str | None = None, attributes: Attributes | None = None) -> Any:
+@dataclass(frozen=True)
+class Prepared:
+    """What `show_avatar` writes into the vertices of the splat object, and into the triangles of the neutral mesh."""
+
+    splats: Attributes
+    neutral: Attributes
+
+
+def prepare(avatar: Avatar) -> Prepared:
+    """The part of showing an avatar that works without Blender, so that a thread can do it."""
+    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
+    splats = {
+        **_attributes(avatar.splats),
+        FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
+        nodes.NEUTRAL_AREA: ("FLOAT", "value", np.ascontiguousarray(area, np.float32)),
+    }
+    if not avatar.splats.strain_color.shape[1]:
+        return Prepared(splats, {})
+    vectors = strain_attributes(strain_basis(avatar.neutral, avatar.faces))
+    flat = {name: np.ascontiguousarray(vector, np.float32).ravel() for name, vector in vectors.items()}
+    return Prepared(splats, {name: ("FLOAT_VECTOR", "vector", values) for name, values in flat.items()})
+
+
+def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Prepared | None = None) -> Any:
     """The splat object of an avatar: it follows the evaluated mesh of the object `head`, frame by frame.
 
-    head: a mesh object with the avatar's triangles, in their order. attributes: `avatar_attributes`, where it is there
+    head: a mesh object with the avatar's triangles, in their order. prepared: from `prepare`, where it is there
     already. Raises StgaError where the head has other triangles.
     """
     check_head(avatar, head)
-    attributes = attributes or avatar_attributes(avatar)
-    shown = _splat_object(name or f"{head.name} splats", attributes, head.users_collection[0])
+    prepared = prepared or prepare(avatar)
+    shown = _splat_object(name or f"{head.name} splats", prepared.splats, head.users_collection[0])
     shown[tags.CONVENTION], shown[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
     _add_modifier(shown, avatar.convention, avatar.splats)
     set_input(shown, nodes.HEAD, head)
     # In no collection: it is never seen, and lives as long as the splats that point to it.
-    set_input(shown, nodes.NEUTRAL, _neutral_object(f"{shown.name} neutral", avatar))
+    set_input(shown, nodes.NEUTRAL, _neutral_object(f"{shown.name} neutral", avatar, prepared.neutral))
     # A sibling of the head: the two object spaces are the same, so are the numbers in them.
     shown.parent = head.parent
     shown.matrix_parent_inverse = head.matrix_parent_inverse
@@ -50,25 +75,20 @@ def can_refresh(shown: Any, avatar: Avatar) -> bool:
     except StgaError:
         return False
     same = (shown.get(tags.CONVENTION), shown.get(tags.ANTIALIASED)) == (avatar.convention, avatar.antialiased)
-    return same and tree == _tree(avatar.convention, avatar.splats)
+    return same and tree == nodes.find_splat_tree(*_kind(avatar.convention, avatar.splats))
 
 
-def refresh(shown: Any, attributes: Attributes) -> None:
+def refresh(shown: Any, prepared: Prepared) -> None:
     """Show other splats in the same object: display settings, name and users stay.
 
-    attributes: from `avatar_attributes` of an avatar for which `can_refresh` says yes.
+    prepared: from `prepare` of an avatar for which `can_refresh` says yes.
     """
-    _write(shown.data, attributes)
+    _write(shown.data, prepared.splats)
 
 
-def avatar_attributes(avatar: Avatar) -> Attributes:
-    """What `show_avatar` writes, without Blender, so that a thread can prepare it."""
-    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
-    return {
-        **_attributes(avatar.splats),
-        FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
-        nodes.NEUTRAL_AREA: ("FLOAT", "value", np.ascontiguousarray(area, np.float32)),
-    }
+def build_slice(avatar: Avatar) -> bool:
+    """Do a moment's work on the node tree that `show_avatar` will want; whether there was some left to do."""
+    return nodes.build_slice(*_kind(avatar.convention, avatar.splats))
 
 
 def check_head(avatar: Avatar, head: Any) -> None:
@@ -94,7 +114,7 @@ def show_world_splats(splats: Splats, name: str) -> Any:
 def splat_modifier(shown: Any) -> Any:
     """The geometry nodes modifier of a splat object. Raises StgaError where `shown` is none."""
     for modifier in shown.modifiers if shown is not None else ():
-        if modifier.type == "NODES" and modifier.node_group is not None and nodes.is_splat_tree(modifier.node_group):
+        if modifier.type == "NODES" and modifier.node_group is not None and is_splat_tree(modifier.node_group):
             return modifier
     raise StgaError(f"{getattr(shown, 'name', None)}: is not an object that shows splats")
 
@@ -153,12 +173,9 @@ def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
     return shown
 
 
-def _neutral_object(name: str, avatar: Avatar) -> Any:
+def _neutral_object(name: str, avatar: Avatar, attributes: Attributes) -> Any:
     mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
-    if avatar.splats.strain_color.shape[1]:
-        for attribute, vectors in strain_attributes(strain_basis(avatar.neutral, avatar.faces)).items():
-            data = mesh.attributes.new(attribute, "FLOAT_VECTOR", "FACE").data
-            data.foreach_set("vector", np.ascontiguousarray(vectors, np.float32).ravel())
+    _write_attributes(mesh, attributes, "FACE")
     return bpy.data.objects.new(name, mesh)
 
 
@@ -194,19 +211,24 @@ def _write(mesh: Any, attributes: Attributes) -> None:
         mesh.clear_geometry()
         mesh.vertices.add(len(positions) // 3)
     mesh.vertices.foreach_set("co", positions)
-    for name, (kind, field, values) in attributes.items():
-        attribute = mesh.attributes.get(name) or mesh.attributes.new(name, kind, "POINT")
-        attribute.data.foreach_set(field, values)
+    _write_attributes(mesh, attributes, "POINT")
     mesh.update()
 
 
-def _tree(convention: str | None, splats: Splats) -> Any:
-    return nodes.splat_tree(convention, splats.sh_degree, splats.strain_color.shape[1] > 0)
+def _write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
+    for name, (kind, field, values) in attributes.items():
+        attribute = mesh.attributes.get(name) or mesh.attributes.new(name, kind, domain)
+        attribute.data.foreach_set(field, values)
+
+
+def _kind(convention: str | None, splats: Splats) -> tuple[str | None, int, bool]:
+    """What decides the node tree, as `nodes.splat_tree` takes it."""
+    return convention, splats.sh_degree, splats.strain_color.shape[1] > 0
 
 
 def _add_modifier(shown: Any, convention: str | None, splats: Splats) -> None:
     modifier = shown.modifiers.new("STGA Splats", "NODES")
-    modifier.node_group = _tree(convention, splats)
+    modifier.node_group = nodes.splat_tree(*_kind(convention, splats))
     set_input(shown, nodes.DISPLAY, POINTS)  # the default of a menu does not reach the modifier in every version
 
 

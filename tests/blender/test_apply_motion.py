@@ -19,6 +19,7 @@ from stga_addon.flame.sequence import read_motion  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
 from stga_addon.scene.rig import rig_of  # noqa: E402
 from stga_addon.scene.splats import evaluated_splats  # noqa: E402
+from stga_addon.training.tracking import Tracking, refined, write_tracking  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
@@ -82,6 +83,18 @@ def test_a_file_from_a_start_frame(scene):
     for row in range(5):
         np.testing.assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
     assert bpy.context.scene.frame_end == 14
+
+
+def test_a_runs_refined_tracking(scene, tmp_path):
+    """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3, refined."""
+    tracking = Tracking(scene.own, scene.own.timesteps)
+    tracking.state.change[:] = np.random.default_rng(0).normal(0, 0.05, tracking.tracked.shape)
+    write_tracking(tmp_path, tracking)
+    shown = refined(open_capture(scene.folder, scene.model_file), tmp_path)
+    assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3
+    assert bpy.ops.stga.apply_motion(filepath=str(tmp_path / "tracking.npz"), start=0) == {"FINISHED"}
+    for timestep in scene.own.timesteps:
+        np.testing.assert_allclose(at(timestep), shown.mesh(timestep), atol=TOLERANCE)
 
 
 def test_undo(scene):

@@ -60,7 +60,7 @@ def test_a_choice_that_cannot_be(chosen):
     """Catches a mistake that shows nowhere, or as a traceback."""
     row = chosen.effects.add()
     row.name, row.choice = "jaw", "on"
-    with pytest.raises(RuntimeError, match=r"--effect jaw=on: .* no parameters of FLAME"):
+    with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
         bpy.ops.stga.plan_effects()
-    assert chosen.plan_error.startswith("--effect jaw=on: ")
+    assert chosen.plan_error.startswith("jaw=on: ")
     assert "Traceback" not in chosen.plan_error

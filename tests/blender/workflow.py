@@ -1,8 +1,9 @@
 """An artist's way through the installed extension; run by `test_versions.py` in a Python of its own with some bpy.
 
-    python workflow.py ZIP FOLDER
+    python workflow.py ZIP FOLDER RUNTIME
 
-FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. Prints RESULT and JSON.
+FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. RUNTIME is the Python that trains
+where this one cannot; "" if there is none. Prints RESULT and JSON.
 """
 
 import importlib
@@ -17,7 +18,7 @@ import bpy
 MODULE = "bl_ext.user_default.stga"
 
 
-def main(archive: str, folder: Path) -> dict[str, object]:
+def main(archive: str, folder: Path, runtime: str) -> dict[str, object]:
     bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.preferences.addon_enable(module=MODULE)
@@ -28,9 +29,14 @@ def main(archive: str, folder: Path) -> dict[str, object]:
     counted = [row.triangles for row in bpy.context.scene.stga.selected_frames]
     ops.heat_map()
     ops.heat_map(show=False)
-    trained = can_train()
-    if trained:
+    if not can_train():
+        bpy.context.preferences.addons[MODULE].preferences.runtime_python = runtime
+    trained = 0
+    if can_train() or runtime:
         ops.train(directory=str(folder / "run"), iterations=3)
+        ops.show_avatar(filepath=bpy.context.scene.stga.avatar)
+        trained = len(positions()) // 3
+        bpy.data.objects.remove(bpy.context.scene.stga.splats)
     ops.show_avatar(filepath=str(folder / "a.npz"))
     ops.apply_motion(filepath=str(folder / "other.npz"), start=1)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
@@ -39,7 +45,7 @@ def main(archive: str, folder: Path) -> dict[str, object]:
     bpy.ops.wm.open_mainfile(filepath=str(folder / "head.blend"))
     ops.export(filepath=str(folder / "plys"), format="ply-sequence")
     shown, frame = positions(), bpy.context.scene.frame_current
-    if trained:
+    if can_train():
         cameras, out = str(folder / "capture/transforms_test.json"), str(folder / "pictures")
         command_line = importlib.import_module(MODULE + ".operators.command_line")
         assert command_line._run(["render", "--cameras", cameras, "--out", out]) == 0
@@ -53,6 +59,7 @@ def main(archive: str, folder: Path) -> dict[str, object]:
     return {
         "version": bpy.app.version_string,
         "counted": counted,
+        "can train": can_train(),
         "trained": trained,
         "shown": shown,
         "frame": frame,
@@ -76,5 +83,5 @@ def positions() -> list[float]:
 
 
 if __name__ == "__main__":
-    print("RESULT " + json.dumps(main(sys.argv[1], Path(sys.argv[2]))), flush=True)
+    print("RESULT " + json.dumps(main(sys.argv[1], Path(sys.argv[2]), sys.argv[3])), flush=True)
     os._exit(0)  # the module bpy 4.2 crashes when its Python ends where a property has an update function

@@ -1,0 +1,66 @@
+"""The curve in the panel: what is painted, and when."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from stga_addon.scene.curve import COMING, LINE, MARGIN, SIZE, curve_picture
+
+SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
+PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
+AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5}
+
+
+def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
+    made: list[dict[str, object]] = [
+        {"iteration": 10 * row, "seconds": float(SECONDS[row]), "psnr": float(PSNR[row])} for row in range(count)
+    ]
+    if forecast:
+        made[-1]["forecast"] = AHEAD
+    return made
+
+
+def test_the_curve_is_where_the_axes_say():
+    """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not after the curve."""
+    pixels, axes = curve_picture(lines())
+    low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
+    inner = SIZE - 2 * MARGIN
+    for second, color in [(second, LINE) for second in (15, 30, 50, 75)] + [(90, COMING)]:
+        column = int(MARGIN + second / 100 * inner)
+        at = (column + 0.5 - MARGIN) / inner * 100
+        like = np.abs(pixels[:, column, :3] - np.array(color)).sum(-1)
+        expected = np.interp(at, [*SECONDS, 100.0], [*PSNR, 34.0])
+        found = low + (np.flatnonzero(like < 0.05).mean() + 0.5 - MARGIN) / inner * (high - low)
+        assert found == pytest.approx(expected, abs=2 * (high - low) / inner)
+
+
+def test_too_little_is_no_curve():
+    """Catches a division by nothing before the first evaluations, and a flat curve without a height."""
+    assert curve_picture([]) is None
+    assert curve_picture(lines(1, forecast=False)) is None
+    flat = [{"iteration": row, "seconds": 1.0 + row, "psnr": 30.0} for row in range(3)]
+    pixels, axes = curve_picture(flat)
+    assert np.isfinite(pixels).all()
+    assert axes == "30 to 30.1 dB, 0 to 3 s"
+
+
+def test_it_is_painted_anew_after_every_evaluation(extension, tmp_path):
+    """Catches a picture that stays as it was, one for nothing, a panel that fails on a damaged file, and pictures that
+    are saved in the .blend file."""
+    bpy = pytest.importorskip("bpy")
+    curve = extension.ui.curve
+    assert curve._update(tmp_path) is None
+    file = tmp_path / "metrics.jsonl"
+    seen = []
+    for count in (1, 3, 6):
+        file.write_text("".join(json.dumps(line) + "\n" for line in lines(count)))
+        seen.append(curve._update(tmp_path))
+    assert seen[0] is None
+    assert seen[1] is not None
+    painted = np.array(curve._pictures[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
+    np.testing.assert_allclose(painted, curve_picture(lines())[0], atol=1 / 255)
+    file.write_text('{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n')
+    assert curve._update(tmp_path) is None
+    assert len(bpy.data.images) == 0
