@@ -39,6 +39,14 @@ class ImportCapture(bpy.types.Operator):
             ("centre", "Image Centre", "cx and cy are ignored, as GaussianAvatars does"),
         ),
     )
+    correctives: bpy.props.EnumProperty(
+        name="Pose Correctives",
+        description="For which of FLAME's joints the rig has the shape keys and drivers that correct the mesh",
+        items=(
+            ("all", "Every Joint", "Any bone posed by hand gives FLAME's own mesh"),
+            ("moving", "Joints That Move", "Only what this capture turns: fewer shape keys and drivers"),
+        ),
+    )
     set_up_scene: bpy.props.BoolProperty(
         name="Set Up Scene",
         description="Give the scene the capture's resolution, its first camera and the Standard view "
@@ -54,7 +62,7 @@ class ImportCapture(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         folder = file_path(self.directory, "capture")
-        bring_in(self, context, folder, self.flame, self.principal_point, self.set_up_scene)
+        bring_in(self, context, folder, self.flame, self.principal_point, self.set_up_scene, self.correctives)
         return {"FINISHED"}
 
 
@@ -65,6 +73,7 @@ def bring_in(
     flame: str = "",
     principal_point: str = "vhap",
     set_up_scene: bool = False,
+    correctives: str = "all",
 ) -> None:
     """Import what `open_capture` makes of `source` and work on it from here on. Raises StgaError."""
 
@@ -73,7 +82,7 @@ def bring_in(
 
     model = flame_model_path(context, flame)
     capture = open_capture(source, flame=model, principal_point=principal_point)
-    head = import_head(capture, warn=warn)
+    head = import_head(capture, warn=warn, correctives=correctives)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(model or "")
     head[tags.PRINCIPAL_POINT] = principal_point

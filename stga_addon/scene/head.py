@@ -11,7 +11,7 @@ from .hierarchy import Warn, capture_root, log_warning, place, reset, triangle_m
 from .rig import add_rig, remove_rig
 
 
-def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warning) -> Any:
+def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warning, correctives: str = "all") -> Any:
     """The capture's head as a mesh object, animated so that Blender's frame number is the capture's timestep.
 
     A FLAME capture becomes a rig (see `rig.add_rig`); any other gets one shape key a timestep, `t00012`, which is 1 at
@@ -20,13 +20,13 @@ def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warn
     `stga_region_<name>`. Importing the same folder or file again replaces what the last import made; vertex groups and
     materials stay where the triangles are the same. Raises StgaError
     where a timestep cannot be read; the scene is then unchanged. `warn` receives one sentence for each thing worth
-    knowing.
+    knowing. correctives: see `rig.add_rig`.
     """
     sequence = capture.flame
     if sequence is not None:
         frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
         head = _place_head(capture, name)
-        add_rig(head, sequence, frames, warn)
+        add_rig(head, sequence, frames, warn, correctives)
         return head
     meshes = np.empty((len(capture.timesteps), *capture.neutral.shape), np.float32)
     for row, timestep in enumerate(capture.timesteps):

@@ -22,7 +22,7 @@ from ..flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ..flame.model import JOINTS, FlameModel
 from ..flame.motion import PARTS
 from ..flame.quaternions import continuous, from_axis_angle
-from ..flame.sequence import FlameSequence
+from ..flame.sequence import TURN, FlameSequence, turns
 from . import compat, tags
 from .hierarchy import Warn, leave_edit_mode, log_warning, place, remove
 
@@ -46,12 +46,19 @@ ROTATION_MINUS_IDENTITY = (
 TERMS = "abcdfghijklmnopqrs"
 
 
-def add_rig(head: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], warn: Warn = log_warning) -> Any:
+def add_rig(
+    head: Any,
+    sequence: FlameSequence,
+    frames: Sequence[FlameFrame],
+    warn: Warn = log_warning,
+    correctives: str = "all",
+) -> Any:
     """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature object.
 
     head has its "Basis" shape key; frames: the sequence's frames, one a timestep. The evaluated mesh equals
     `flame_forward` within 1e-5 m. Vertex offsets that change by frame have no rig: they become one shape key a
-    timestep, which `warn` is told, as it is of coefficients beyond ±10.
+    timestep, which `warn` is told, as it is of coefficients beyond ±10. correctives: "all", or "moving" for the shape
+    keys and drivers of those joints only that turn in the frames.
     """
     model = sequence.model
     basis = shaped_vertices(model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset)
@@ -64,7 +71,9 @@ def add_rig(head: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], wa
     _skin(head, rig, model.weights, moving)
     for name, component in sliders.items():
         _new_key(head, name, basis + model.shapedirs[:, :, component], SLIDER)
-    _add_pose_keys(head, rig, model, basis)
+    _add_pose_keys(
+        head, rig, model, basis, np.ones(len(JOINTS), bool) if correctives == "all" else turns(frames) > TURN
+    )
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
         _add_offset_keys(head, sequence, frames, basis, warn)
@@ -273,10 +282,15 @@ def _key_expressions(head: Any, numbers: Sequence[int], values: np.ndarray, warn
         )
 
 
-def _add_pose_keys(head: Any, rig: Any, model: FlameModel, basis: np.ndarray) -> None:
-    """FLAME's 36 pose correctives: each is driven by one entry of one joint's rotation minus identity."""
+def _add_pose_keys(head: Any, rig: Any, model: FlameModel, basis: np.ndarray, wanted: np.ndarray) -> None:
+    """FLAME's pose correctives, nine a joint: each is driven by one entry of the joint's rotation minus identity.
+
+    wanted (5,) bool: joints that get theirs.
+    """
     for feature in range(model.posedirs.shape[2]):
         joint, entry = divmod(feature, 9)
+        if not wanted[1 + joint]:
+            continue
         bone, row, column = JOINTS[1 + joint], *divmod(entry, 3)
         name = f"pose_{bone}_{row}{column}"
         _new_key(head, name, basis + model.posedirs[:, :, feature], 2.0)

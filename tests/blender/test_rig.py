@@ -83,6 +83,33 @@ def test_small_rotations_and_offsets_do_not_snap(source):
         np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(small, timestep), atol=5e-7)
 
 
+def test_correctives_of_moving_joints_only(source):
+    """Fails when joints that stay still get shape keys and drivers all the same, or moving ones lose theirs."""
+    sequence = flame_sequence(flame_model())
+
+    def frame(timestep: int):
+        full = sequence.frame(timestep)
+        return replace(full, neck_pose=np.full(3, 1e-3), eyes_pose=np.zeros(6))
+
+    still = replace(sequence, frame=frame)
+    head = import_head(motion_capture(still, source), correctives="moving")
+    names = [key.name for key in head.data.shape_keys.key_blocks if key.name.startswith("pose_")]
+    assert len(names) == 9
+    assert all(name.startswith("pose_jaw_") for name in names)
+    driven = {curve.data_path for curve in head.data.shape_keys.animation_data.drivers}
+    assert len(driven) == 9
+    neckless = model_without_neck(sequence.model)
+    assert_parity(head, replace(still, model=neckless))
+    assert_parity(import_head(motion_capture(still, source)), still)
+
+
+def model_without_neck(model):
+    """The model without the neck's pose correctives."""
+    directions = model.posedirs.copy()
+    directions[:, :, :9] = 0
+    return replace(model, posedirs=directions)
+
+
 def test_drivers_need_no_python_and_no_cycle(source, capfd):
     """Fails when Blender would run the drivers as scripts (refused in files from others) or in an undefined order."""
     head = import_head(motion_capture(flame_sequence(flame_model()), source))
