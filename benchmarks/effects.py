@@ -26,6 +26,7 @@ from stga_addon.training.folder import Run
 from stga_addon.training.metrics import measure
 from stga_addon.training.run import train
 from stga_addon.training.settings import make_settings
+from stga_addon.training.tracking import refined
 
 LEFT_TO_AUTO = ("selection",)
 
@@ -72,6 +73,7 @@ def trained(capture: Capture, flame: Path | None, iterations: int, choices: dict
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
+        capture = refined(capture, Path(folder))
     names = ", ".join(decision.effect for decision in plan if decision.on)
     return measure(avatar, capture, "val").psnr, seconds, names
 

@@ -43,7 +43,7 @@ def train(options: Namespace) -> None:
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
         capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
-        run = decide(_new_run(options, capture), capture)
+        run = decide(_new_run(options, capture), capture, device)
     for warning in capture.warnings:
         print(f"warning: {warning}")
     _print_table(describe_plan(run.plan))
@@ -53,6 +53,8 @@ def train(options: Namespace) -> None:
     for line in conclude(options.out):
         print(line)
     print(f"avatar: {avatar}")
+    if run.settings.tracking:
+        print(f"its meshes: {options.out / 'tracking.npz'}, in Blender with Apply Motion")
 
 
 def job(options: Namespace) -> None:
@@ -370,13 +372,18 @@ def _avatar_and_capture(source: Path, options: Namespace) -> tuple[Avatar, Captu
     capture, flame = getattr(options, "capture", None), getattr(options, "flame", None)
     if source.is_dir():
         from .training.folder import read_run
+        from .training.tracking import refined
 
         run = read_run(source)
         avatar, principal_point = read_avatar(source / "avatar.npz"), run.principal_point
         capture, flame = capture or run.capture, flame or run.flame
     else:
         avatar, principal_point = read_avatar(source), "vhap"
+        if capture is not None and avatar.settings.get("tracking"):
+            print(f"warning: {source}: was trained on refined meshes, which only its run's folder has", file=sys.stderr)
     opened = None if capture is None else open_capture(capture, flame, principal_point)
+    if opened is not None and source.is_dir():
+        opened = refined(opened, source)
     return avatar, opened if opened is None or options.head is None else options.head.played(opened)
 
 

@@ -121,13 +121,13 @@ def work(run: Path, also: "Report | None" = None) -> Path:
         selection = None
         if (folder / SELECTION).exists():
             selection = read_selection(folder, len(capture.faces))
+        device, why = choose_device("auto")
+        teller.tell(0.0, why)
         if job.settings is None:
             wanted = read_run(run)
         else:
             teller.tell(0.0, "looking at the capture")
-            wanted = decide(Run(capture.root, job.flame, job.principal_point, job.settings), capture)
-        device, why = choose_device("auto")
-        teller.tell(0.0, why)
+            wanted = decide(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
         report = _Report(teller, also)
         return train(capture, run, wanted, selection, job.settings is None, report, device)
 

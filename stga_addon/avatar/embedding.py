@@ -81,6 +81,37 @@ def face_frames(
     return FaceFrames(origin, rotation, scale, deformed)
 
 
+def frame_pull(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    frames: FaceFrames,
+    force: np.ndarray,
+    torque: np.ndarray,
+    growth: np.ndarray,
+) -> np.ndarray:
+    """Gradient (V, 3) of a scalar with respect to the vertices, from its gradient with respect to "stga" frames.
+
+    The reverse of `face_frames`, with all vectors in the frame's own axes: force (F, 3) is the gradient with respect to
+    the origin, torque (F, 3) to a small rotation of the frame, growth (F,) to the logarithm of its scale. Strain hands
+    nothing on, and a line (see SLIVER) only its force.
+    """
+    corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
+    x, y = corners[..., 0], corners[..., 1]
+    twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
+    flat = twice <= np.maximum(2 * SLIVER * _longest_squared(corners), TINY)
+    per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
+    # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left, over twice the area.
+    slope_x, slope_y = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area, (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
+    # The first axis points from the origin to p0, and turns in the plane as that does.
+    spin = np.where(flat, 0.0, torque[:, 2] / np.where(flat, 1.0, x[:, 0]))
+    pull = np.repeat(force[:, None] / 3, 3, axis=1)
+    pull[..., 0] += growth[:, None] / 2 * slope_x
+    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * np.array([2 / 3, -1 / 3, -1 / 3])
+    pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x  # a corner that leaves the plane tilts it
+    pull = (pull @ frames.rotation.transpose(0, 2, 1)).reshape(-1, 3)
+    return np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in pull.T], -1)
+
+
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) in square metres of every triangle; exactly 0 where it counts as a line (see SLIVER)."""
     corners = np.asarray(vertices, np.float64)[faces]

@@ -75,7 +75,8 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 
 
 def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
-    settings = make_settings(seconds=seconds, seed=SEED, effects={})
+    # What was pictured is what the files say, and Blender shows the head as they do.
+    settings = make_settings(seconds=seconds, seed=SEED, effects={"tracking": "off"})
     run = decide(Run(capture.root, model.resolve(), "vhap", settings), capture)
     folder = out / "run"
     if (folder / "run.json").exists():

@@ -7,6 +7,7 @@ import numpy as np
 from ..avatar.strain import GAIN
 from ..capture.model import Capture
 from ..flame.forward import FlameFrame
+from ..flame.sequence import turns
 from ..flame.teeth import LOWER_LIP, TEETH_VERTICES, TEMPLATE_VERTICES, UPPER_LIP
 from ..selection import select_capture
 from ..training.settings import Settings
@@ -24,8 +25,9 @@ LARGEST = 4.0
 class Facts:
     """A capture with training views, and the settings it is to be trained with."""
 
-    def __init__(self, capture: Capture, settings: Settings) -> None:
-        self.capture, self.settings = capture, settings
+    def __init__(self, capture: Capture, settings: Settings, device: str = "cpu") -> None:
+        """device: one of `choose_device`."""
+        self.capture, self.settings, self.device = capture, settings, device
         self.views = capture.views["train"]
 
     @cached_property
@@ -87,6 +89,11 @@ class Facts:
         return float(self.samples.beside.sum() / max(self.samples.covered.sum(), 1))
 
     @cached_property
+    def outside(self) -> float:
+        """Share of the mesh that sticks out of the foreground by two pixels or more; NaN without masks."""
+        return float(self.samples.outside.sum() / max(self.samples.mesh.sum(), 1))
+
+    @cached_property
     def selected(self) -> float:
         """Share of the triangles that a frame selects by the settings' rule, on average."""
         chosen = select_capture(self.capture, self.settings.selection)
@@ -110,7 +117,7 @@ class Facts:
 
     def turns(self, *joints: int) -> float:
         """Largest angle in degrees by which one of FLAME's joints is turned."""
-        return float(np.degrees(max(np.linalg.norm(frame.pose[list(joints)], axis=1).max() for frame in self.frames)))
+        return float(turns(self.frames)[list(joints)].max())
 
     @cached_property
     def lips(self) -> float:

@@ -15,23 +15,24 @@ if TYPE_CHECKING:
     from ..training.folder import Run
 
 
-def decide(run: "Run", capture: Capture) -> "Run":
+def decide(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
     """The run with its effects decided, once, before it begins; one whose settings ask for none is left as it is.
 
+    device: what it is to be trained on, one of `choose_device`.
     Raises StgaError for a choice that cannot work on this capture.
     """
     if run.settings.effects is None or run.plan or not capture.views.get("train"):
         return run
-    settings, plan = plan_effects(capture, run.settings)
+    settings, plan = plan_effects(capture, run.settings, device)
     return replace(run, settings=settings, plan=plan)
 
 
-def plan_effects(capture: Capture, settings: Settings) -> tuple[Settings, tuple[Decision, ...]]:
+def plan_effects(capture: Capture, settings: Settings, device: str = "cpu") -> tuple[Settings, tuple[Decision, ...]]:
     """Look at a capture with training views for a few seconds; returns the settings that follow, and why.
 
     Raises StgaError where an image cannot be read, or for a choice in `settings.effects` that cannot work.
     """
-    facts, choices = Facts(capture, settings), settings.effects or {}
+    facts, choices = Facts(capture, settings, device), settings.effects or {}
     changes: dict[str, object] = {}
     plan = []
     for effect in EFFECTS:

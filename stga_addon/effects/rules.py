@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..flame.sequence import TURN
 from .facts import Facts
 
 FEWEST_CAMERAS = 4
@@ -30,10 +31,11 @@ BESIDE = 0.003
 """Share of the foreground beside the mesh from which something must stand for it."""
 PIXELS_PER_SPLAT = 0.5
 """Fewer than this leave nothing for further splats to show."""
-TURN = 0.5
-"""Degrees by which a joint must turn to count as moving."""
 LIPS, JAW = 1.5, 3.0
 """Millimetres that the lips must part by, or degrees that the jaw must open by, for teeth to be seen."""
+
+OUTSIDE = 0.001
+"""Share of the mesh outside the masks from which the tracking cannot be right."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,18 @@ def dynamic_offsets(facts: Facts) -> Verdict | None:
     return Verdict(True, f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them", only=True)
 
 
+def tracking(facts: Facts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    if facts.device != "cpu":
+        return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", only=True)
+    if facts.timesteps == 1:
+        return Verdict(False, "the splats of a single frame go where its images are by themselves", only=True)
+    if np.isnan(facts.outside):
+        return Verdict(False, "without masks, whether the mesh is where the images are is not known")
+    return Verdict(facts.outside > OUTSIDE, f"{facts.outside:.2%} of the mesh sticks out of the masks")
+
+
 EFFECTS = (
     Effect(
         "view-color",
@@ -214,5 +228,12 @@ EFFECTS = (
     joint("jaw", 2),
     joint("eyes", 3, 4),
     Effect("dynamic-offsets", "a mesh a frame beside the parameters", dynamic_offsets),
+    Effect(
+        "tracking",
+        "a pass through FLAME and back in every global iteration; the run's tracking.npz is then the head's motion",
+        tracking,
+        on={"tracking": True},
+        off={"tracking": False},
+    ),
 )
 """In the order in which they are shown."""

@@ -42,6 +42,8 @@ class Samples:
     ground     (S,) metres that a pixel is wide at the head
     covered    (S,) pixels of the whole image that the foreground has, and
     beside     (S,) how many of them lie beside the mesh; NaN without a mask
+    mesh       (S,) pixels of the whole image that the mesh has, and
+    outside    (S,) how many of them lie outside the foreground; NaN without a mask
     backdrop   (S, 3) mean colour outside the mask, and
     unevenness (S,) root mean square deviation from it in levels of 255; NaN without a mask
     """
@@ -56,6 +58,8 @@ class Samples:
     ground: np.ndarray
     covered: np.ndarray
     beside: np.ndarray
+    mesh: np.ndarray
+    outside: np.ndarray
     backdrop: np.ndarray
     unevenness: np.ndarray
 
@@ -174,7 +178,8 @@ def _around(image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, grown:
     """What a view shows outside the mesh (H, W) bool and the mask; grown: pixels of the whole image in one of these."""
     unknown = np.array(np.nan)
     if mask is None:
-        return {"covered": unknown, "beside": unknown, "backdrop": np.full(3, np.nan), "unevenness": unknown}
+        names = ("covered", "beside", "mesh", "outside", "unevenness")
+        return {"backdrop": np.full(3, np.nan), **dict.fromkeys(names, unknown)}
     near = binary_dilation(mesh, iterations=max(1, round(BESIDE * len(image))))
     foreground = mask > 127
     clear = image[binary_erosion(mask == 0, iterations=RIM, border_value=1)].astype(np.float64)
@@ -182,6 +187,8 @@ def _around(image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, grown:
     return {
         "covered": np.array(grown * foreground.sum()),
         "beside": np.array(grown * (foreground & ~near).sum()),
+        "mesh": np.array(grown * mesh.sum()),
+        "outside": np.array(grown * (mesh & ~binary_dilation(foreground, np.ones((3, 3)))).sum()),
         "backdrop": backdrop,
         "unevenness": np.array(np.sqrt(((clear - backdrop) ** 2).mean())) if len(clear) else unknown,
     }

@@ -1,6 +1,6 @@
 """A tracked FLAME sequence: per-timestep parameter files and the meshes they stand for."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_npz
-from .forward import FlameFrame, flame_forward, neutral_frame
+from .forward import FlameFrame, flame_forward, neutral_frame, shaped_vertices
 from .model import FlameModel
 from .teeth import TEETH_VERTICES
 
@@ -30,6 +30,8 @@ ALIASES = {
 }
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSES = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
+TURN = 0.5  # degrees by which a joint must turn to count as moving
+LAST_TIMESTEP = 1 << 20  # Blender's last frame; a motion is played with all frames between its timesteps
 MOTION_PACKING = 256  # dynamic offsets that are all zero, as most are, pack a published FLAME's motion 116 times
 
 
@@ -76,6 +78,21 @@ def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
     return _mesh(sequence, neutral_frame(sequence.model))
 
 
+def with_identity(sequence: FlameSequence) -> FlameSequence:
+    """The same motion with what makes the person, shape and static offset, in the template: FLAME adds it up before it
+    poses, and a mesh then needs a quarter of the components."""
+    model = sequence.model
+    shapes = model.shapedirs[:, :, model.n_identity :]
+    template = shaped_vertices(model, sequence.shape, np.zeros(shapes.shape[2]), sequence.static_offset)
+    person = replace(model, v_template=template, shapedirs=np.ascontiguousarray(shapes), n_identity=0)
+    return replace(sequence, model=person, shape=np.zeros(0), static_offset=None)
+
+
+def turns(frames: Sequence[FlameFrame]) -> np.ndarray:
+    """Largest angle (5,) in degrees by which the frames turn each of `JOINTS`."""
+    return np.asarray(np.degrees(np.linalg.norm([frame.pose for frame in frames], axis=2).max(axis=0)))
+
+
 def _mesh(sequence: FlameSequence, frame: FlameFrame) -> np.ndarray:
     return flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
 
@@ -103,7 +120,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
 
     VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a GaussianAvatars avatar, and
     plain files of expression and pose, by the names in `ALIASES` too; `pose` holds the joints of `POSES`. Timesteps
-    count from 0. Raises StgaError naming the file and the field.
+    count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
     """
     arrays = _spelled_out(path, read_npz(path, max_packing=MOTION_PACKING))
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
@@ -119,13 +136,23 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     if "shape" in arrays and arrays["shape"].ndim == 2:
         arrays["shape"] = arrays["shape"][0]  # one a timestep: whoever is tracked stays the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
+    timesteps = _timesteps(path, arrays.get("timesteps", np.arange(count)), count)
+    row = {timestep: number for number, timestep in enumerate(timesteps)}
 
     def frame(timestep: int) -> FlameFrame:
-        return _frame(path, {name: array[timestep] for name, array in moving.items()}, model)
+        return _frame(path, {name: array[row[timestep]] for name, array in moving.items()}, model)
 
-    for timestep in range(count):
+    for timestep in timesteps:
         frame(timestep)  # a wrong value in the middle is reported when the file is opened, not minutes later
-    return FlameSequence(model, shape, static_offset, tuple(range(count)), frame)
+    return FlameSequence(model, shape, static_offset, timesteps, frame)
+
+
+def _timesteps(path: Path, found: np.ndarray, count: int) -> tuple[int, ...]:
+    named = found.dtype.kind in "iu" and found.shape == (count,)
+    if not named or found[0] < 0 or (found[1:] <= found[:-1]).any() or found[-1] > LAST_TIMESTEP:
+        limits = f"from 0 to {LAST_TIMESTEP}, each more than the one before"
+        raise StgaError(f"{path}: timesteps are no {count} whole numbers {limits}")
+    return tuple(found.tolist())
 
 
 def _spelled_out(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..files import read_json
-from ..training.folder import read_metrics
+from ..training.evaluations import read_metrics
 from ..training.forecast import curve_of, hits
 from .race import Job
 from .runner import QUALITY

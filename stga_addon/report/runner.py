@@ -19,6 +19,7 @@ from ..files import write_json
 from ..training.folder import read_run
 from ..training.metrics import measure
 from ..training.run import Progress, train
+from ..training.tracking import refined
 from .calibration import seconds_per_iteration
 
 WARM_UP = 1.0
@@ -63,7 +64,8 @@ def work(folder: Path, orders: IO[str], answers: IO[str]) -> None:
         avatar = read_avatar(train(capture, folder, run, resume=True, report=turns.report))
         if not turns.dismissed:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
-            quality = {split: measure(avatar, capture, split, perceptual=True).as_json() for split in splits}
+            trained = refined(capture, folder)
+            quality = {split: measure(avatar, trained, split, perceptual=True).as_json() for split in splits}
             write_json(folder / QUALITY, quality)
         turns.answer({"done": not turns.dismissed})
     except StgaError as error:

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from ..files import replacing
-from ..training.folder import read_metrics, read_run
+from ..training.evaluations import read_metrics
+from ..training.folder import read_run
 from ..training.forecast import clock, curve_of, hits, level_since, missed
 from .pictures import run_chart
 from .results import evaluation_share

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..avatar.embedding import frame_pull
 from ..capture.model import View
 from ..raster.kernels.image_loss import change_background
 from ..raster.kernels.rows import distance_limit, scale_limit
@@ -20,6 +21,7 @@ from .losses import REACH, image_gradient, tile_rectangles, whole_image
 from .settings import Settings
 from .state import TrainState
 from .step import Batch
+from .tracking import frame_gradient
 
 
 class CpuStep:
@@ -38,6 +40,8 @@ class CpuStep:
         state = self.state
         focus = None if batch.selected is None else batch.selected[state.face.numpy()]
         rows, screen, loss = self._differentiate(batch.view, self._over(batch), batch.background, batch.degree, focus)
+        if batch.refine:
+            self._refine(batch, rows)
         self._limit(rows)
         adam.step(state, rows, batch.rates)
         if focus is None:
@@ -86,6 +90,16 @@ class CpuStep:
             self.state.arrays(), self.state.face.numpy(), self._seen, degree, background, focus, REACH,
             antialiased=self._settings.antialiased, scratch=self._scratch,
         )  # fmt: skip
+
+    def _refine(self, batch: Batch, rows: np.ndarray) -> None:
+        """Step FLAME's parameters of the timestep along the gradient of the loss, which the splats' rows hold."""
+        store, state, timestep = self._frames, self.state, batch.view.timestep
+        assert store.tracking is not None  # nobody else asks for it
+        frames, gradients = store.of(timestep), Parameters(*(g.numpy() for g in state.gradients))
+        asked = frame_gradient(state.arrays(), state.face.numpy(), gradients, rows, frames)
+        pull = frame_pull(store.mesh(timestep), store.capture.faces, frames, *asked)
+        store.tracking.step(timestep, pull, batch.refine)
+        store.forget()
 
     def _limit(self, rows: np.ndarray) -> None:
         """Add the gradients of the limits that keep splats near what they cover."""

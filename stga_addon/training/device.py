@@ -36,10 +36,12 @@ def choose_device(wanted: str) -> tuple[str, str]:
 def make_step(device: str, settings: Settings, lengths: np.ndarray, frames: FrameStore, state: TrainState) -> Step:
     """What computes iterations on a device of `choose_device`.
 
-    lengths (F,): what a triangle's limits are multiples of.
+    lengths (F,): what a triangle's limits are multiples of. Raises StgaError where the settings need another device.
     """
     if device == "cpu":
         return CpuStep(settings, lengths, frames, state)
+    if settings.tracking:
+        raise StgaError(f"effect tracking: FLAME's parameters are refined on the CPU only, not on {device}")
     from .warp_step import WarpStep
 
     return WarpStep("cpu" if device == "warp-cpu" else device, settings, lengths, frames, state)

@@ -4,6 +4,7 @@ run.json        what is trained, with which settings
 selection.npz   timestep -> selected triangles
 checkpoint.npz  the whole state of training, replaced as a whole
 avatar.npz      the best avatar so far, by the held-out views
+tracking.npz    where FLAME's parameters are refined, those that avatar.npz was trained with (`tracking`)
 metrics.jsonl   one line per evaluation
 """
 
@@ -25,14 +26,18 @@ from ..avatar.file import SH_SIZES
 from ..avatar.splats import MAX_SH_DEGREE
 from ..avatar.strain import STRAINS
 from ..errors import StgaError
-from ..files import file_size, partial_name, read_json, read_npz, replacing, write_json, write_npz
+from ..files import partial_name, read_json, read_npz, replacing, write_json, write_npz
 from ..locks import held, owner
+from .evaluations import METRICS, read_metrics
 from .plan import Decision, plan_from_json, plan_to_json
 from .settings import SCHEDULES, STRATEGIES, Settings, from_json, to_json
 from .state import TrainState, state_of, tensors_of
+from .tracking import FILE as TRACKING
+from .tracking import Refinement
 
 FORMAT, VERSION = "stga-run", 1
-FILES = ("run.json", "selection.npz", "checkpoint.npz", "avatar.npz", "metrics.jsonl")
+REFINEMENT = "tracking/"
+FILES = ("run.json", "selection.npz", "checkpoint.npz", "avatar.npz", TRACKING, METRICS)
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,7 @@ class Checkpoint:
     elapsed_s  seconds of training so far, evaluation not counted
     best_psnr  of avatar.npz, dB; −inf before the first evaluation
     losses     of the last global iterations
+    tracking   where FLAME's parameters are refined
     """
 
     state: TrainState
@@ -65,6 +71,7 @@ class Checkpoint:
     best_psnr: float
     evaluations: int
     losses: list[float]
+    tracking: Refinement | None = None
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -162,7 +169,9 @@ def read_selection(folder: Path, faces: int) -> dict[int, np.ndarray]:
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
     arrays = {k: t.numpy() for k, t in tensors_of(checkpoint.state).items() if not k.startswith("gradients/")}
-    values = {k: v for k, v in vars(checkpoint).items() if k != "state"}
+    if checkpoint.tracking is not None:
+        arrays.update({REFINEMENT + name: array for name, array in vars(checkpoint.tracking).items()})
+    values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
     arrays["meta"] = np.frombuffer(json.dumps({"version": VERSION, **values}).encode(), np.uint8)
     write_npz(folder / "checkpoint.npz", arrays)
 
@@ -175,6 +184,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         meta = _meta(arrays.pop("meta"))
         if meta.pop("version") != VERSION:
             raise StgaError(f"{path}: was written by another version")
+        refinement = _refinement(path, arrays)
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         for name in [n for n in tensors if n.startswith("first/")]:
             tensors[name.replace("first/", "gradients/")] = torch.zeros_like(tensors[name])
@@ -182,7 +192,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             raise StgaError(f"{path}: an array has no rows")
         state = state_of(tensors)
         _check_state(path, state)
-        return Checkpoint(state=state, **meta)
+        return Checkpoint(state=state, tracking=refinement, **meta)
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
 
@@ -222,42 +232,38 @@ def _check_state(path: Path, state: TrainState) -> None:
             raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 
+def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> Refinement | None:
+    """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
+    names = [name for name in arrays if name.startswith(REFINEMENT)]
+    if not names:
+        return None
+    found = Refinement(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
+    whole = found.change.shape
+    if len(whole) != 2:
+        raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")
+    shapes = {"change": whole, "first": whole, "second": whole[1:], "steps": whole[:1]}
+    for name, array in vars(found).items():
+        dtype = np.dtype(np.int64 if name == "steps" else np.float64)
+        if array.dtype != dtype or array.shape != shapes[name]:
+            expected = f"{dtype} {shapes[name]}"
+            raise StgaError(f"{path}: {REFINEMENT}{name} is {array.dtype} {array.shape}, expected {expected}")
+        if not np.isfinite(array).all():
+            raise StgaError(f"{path}: {REFINEMENT}{name} holds a value that is not finite")
+    return found
+
+
 def append_metrics(folder: Path, line: dict[str, Any]) -> None:
     try:
-        with (folder / "metrics.jsonl").open("a", encoding="utf-8") as out:
+        with (folder / METRICS).open("a", encoding="utf-8") as out:
             out.write(json.dumps(line) + "\n")
     except OSError as error:
         raise StgaError(f"{folder / 'metrics.jsonl'}: cannot be written ({error.strerror})") from error
 
 
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All complete lines, up to the first that is none: a kill may have cut it off.
-
-    Raises StgaError where there is something else than a file, or one that cannot be read.
-    """
-    path = folder / "metrics.jsonl"
-    lines: list[dict[str, Any]] = []
-    if not path.exists():
-        return lines
-    try:
-        file_size(path)
-        with path.open("rb") as texts:
-            for text in texts:
-                line = json.loads(text.decode("utf-8"))
-                if not isinstance(line, dict) or type(line.get("iteration")) is not int:
-                    break
-                lines.append(line)
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, RecursionError):
-        pass
-    return lines
-
-
 def cut_metrics(folder: Path, iteration: int) -> None:
     """Forget evaluations after `iteration`: a resumed run makes them again."""
     kept = [line for line in read_metrics(folder) if line["iteration"] <= iteration]
-    with replacing(folder / "metrics.jsonl") as partial:
+    with replacing(folder / METRICS) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 
 

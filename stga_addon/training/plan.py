@@ -21,6 +21,7 @@ EFFECTS = (
     "jaw",
     "eyes",
     "dynamic-offsets",
+    "tracking",
 )
 """Names of what `effects.rules` decides."""
 

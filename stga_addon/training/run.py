@@ -15,12 +15,15 @@ from ..capture.model import Capture
 from ..errors import StgaError
 from ..selection import select_capture
 from . import folder as run_folder
+from .evaluations import read_metrics
 from .exposure import even_exposure
 from .folder import Checkpoint, Run
 from .forecast import clock, curve_of, forecast, horizon, level_since
 from .metrics import evaluate, peak_memory_mb
 from .schedule import view_order
 from .settings import to_json
+from .tracking import FILE as TRACKING
+from .tracking import write_tracking
 from .trainer import Trainer
 from .warm import compile_kernels
 from .watch import look, watch_views
@@ -115,6 +118,7 @@ class _Loop:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
         self.trainer = Trainer(self.capture, self.settings, selection, device=self.device)
+        (self.out / TRACKING).unlink(missing_ok=True)  # a run that was here before may have left one
         run_folder.write_selection(self.out, selection)
         run_folder.write_run(self.out, self.run)
         run_folder.cut_metrics(self.out, -1)
@@ -134,12 +138,15 @@ class _Loop:
         if bool(splats.strain_color.shape[1]) != self.settings.strain_color:
             raise StgaError(f"{self.out}: its splats and run.json disagree on whether colours follow strain")
         self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state, self.device)
+        here, there = self.trainer.tracking, checkpoint.tracking
+        if (None if here is None else here.tracked.shape) != (None if there is None else there.change.shape):
+            raise StgaError(f"{self.out}: its refined tracking is not of this capture, or run.json knows of none")
         self.trainer.continue_from(checkpoint)
         self.losses.extend(checkpoint.losses)
         self.elapsed, self.best = checkpoint.elapsed_s, checkpoint.best_psnr
         self.evaluations = checkpoint.evaluations
         run_folder.cut_metrics(self.out, checkpoint.iteration)
-        self.lines = run_folder.read_metrics(self.out)
+        self.lines = read_metrics(self.out)
 
     def work(self) -> None:
         """Train until the budget is spent, the settings' goal is reached or the report says stop."""
@@ -227,6 +234,8 @@ class _Loop:
         if not self.sights or self.psnr is None or self.psnr >= self.best:
             self.best = -np.inf if self.psnr is None else self.psnr
             write_avatar(self.out / "avatar.npz", self._avatar())
+            if self.trainer.tracking is not None:
+                write_tracking(self.out, self.trainer.tracking)
         now = perf_counter()
         line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
         line["peak_memory_mb"] = peak_memory_mb()
@@ -268,6 +277,7 @@ class _Loop:
             Checkpoint(
                 trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
                 self.elapsed, self.best, self.evaluations, list(self.losses),
+                None if trainer.tracking is None else trainer.tracking.state,
             ),
         )  # fmt: skip
 

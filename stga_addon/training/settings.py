@@ -75,6 +75,7 @@ class Settings:
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
                    images, which are taken away when they are read
+    tracking       refine FLAME's expression, joints and translation of each training timestep (`tracking`)
     effects        effect -> "on" or "off" where the person has decided, with everything else to be decided from the
                    capture (`effects.plan`); None: these settings are final
     """
@@ -116,6 +117,7 @@ class Settings:
     antialiased: bool = False
     teeth: bool = True
     exposure: tuple[tuple[float, ...], ...] = ()
+    tracking: bool = False
     effects: Mapping[str, str] | None = None
 
 

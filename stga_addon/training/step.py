@@ -20,6 +20,7 @@ class Batch:
     degree      of spherical harmonics in use
     selected    (F,) bool triangles whose splats alone are trained; None trains all
     rates       learning rate by parameter name, and "sh_rest"
+    refine      share of the full rates by which FLAME's parameters of the timestep are stepped, 0 for not at all
     """
 
     view: View
@@ -29,6 +30,7 @@ class Batch:
     degree: int
     selected: np.ndarray | None
     rates: Mapping[str, float]
+    refine: float = 0.0
 
 
 class Step(Protocol):

@@ -19,6 +19,7 @@ from .seeds import hull_seeds
 from .settings import Settings
 from .state import TrainState, new_state
 from .step import Batch
+from .tracking import refining_share, track
 
 SPLIT_SHARE = 0.02
 """Largest share of the splats that one round of density control splits."""
@@ -41,7 +42,8 @@ class Trainer:
     ) -> None:
         """device: one of `choose_device`."""
         self.capture, self.settings, self.selection = capture, settings, selection
-        self.frames = FrameStore(capture, settings.convention, settings.strain_color)
+        self.tracking = track(capture, settings.convention) if settings.tracking else None
+        self.frames = FrameStore(capture, settings.convention, settings.strain_color, self.tracking)
         self._lengths = face_lengths(capture, settings.convention)
         state = new_state(initial_splats(capture, settings)) if state is None else state
         self._step = make_step(device, settings, self._lengths, self.frames, state)
@@ -67,6 +69,8 @@ class Trainer:
         """Take over everything that a step depends on."""
         self.state, self.iteration, self.visit = checkpoint.state, checkpoint.iteration, checkpoint.visit
         self.last_timestep, self.initial_count = checkpoint.last_timestep, checkpoint.initial_count
+        if self.tracking is not None and checkpoint.tracking is not None:
+            self.tracking.state = checkpoint.tracking
 
     def step(self, view: View, target: np.ndarray, progress: float, mask: np.ndarray | None = None) -> float | None:
         """Train one view.
@@ -86,6 +90,8 @@ class Trainer:
             mask = None
         if mask is not None:
             background = np.random.default_rng([settings.seed, self.iteration]).random(3, np.float32)
+        selected = None if whole else self._selected(view.timestep)
+        refine = refining_share(progress) if self.tracking is not None and selected is None else 0.0
         loss = self._step.train(
             Batch(
                 view,
@@ -93,8 +99,9 @@ class Trainer:
                 mask,
                 background,
                 sh_degree(settings, progress),
-                None if whole else self._selected(view.timestep),
+                selected,
                 learning_rates(settings.rates, progress),
+                refine,
             )
         )
         self.iteration += 1

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from training.heads import write_head
 
 from stga_addon.capture.images import read_view
 from stga_addon.effects.plan import plan_effects
@@ -67,6 +68,25 @@ def test_on_calls_all(painted, tmp_path, monkeypatch):
     assert calls["background"] == ITERATIONS
     assert splats.sh.shape[1] == 16
     assert splats.strain_color.shape[1] == 3
+
+
+@pytest.mark.parametrize("choice", ["on", "off"])
+def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
+    """Catches parameters that are read, differentiated or written where nobody asked for it, or not where one did."""
+    capture, _ = write_head(tmp_path / "head")
+    settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
+    calls: Counter[str] = Counter()
+    for module, name in ((trainer, "track"), (cpu_step, "frame_pull"), (run, "write_tracking")):
+        monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
+    run.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
+    if choice == "off":
+        assert calls == {}
+        assert read_checkpoint(tmp_path / "run").tracking is None
+        assert not (tmp_path / "run/tracking.npz").exists()
+    else:
+        assert calls["track"] == 1
+        assert calls["frame_pull"] == ITERATIONS - 2  # none in the first 15 %
+        assert calls["write_tracking"] > 0
 
 
 def test_exposure_is_taken_away(painted):

@@ -194,10 +194,32 @@ def test_dynamic_offsets():
     assert (found.on, found.only) == (True, True)
 
 
+def off_track(capture, metres, device="cpu"):
+    """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
+    meshes = {timestep: capture.mesh(timestep) + np.array([metres, 0, 0]) for timestep in capture.timesteps}
+    facts = Facts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
+    facts.frames = [frame()]
+    return facts
+
+
+def test_mesh_and_mask_disagree(painted):
+    """Catches a tracking that is off and left so, and one that is refined although nothing says that it is off."""
+    assert not rules.tracking(off_track(painted(), 0.0)).on
+    found = rules.tracking(off_track(painted(), 0.012))  # five pixels
+    assert found.on
+    assert 0.5 < float(found.reason.split("%")[0]) < 5.0
+    unknown = rules.tracking(off_track(painted(masks=False), 0.012))
+    assert (unknown.on, unknown.only) == (False, False)
+    for impossible in (off_track(painted(timesteps=1), 0.012), off_track(painted(), 0.012, "cuda:0")):
+        verdict = rules.tracking(impossible)
+        assert (verdict.on, verdict.only) == (False, True)
+    assert "on the CPU only, not on cuda:0" in verdict.reason
+
+
 def test_what_a_mesh_sequence_has_not(painted):
     """Catches an effect of FLAME's that is planned for, or forced on, a capture without its parameters."""
     plan, _ = planned(painted())
-    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets"}
+    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}
     with pytest.raises(StgaError, match=r"--effect teeth=on: .* has none"):
         planned(painted(), teeth="on")
     with pytest.raises(StgaError, match=r"--effect jaw=on: .* no parameters of FLAME"):

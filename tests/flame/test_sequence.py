@@ -157,6 +157,9 @@ def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
         added = np.full((40, 3), 0.01) if timestep == 2 else None
         expected = flame_forward(tiny_flame, frames[0]["shape"], replace(single, dynamic_offset=added), offset[0])
         np.testing.assert_allclose(sequence_mesh(motion, timestep), expected, atol=1e-7)
+    named = read_motion(_write(tmp_path / "named.npz", {**moving, "timesteps": np.array([2, 3, 7])}), tiny_flame)
+    assert named.timesteps == (2, 3, 7)
+    np.testing.assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
 
 
 @pytest.mark.parametrize(
@@ -170,6 +173,11 @@ def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
         ("pose", np.zeros((3, 9)), r"pose has shape \(3, 9\), expected \(timesteps, 6\) or \(timesteps, 15\)"),
         ("pose", np.zeros((0, 6)), "pose has shape"),
         ("pose", np.zeros(6), "pose has shape"),
+        ("timesteps", np.array([0, 1]), "timesteps are no 3 whole numbers"),
+        ("timesteps", np.array([0, 2, 2]), "timesteps are no 3 whole numbers"),
+        ("timesteps", np.array([0.0, 1.0, 2.0]), "timesteps are no 3 whole numbers"),
+        ("timesteps", np.array([0, 1, 2**63 + 1], np.uint64), "timesteps are no 3 whole numbers"),
+        ("timesteps", np.array([0, 1, 2**40]), "timesteps are no 3 whole numbers"),
     ],
 )
 def test_malformed_motions(

@@ -37,3 +37,7 @@ def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
         store.of(timestep)
     store.of(1)
     assert read == [1, *range(2, KEPT + 2), 1]
+    store.forget()
+    store.mesh(1)
+    store.of(1)
+    assert read[-2:] == [1, 1]  # read again, once for mesh and frames

@@ -1,0 +1,92 @@
+"""What refining FLAME's parameters brings, and costs where they are right, at the same number of iterations.
+
+    python benchmarks/tracking.py CAPTURE --flame FILE [--iterations 500] [--errors 0 0.5 1]
+
+CAPTURE should be tracked exactly, as the demo's is. Disturbs the parameters of its training timesteps by random steps
+(1: 2 mm, 1° a joint, 0.15 of an expression), trains with the effect and without, and prints how far the meshes are
+from where they should be, the PSNR of the held-out view and of the unseen timesteps, which are not disturbed, and the
+time of an iteration, for which the machine should be idle.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.flame_capture import with_sequence
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.effects.facts import Facts
+from stga_addon.effects.plan import plan_effects
+from stga_addon.flame.forward import FlameFrame
+from stga_addon.training.evaluations import read_metrics
+from stga_addon.training.folder import Run
+from stga_addon.training.metrics import measure
+from stga_addon.training.run import train
+from stga_addon.training.settings import make_settings
+from stga_addon.training.tracking import JOINTS, PLACE, numbers_of, refined, with_numbers
+
+COEFFICIENT, RADIAN, METRE = 0.15, 0.0175, 0.002
+
+
+def lose_track(capture: Capture, error: float) -> Capture:
+    """The FLAME capture with other parameters in its training timesteps."""
+    sequence = capture.flame
+    assert sequence is not None
+    expressions = sequence.model.n_expression
+    sizes = np.repeat([COEFFICIENT, RADIAN, METRE], [expressions, JOINTS, PLACE])
+    disturbed = {view.timestep for view in capture.views["train"]}
+
+    def frame(timestep: int) -> FlameFrame:
+        tracked = sequence.frame(timestep)
+        if timestep not in disturbed:
+            return tracked
+        steps = np.random.default_rng(timestep).normal(0, error * sizes)
+        return with_numbers(tracked, numbers_of(tracked) + steps)
+
+    return with_sequence(capture, replace(sequence, frame=frame))
+
+
+def millimetres(capture: Capture, true: Capture) -> float:
+    """Mean distance of vertices between two captures' training timesteps."""
+    timesteps = {view.timestep for view in true.views["train"]}
+    return 1000 * float(np.mean([np.linalg.norm(capture.mesh(t) - true.mesh(t), axis=1).mean() for t in timesteps]))
+
+
+def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tuple[Capture, Mapping[str, float], float]:
+    """The capture as it was refined, the PSNR by split, and the seconds of an iteration."""
+    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
+    with tempfile.TemporaryDirectory() as folder:
+        avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
+        shown, last = refined(capture, Path(folder)), read_metrics(Path(folder))[-1]
+    quality = {split: measure(avatar, shown, split).psnr for split in ("val", "test")}
+    return shown, quality, last["seconds"] / last["iteration"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--flame", type=Path, required=True)
+    parser.add_argument("--iterations", type=int, default=500)
+    parser.add_argument("--errors", type=float, nargs="+", default=[0, 0.5, 1])
+    options = parser.parse_args()
+    true = open_capture(options.capture, options.flame)
+    for error in options.errors:
+        capture = lose_track(true, error)
+        outside = Facts(capture, make_settings(iterations=1)).outside
+        print(f"error {error:g}: {outside:.2%} of the mesh outside the masks", flush=True)
+        for choice in ("off", "on"):
+            shown, psnr, pace = trained(capture, options.flame, options.iterations, choice)
+            quality = ", ".join(f"{split} {value:.2f} dB" for split, value in psnr.items())
+            print(
+                f"  {choice:<4}{millimetres(shown, true):6.2f} mm  {quality}  {1000 * pace:.1f} ms an iteration",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
