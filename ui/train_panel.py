@@ -10,8 +10,10 @@ from ..operators.common import package, settings
 from ..operators.plan import chosen_effects
 from ..operators.runtime import has_runtime
 from ..stga_addon.job import describe, folder_of
+from ..stga_addon.scene import tags
 from ..stga_addon.task import Snapshot, State
 from ..stga_addon.training.forecast import clock
+from ..stga_addon.training.plan import TRACKING
 from .curve import draw_curve
 from .mishap import draw_mishap
 from .properties import seconds_of_presets
@@ -83,4 +85,17 @@ def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
         for line in describe(now.status.figures)[1:]:
             draw_text(box, context, line)
         draw_curve(box, run)
+        if (run / TRACKING).is_file():
+            _draw_refined(box, context, run / TRACKING)
     row.operator(ids.DISMISS_TRAINING, text="", icon="X", emboss=False)
+
+
+def _draw_refined(layout: Any, context: Any, path: Path) -> None:
+    """The splats were trained on other meshes than the imported ones, which a click exchanges."""
+    head = settings(context).head
+    column = layout.column()
+    column.operator_context = "EXEC_DEFAULT"  # without a file dialog
+    column.enabled = head is not None
+    apply = column.operator(ids.APPLY_MOTION, text="Apply Refined Tracking", icon="CON_FOLLOWTRACK")
+    apply.filepath, apply.source = str(path), ""
+    apply.start = head[tags.TIMESTEPS][0] if head is not None else 1

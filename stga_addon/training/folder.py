@@ -29,10 +29,9 @@ from ..errors import StgaError
 from ..files import partial_name, read_json, read_npz, replacing, write_json, write_npz
 from ..locks import held, owner
 from .evaluations import METRICS, read_metrics
-from .plan import Decision, plan_from_json, plan_to_json
+from .plan import TRACKING, Decision, plan_from_json, plan_to_json
 from .settings import SCHEDULES, STRATEGIES, Settings, from_json, to_json
 from .state import TrainState, state_of, tensors_of
-from .tracking import FILE as TRACKING
 from .tracking import Refinement
 
 FORMAT, VERSION = "stga-run", 1

@@ -24,6 +24,8 @@ EFFECTS = (
     "tracking",
 )
 """Names of what `effects.rules` decides."""
+TRACKING = "tracking.npz"
+"""Name of the file in a run's folder that holds its refined parameters (`tracking`, which needs torch)."""
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from .exposure import even_exposure
 from .folder import Checkpoint, Run
 from .forecast import clock, curve_of, forecast, horizon, level_since
 from .metrics import evaluate, peak_memory_mb
+from .plan import TRACKING
 from .schedule import view_order
 from .settings import to_json
-from .tracking import FILE as TRACKING
 from .tracking import write_tracking
 from .trainer import Trainer
 from .warm import compile_kernels

@@ -17,8 +17,8 @@ from ..flame.forward import FlameFrame
 from ..flame.forward_torch import flame_forward, flame_tensors
 from ..flame.sequence import FRAME_FIELDS, FlameSequence, read_motion, sequence_mesh, with_identity
 from ..raster.render import Parameters
+from .plan import TRACKING
 
-FILE = "tracking.npz"
 START = 0.15
 """Share of the budget before the first step: splats that show nothing yet pull nowhere."""
 END = 0.1
@@ -171,7 +171,7 @@ def write_tracking(folder: Path, tracking: Tracking) -> None:
     if sequence.static_offset is not None:
         arrays["static_offset"] = sequence.static_offset
     arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracking.tracked
-    write_npz(folder / FILE, arrays, compressed=True)
+    write_npz(folder / TRACKING, arrays, compressed=True)
 
 
 def refined(capture: Capture, folder: Path) -> Capture:
@@ -180,7 +180,7 @@ def refined(capture: Capture, folder: Path) -> Capture:
     A timestep is taken from the run only where the capture has the parameters that the run began with, so that another
     capture given in its place stays as it is. Raises StgaError where the run's file is damaged.
     """
-    path, sequence = folder / FILE, capture.flame
+    path, sequence = folder / TRACKING, capture.flame
     if sequence is None or not path.exists():
         return capture
     motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
