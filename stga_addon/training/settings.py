@@ -24,15 +24,15 @@ class Rates:
     Positions in local units (metres of the neutral mesh), scales as logarithms, opacity as logit.
     """
 
-    xyz: float = 2e-4
-    rotation: float = 5e-3
-    log_scale: float = 2e-2
-    opacity: float = 5e-2
-    sh: float = 2e-2
-    sh_rest: float = 1e-3
-    strain_color: float = 5e-3
-    position_end: float = 0.05
-    end: float = 0.2
+    xyz: float = 4e-4
+    rotation: float = 1e-2
+    log_scale: float = 4e-2
+    opacity: float = 1e-1
+    sh: float = 4e-2
+    sh_rest: float = 2e-3
+    strain_color: float = 1e-2
+    position_end: float = 0.025
+    end: float = 0.1
 
 
 @dataclass(frozen=True)
