@@ -34,13 +34,14 @@ KNOBS: dict[str, Changes] = {
     "no-strays": {"stray_every": 0},
     "frame-batches": {"views_per_visit": 0},
     "selective": {"strategy": "selective"},
-    "selective-every-1": {"strategy": "selective", "global_every": 1},
+    "selective-every-2": {"strategy": "selective", "global_every": 2},
     "selective-every-20": {"strategy": "selective", "global_every": 20},
+    "selective-warm-30%": {"strategy": "selective", "warm_up": 0.3},
     "selective-1mm": {"strategy": "selective", "selection": SelectionOptions(threshold=0.001)},
     "selective-5mm": {"strategy": "selective", "selection": SelectionOptions(threshold=0.005)},
 }
 """One setting changed at a time: resolution, splats a triangle, degree of colour, loss, density control, stray
-resets, order of views, and for selective training the period of global iterations and the threshold."""
+resets, order of views, and for selective training the period of global iterations, its beginning and the threshold."""
 
 
 def settings_of(changes: Changes, seconds: float) -> Settings:

@@ -54,8 +54,8 @@ class Settings:
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     distance_weight, distance_limit   the same for the distance from the triangle's origin
-    stray_every, stray_limit    every so many iterations, a splat farther than this from its triangle's origin is
-                   put back onto it; 0 never
+    stray_every, stray_limit, stray_to    every so many iterations (0: never), a splat farther than the limit from its
+                   triangle's origin is put back to this share of the limit; 0: onto the origin, as in the paper
                    All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
                    for "gaussian_avatars"
     sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
@@ -88,9 +88,9 @@ class Settings:
     lattice: int = 2
     convention: str = "stga"
     views_per_visit: int = 1
-    global_every: int = 2
+    global_every: int = 1
     global_unit: str = "iteration"
-    warm_up: float = 0.3
+    warm_up: float = 0.6
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     rates: Rates = field(default_factory=Rates)
     ssim_weight: float = 0.2
@@ -100,6 +100,7 @@ class Settings:
     distance_limit: float = 1.0
     stray_every: int = 200
     stray_limit: float = 6.0
+    stray_to: float = 1.0
     sh_degree: int = 3
     sh_steps: tuple[float, ...] = (0.3, 0.5, 0.7)
     seeds: bool = True
@@ -127,6 +128,7 @@ PAPER = {
     "warm_up": 0.0,
     "scale_limit": 1.0,
     "stray_limit": 1.0,
+    "stray_to": 0.0,
     "lattice": 4,
     "seeds": False,
     "any_background": False,

@@ -127,7 +127,7 @@ class Trainer:
             return
         state = self.state
         if stray:
-            reset_strays(state, settings.stray_limit * self._lengths)
+            reset_strays(state, settings.stray_limit * self._lengths, settings.stray_to)
         if density:
             room = round(self.initial_count * (1 + settings.growth)) - len(state)
             rng = np.random.default_rng([settings.seed, self.iteration])
@@ -163,14 +163,19 @@ def teeth_triangles(capture: Capture) -> np.ndarray:
     return np.asarray(np.isin(capture.faces, masks.get("teeth", ())).all(axis=1))
 
 
-def reset_strays(state: TrainState, limit: np.ndarray) -> int:
-    """Put splats that left their triangle's neighbourhood back onto its origin (STGA, training); returns how many.
+def reset_strays(state: TrainState, limit: np.ndarray, to: float) -> int:
+    """Put splats that left their triangle's neighbourhood back, to the share `to` of the limit; returns how many.
 
-    limit (F,) in local units. Loose splats may be anywhere. The moments of a position that was reset start anew.
+    limit (F,) in local units, from the triangle's origin. Loose splats may be anywhere. The moments of a position that
+    was reset start anew. (STGA, training, which puts them onto the origin: to = 0.)
     """
-    distance = state.parameters.xyz.norm(dim=1).numpy()
-    strays = torch.from_numpy(~state.loose.numpy() & (distance > limit[state.face.numpy()]))
-    for tensor in (state.parameters.xyz, state.first.xyz, state.second.xyz):
+    distance = state.parameters.xyz.norm(dim=1)
+    allowed = torch.from_numpy(limit)[state.face.long()]
+    strays = ~state.loose & (distance > allowed)
+    # Rounding must not leave them just beyond the limit, or they would be strays again.
+    factor = (to * (1 - 1e-6) * allowed / distance)[strays, None]
+    state.parameters.xyz[strays] = torch.where(factor > 0, factor * state.parameters.xyz[strays], 0)
+    for tensor in (state.first.xyz, state.second.xyz):
         tensor[strays] = 0
     return int(strays.sum())
 

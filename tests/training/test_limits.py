@@ -72,7 +72,8 @@ def test_within_the_limits_nothing_happens(kernel) -> None:
     np.testing.assert_array_equal(out, 0.25)
 
 
-def test_stray_resets() -> None:
+@pytest.mark.parametrize("to", [0.0, 0.5, 1.0])
+def test_stray_resets(to: float) -> None:
     """Catches a limit of another triangle, loose splats pulled home, and momentum that throws a splat out again."""
     state = random_state(60, FACES)
     state.loose[:] = torch.arange(60) % 4 == 0
@@ -83,12 +84,17 @@ def test_stray_resets() -> None:
     assert 5 < strays.sum() < 40
     assert np.array(far)[::4].any()
     before = bits(state)
-    assert reset_strays(state, limit) == strays.sum()
+    assert reset_strays(state, limit, to) == strays.sum()
     after = bits(state)
     for name, old in before.items():
         if name in ("parameters/xyz", "first/xyz", "second/xyz"):
-            assert not after[name][strays].any()
             np.testing.assert_array_equal(after[name][~strays], old[~strays])
+        if name == "parameters/xyz":
+            length = np.linalg.norm(xyz[strays].astype(float), axis=1, keepdims=True)
+            wanted = xyz[strays] / length * to * limit[face[strays], None]
+            np.testing.assert_allclose(state.parameters.xyz.numpy()[strays], wanted, rtol=1e-5)
+        elif name in ("first/xyz", "second/xyz"):
+            assert not after[name][strays].any()
         else:
             np.testing.assert_array_equal(after[name], old, err_msg=name)
-    assert reset_strays(state, limit) == 0
+    assert reset_strays(state, limit, to) == 0

@@ -1,0 +1,110 @@
+"""Kernels on Python's threads: every unit once, errors told, several callers at a time, the lock let go."""
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba")
+
+from stga_addon.raster.kernels import jit
+from stga_addon.raster.kernels.threads import parallel, set_threads, threads
+
+from .test_kernels import SCENES, kernel_gradients, random_cotangents
+
+
+@pytest.fixture(autouse=True)
+def as_many_as_before() -> Iterator[None]:
+    before = threads()
+    yield
+    set_threads(before)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("units", [0, 1, 2, 5, 8, 100])
+def test_every_unit_is_done_once(count: int, units: int) -> None:
+    """Catches pieces that overlap, are left out at the end, or are taken by two threads."""
+
+    @parallel(len)
+    def count_up(begin: int, end: int, done: np.ndarray) -> None:
+        for n in range(begin, end):
+            done[n] += 1
+
+    set_threads(count)
+    done = np.zeros(units, int)
+    for _ in range(20):
+        count_up(done)
+    assert (done == 20).all()
+
+
+@pytest.mark.parametrize("at", [0, 9])
+def test_an_error_reaches_the_caller(at: int) -> None:
+    """Catches an error that dies with its thread, a caller that then waits for ever, and threads lost to it."""
+
+    @parallel(len)
+    def fail(begin: int, end: int, numbers: np.ndarray) -> None:
+        if begin <= at < end:
+            raise ValueError("this piece")
+
+    set_threads(3)
+    for _ in range(5):
+        with pytest.raises(ValueError, match="this piece"):
+            fail(np.zeros(10))
+
+
+def test_several_callers_at_a_time() -> None:
+    """Catches shared state between calls: Blender draws a viewport in a thread of its own while another one renders."""
+    scene = SCENES["plain"]
+    cotangents = random_cotangents(scene.camera)
+    _, expected = kernel_gradients(scene, cotangents)
+    found: list[dict[str, np.ndarray]] = []
+
+    def render() -> None:
+        for _ in range(5):
+            found.append(kernel_gradients(scene, cotangents)[1])
+
+    set_threads(2)
+    callers = [threading.Thread(target=render) for _ in range(3)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert len(found) == 15
+    for gradients in found:
+        for name, value in gradients.items():
+            np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+@jit
+def spin(begin, end, times, out):
+    for n in range(begin, end):
+        x = 0.0
+        for k in range(times):
+            x += 1.0 / (1.0 + x * x + k)
+        out[n] = x
+
+
+def test_python_goes_on_meanwhile() -> None:
+    """Catches kernels that hold Python's lock: Blender's window would stand still while a picture is drawn."""
+    out = np.zeros(1)
+    spin(0, 1, 1, out)
+    ticks = []
+    ended = threading.Event()
+
+    def tick() -> None:
+        while not ended.is_set():
+            ticks.append(time.monotonic())
+            time.sleep(0.001)
+
+    other = threading.Thread(target=tick)
+    other.start()
+    while not ticks:
+        time.sleep(0.001)
+    before = len(ticks)
+    spin(0, 1, 100_000_000, out)  # some tenths of a second
+    during = len(ticks) - before
+    ended.set()
+    other.join()
+    assert during > 1
