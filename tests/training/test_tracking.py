@@ -46,6 +46,11 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return write_head(tmp_path_factory.mktemp("right"), error=0.0)
 
 
+@pytest.fixture(scope="module", params=[False, True], ids=["", "antialiased"])
+def finished(right: Made, request: pytest.FixtureRequest) -> Trainer:
+    return trained(right[0], 300, antialiased=request.param, tracking=True)
+
+
 def trained(capture: Capture, iterations: int, **changes: Any) -> Trainer:
     settings = quick_settings("global", iterations=iterations, lattice=1, sh_degree=0, sh_steps=(), **changes)
     trainer = Trainer(capture, settings, {})
@@ -59,6 +64,8 @@ def trained(capture: Capture, iterations: int, **changes: Any) -> Trainer:
 
 GROUPS = {"expression": slice(0, 2), "root": slice(2, 5), "jaw": slice(8, 11), "translation": slice(17, 20)}
 """Where the numbers of the ball's FLAME stand."""
+AWAY = {"expression": 0.5, "root": 0.03, "jaw": 0.1, "translation": 0.002}
+"""What they are disturbed by: coefficients, radians, metres."""
 
 
 def differences(tracking: Tracking, timestep: int, loss: Callable[[], float], step: float) -> np.ndarray:
@@ -114,37 +121,39 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_the_gradient_points_where_the_image_gets_better(lost: Made, antialiased: bool) -> None:
-    """Catches a gradient that is right for splats, but not for the loss that is trained.
+@pytest.mark.parametrize("name", GROUPS)
+def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name: str) -> None:
+    """Catches a gradient that is right for splats, but not for the loss that is trained: along a disturbance of a
+    tracking that was right, against differences of the image loss.
 
-    No better than this: splats that change places in depth, and their rims, are steps that no gradient tells of.
+    No closer than this: splats that change places in depth, and their rims, are steps that no gradient tells of.
     """
-    capture, _ = lost
-    trainer = trained(capture, 100, antialiased=antialiased, tracking=True)
+    trainer, capture = finished, finished.capture
     step, tracking = trainer._step, trainer.tracking
     assert isinstance(step, CpuStep)
     assert tracking is not None
     view = next(view for view in capture.views["train"] if view.timestep == 3)
     target, face = read_image(view), trainer.state.face.numpy()
-    rows, _, _ = step._differentiate(view, target, WHITE, 0, None)
-    gradients = Parameters(*(tensor.numpy() for tensor in trainer.state.gradients))
-    frames = trainer.frames.of(3)
+    row, before, part = tracking.sequence.timesteps.index(3), tracking.tracked.copy(), GROUPS[name]
+    away = np.zeros(before.shape[1])
+    away[part] = np.random.default_rng(3).normal(0, AWAY[name], part.stop - part.start)
+
+    def differentiate(share: float) -> tuple[np.ndarray, float]:
+        tracking.tracked = before.copy()
+        tracking.tracked[row] += share * away
+        trainer.frames.forget()
+        rows, _, loss = step._differentiate(view, target, WHITE, 0, None)
+        assert loss is not None
+        return rows, loss
+
+    slope = (differentiate(1.15)[1] - differentiate(0.85)[1]) / 0.3
+    rows, _ = differentiate(1.0)
+    gradients, frames = Parameters(*(tensor.numpy() for tensor in trainer.state.gradients)), trainer.frames.of(3)
     asked = frame_gradient(trainer.state.arrays(), face, gradients, rows, frames)
     found = tracking.gradient(3, frame_pull(trainer.frames.mesh(3), capture.faces, frames, *asked))
-
-    def loss() -> float:
-        trainer.frames.forget()
-        _, _, value = step._differentiate(view, target, WHITE, 0, None)
-        assert value is not None
-        return value
-
-    expected = differences(tracking, 3, loss, 3e-4)
-    for name, part in GROUPS.items():
-        ours, theirs = found[part], expected[part]
-        lengths = np.linalg.norm(ours), np.linalg.norm(theirs)
-        assert ours @ theirs > 0.98 * lengths[0] * lengths[1], name
-        assert 0.6 < lengths[0] / lengths[1] < 1.2, name
+    tracking.tracked = before
+    assert slope > 0
+    assert 0.7 < found @ away / slope < 1.2
 
 
 def millimetres(trainer: Trainer, true: dict[int, np.ndarray]) -> float:
@@ -182,7 +191,9 @@ def test_what_it_costs_where_nothing_is_wrong(right: Made) -> None:
 def test_nothing_moves_before_there_is_something_to_see(lost: Made) -> None:
     """Catches a tracking that follows grey splats, and one that moves in local iterations."""
     capture, _ = lost
-    trainer = Trainer(capture, quick_settings("selective", warm_up=0.0, tracking=True), {0: np.arange(320) < 9})
+    trainer = Trainer(
+        capture, quick_settings("selective", warm_up=0.0, global_every=2, tracking=True), {0: np.arange(320) < 9}
+    )
     view = next(view for view in capture.views["train"] if view.timestep == 0)
     assert trainer.tracking is not None
     steps = trainer.tracking.state.steps
