@@ -151,8 +151,8 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         ),
         "project backward": (
             lambda: project_backward(
-                *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
-                False, False, r.projected, rows, r.slot_start, r.slot_count, pair_gradients, False, *gradients, screen,
+                rows, *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
+                False, False, r.projected, r.slot_start, r.slot_count, pair_gradients, False, *gradients, screen,
             ),
             pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),

@@ -225,8 +225,8 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        *complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens,
-        seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected, rows,
+        rows, *complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world,
+        seen.lens, seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected,
         rendering.slot_start, rendering.slot_count, pair_gradients, add, *complete(gradients), screen,
     )  # fmt: skip
     return rows, screen

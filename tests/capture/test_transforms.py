@@ -98,6 +98,19 @@ def test_camera_is_known_by_where_it_stands(tmp_path: Path) -> None:
     assert [frame.view.camera_index for frame in read_splits(tmp_path).frames] == [0, 0, 1]
 
 
+def test_frames_share_cameras_that_are_alike_in_everything(tmp_path: Path) -> None:
+    """Catches a camera of its own for each of 18,000 views, and one lens or pose taken for another's."""
+    entries = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(2, 0), factory.frame(3, 0), factory.frame(4, 1)]
+    entries[2]["fl_x"] += 1.0
+    entries[3]["cy"] += 1.0
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": entries}))
+    cameras = [frame.view.camera for frame in read_splits(tmp_path).frames]
+    assert cameras[0] is cameras[1]
+    assert len({id(camera) for camera in cameras}) == 4
+    assert cameras[2].fl_x == cameras[0].fl_x + 1
+    assert cameras[3].cy != cameras[0].cy
+
+
 def test_single_file_is_all_training(tmp_path: Path) -> None:
     """Catches frames lost, or split by guesswork, where a capture has transforms.json alone."""
     frames = [factory.frame(0, camera) for camera in range(3)]

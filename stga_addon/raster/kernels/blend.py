@@ -56,19 +56,9 @@ def _row_range(mean_y, extent_y, top):
 @parallel(lambda tiles, *_: len(tiles))
 @jit
 def blend_forward(
-    first_tile,
-    past_tile,
-    tiles,
-    tiles_x,
-    start,
-    pair_splat,
-    projected,
-    extent_y,
-    background,
-    image,
-    transmittance,
-    last,
-):
+    first_tile, past_tile,
+    tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last,
+):  # fmt: skip
     """Render the listed tiles.
 
     tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int32 into the pair

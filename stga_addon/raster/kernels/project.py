@@ -248,12 +248,12 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
     )  # fmt: skip
 
 
-@parallel(lambda *arguments: len(arguments[17]))  # visible
+@parallel(lambda visible, *_: len(visible))
 @jit
 def project_backward(
-    begin, end,
+    begin, end, visible,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, visible, slot_start, slot_count, grads, add,
+    depth_as_colour, antialiased, projected, slot_start, slot_count, grads, add,
     v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of v_* (or add it); the counterpart of `project_forward`.
