@@ -17,7 +17,7 @@ from ..files import file_size, read_json
 from ..flame.masks import faces_within
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
-CACHE_BYTES = 64 << 20
+CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 GLB_JSON = b"JSON"
 MAX_NODES, MAX_CORNERS = 1000, 1 << 22
@@ -78,11 +78,11 @@ def tracked_meshes(
             )
         return vertices
 
-    return remembered(mesh, len(faces))
+    return remembered(mesh, int(faces.max()) + 1)
 
 
 def remembered(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
-    """The same function with its latest results kept, read-only, within 64 MiB; `vertices` says how large one is."""
+    """The same function with its latest results kept, read-only, within 8 MiB; `vertices` says how large one is."""
 
     @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
     def kept(timestep: int) -> np.ndarray:
@@ -174,30 +174,35 @@ def _check_glb(data: bytes) -> None:
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """trimesh cannot keep an OBJ's order once it has several materials or objects: it regroups and splits vertices."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
+    points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]
+    polygons = [n for n, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
     try:
-        vertices = np.array([line.split()[1:4] for line in lines if line[:2] in (b"v ", b"v\t")], dtype=np.float64)
+        vertices = np.array([lines[n].split()[1:4] for n in points], np.float64)
     except ValueError as error:
         raise StgaError(f"{path}: a vertex line does not hold three numbers") from error
-    triangles: list[list[int]] = []
-    count = 0
+    text = b"\n".join([lines[n] for n in polygons])
     try:
-        for line in lines:
-            kind = line[:2]
-            if kind in (b"v ", b"v\t"):
-                count += 1
-            elif kind in (b"f ", b"f\t"):
-                corners = [_corner(word, count) for word in line.split()[1:]]
-                if len(corners) < 3:
-                    raise ValueError("fewer than three corners")
-                triangles += ([corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1))
-        return vertices.reshape(-1, vertices.shape[-1]), np.array(triangles, np.int64).reshape(-1, 3)
+        faces = _triangles(text, tuple(np.searchsorted(points, polygons)) if b"-" in text else (0,) * len(polygons))
     except (ValueError, OverflowError) as error:
         raise StgaError(f"{path}: a face line is malformed ({error})") from error
+    return vertices, faces
 
 
-def _corner(word: bytes, count: int) -> int:
-    """Vertex index from 0 up: OBJ counts from 1, and backwards from the latest vertex where negative."""
-    index = int(word.partition(b"/")[0])
-    if index == 0:
+@lru_cache(maxsize=2)
+def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
+    """(F, 3) of an OBJ's face lines, polygons as fans; kept, because all files of a sequence have the same lines.
+
+    OBJ counts vertices from 1 up, or backwards from the latest of the `earlier` ones of each line. Raises ValueError.
+    """
+    corners = [line.split()[1:] for line in text.splitlines()]
+    count = np.array([len(words) for words in corners], int)
+    if (count < 3).any():
+        raise ValueError("fewer than three corners")
+    index = np.array([int(word.partition(b"/")[0]) for words in corners for word in words], np.int64)
+    if (index == 0).any():
         raise ValueError("vertex 0, but OBJ counts from 1")
-    return index - 1 if index > 0 else count + index
+    index = np.where(index > 0, index - 1, np.repeat(np.array(earlier, int), count) + index)
+    fan = count - 2
+    first = np.repeat(np.cumsum(count) - count, fan)
+    second = first + 1 + np.arange(fan.sum()) - np.repeat(np.cumsum(fan) - fan, fan)
+    return np.asarray(index[np.stack([first, second, second + 1], axis=1)])

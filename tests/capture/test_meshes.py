@@ -59,6 +59,14 @@ def test_obj_dialects(tmp_path: Path) -> None:
     np.testing.assert_array_equal(faces, [[3, 1, 0], [0, 1, 2], [0, 2, 3], [4, 3, 2], [0, 2, 4]])
 
 
+def test_obj_files_with_the_same_face_lines(tmp_path: Path) -> None:
+    """Catches kept triangles that ignore how many vertices stand before a line that counts backwards."""
+    path = tmp_path / "x.obj"
+    for vertices, expected in (("", [0, 1, 2]), ("v 2 0 0\n", [1, 2, 3]), ("", [0, 1, 2])):
+        path.write_text(vertices + OK + "f -3 -2 -1\n")
+        np.testing.assert_array_equal(read_mesh(path)[1], [expected])
+
+
 OK = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
