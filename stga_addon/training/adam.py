@@ -11,8 +11,10 @@ from .state import TrainState
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
 
 
-def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> None:
+def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float], averaging: float = 1.0) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
+
+    averaging: share with which the stepped row enters its running average; 1: the average is the row.
 
     rates: learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`.
     (STGA, selective training; Adam with a step count per row, because rows are trained unequally often.)
@@ -25,7 +27,7 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float]) -> Non
             row[3:] = rates["sh_rest"]
     adam_rows(
         rows, state.steps.numpy(), _tables(state.parameters), _tables(state.gradients), _tables(state.first),
-        _tables(state.second), by_column, BETA1, BETA2, EPSILON,
+        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, EPSILON, np.float32(averaging),
     )  # fmt: skip
 
 

@@ -43,15 +43,16 @@ class CpuStep:
         if batch.refine:
             self._refine(batch, rows)
         self._limit(rows)
-        adam.step(state, rows, batch.rates)
+        adam.step(state, rows, batch.rates, self._settings.averaging)
         if focus is None:
             state.pull.numpy()[rows] += screen[rows]
             state.seen.numpy()[rows] += 1
         return loss
 
     def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
-        """The view as the splats show it now: a new (3, H, W) float32 image."""
-        return self._render(view, background, degree).image.copy()
+        """The view as the splats' running average shows it: a new (3, H, W) float32 image."""
+        average = Parameters(*(tensor.numpy() for tensor in self.state.average))
+        return self._render(average, view, background, degree).image.copy()
 
     def _over(self, batch: Batch) -> np.ndarray:
         """The target over the background that is drawn behind the splats."""
@@ -69,7 +70,7 @@ class CpuStep:
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the gradients of the rows that matter; returns those rows, their screen pull and the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
-        rendering = self._render(view, background, degree, focus)
+        rendering = self._render(self.state.arrays(), view, background, degree, focus)
         if focus is None:
             rectangles = whole_image(height, width)
         else:
@@ -84,10 +85,12 @@ class CpuStep:
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
 
-    def _render(self, view: View, background: np.ndarray, degree: int, focus: np.ndarray | None = None) -> Rendering:
+    def _render(
+        self, splats: Parameters, view: View, background: np.ndarray, degree: int, focus: np.ndarray | None = None
+    ) -> Rendering:
         self._seen = camera_frames(self._frames.of(view.timestep), view.camera)
         return render_forward(
-            self.state.arrays(), self.state.face.numpy(), self._seen, degree, background, focus, REACH,
+            splats, self.state.face.numpy(), self._seen, degree, background, focus, REACH,
             antialiased=self._settings.antialiased, scratch=self._scratch,
         )  # fmt: skip
 

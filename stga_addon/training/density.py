@@ -19,13 +19,16 @@ def control_density(state: TrainState, room: int, share: float, rng: np.random.G
 
     room: how many splats may still be added; share: at most this share of the splats is split at once. Every triangle
     that has splats keeps one. Children inherit triangle and looseness, lie within the parent's Gaussian in local
-    units, and start with fresh moments.
+    units, and keep Adam's second moment, without which their first steps would all be as long as the rate.
     """
     pull = (state.pull / state.seen.clamp_min(1)).numpy()
     count = max(0, min(room, int(share * len(state))))
     hardest = np.argsort(-pull, kind="stable")[:count]
     hardest = hardest[pull[hardest] > 0]
-    children = new_state(_halves(state.splats().rows(hardest), rng))
+    parents = keep_rows(state, torch.from_numpy(np.tile(hardest, 2)))
+    children = replace(
+        new_state(_halves(state.splats().rows(hardest), rng)), second=parents.second, steps=parents.steps
+    )
     keep = ~_dispensable(state)
     keep[hardest] = False
     state = join(keep_rows(state, torch.from_numpy(keep)), children)

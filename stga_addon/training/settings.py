@@ -54,6 +54,8 @@ class Settings:
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     distance_weight, distance_limit   the same for the distance from the triangle's origin
+    averaging      the avatar is made of each splat's running average over its steps, in which the latest has this
+                   share; 1: of the splats as they are
     stray_every, stray_limit, stray_to    every so many iterations (0: never), a splat farther than the limit from its
                    triangle's origin is put back to this share of the limit; 0: onto the origin, as in the paper
                    All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
@@ -98,6 +100,7 @@ class Settings:
     scale_limit: float = 4.0
     distance_weight: float = 0.0
     distance_limit: float = 1.0
+    averaging: float = 0.05
     stray_every: int = 200
     stray_limit: float = 6.0
     stray_to: float = 1.0
@@ -129,6 +132,7 @@ PAPER = {
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_to": 0.0,
+    "averaging": 1.0,
     "lattice": 4,
     "seeds": False,
     "any_background": False,
@@ -145,6 +149,7 @@ GAUSSIAN_AVATARS = {
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_every": 0,
+    "averaging": 1.0,
     "seeds": False,
     "any_background": False,
     "growth": 8.0,

@@ -16,6 +16,7 @@ class TrainState:
     """N splats in training, torch tensors on one device, all with N rows.
 
     parameters, gradients, first, second  as in `Splats`: values, last gradient, Adam's two moments
+    average  the parameters' running average over their steps, which is what the avatar is made of
     steps    (N,) int32: how often Adam stepped the row
     face     (N,) int32 and loose (N,) bool, as in `Splats`
     pull     (N,) sum of the screen-space gradient lengths since the last density control, and
@@ -26,6 +27,7 @@ class TrainState:
     gradients: Parameters
     first: Parameters
     second: Parameters
+    average: Parameters
     steps: torch.Tensor
     face: torch.Tensor
     loose: torch.Tensor
@@ -41,7 +43,14 @@ class TrainState:
 
     def splats(self) -> Splats:
         """A copy of the splats as they are now."""
-        arrays = {name: t.numpy().copy() for name, t in self.parameters._asdict().items()}
+        return self._copy(self.parameters)
+
+    def averaged(self) -> Splats:
+        """A copy of the splats' running average."""
+        return self._copy(self.average)
+
+    def _copy(self, parameters: Parameters) -> Splats:
+        arrays = {name: t.numpy().copy() for name, t in parameters._asdict().items()}
         return Splats(**arrays, face=self.face.numpy().copy(), loose=self.loose.numpy().copy())
 
 
@@ -58,6 +67,7 @@ def new_state(splats: Splats) -> TrainState:
         gradients=zeros(),
         first=zeros(),
         second=zeros(),
+        average=Parameters(*(v.clone() for v in values)),
         steps=torch.zeros(n, dtype=torch.int32),
         face=torch.from_numpy(splats.face.astype(np.int32)),
         loose=torch.from_numpy(splats.loose.astype(bool)),

@@ -109,7 +109,7 @@ class Trainer:
         return loss
 
     def draw(self, view: View, progress: float = 1.0) -> np.ndarray:
-        """The view as the splats show it now: a new (3, H, W) float32 image over the background."""
+        """The view as the splats' running average shows it: a new (3, H, W) float32 image over the background."""
         return self._step.draw(view, self._background, sh_degree(self.settings, progress))
 
     def _selected(self, timestep: int) -> np.ndarray | None:
@@ -177,6 +177,7 @@ def reset_strays(state: TrainState, limit: np.ndarray, to: float) -> int:
     state.parameters.xyz[strays] = torch.where(factor > 0, factor * state.parameters.xyz[strays], 0)
     for tensor in (state.first.xyz, state.second.xyz):
         tensor[strays] = 0
+    state.average.xyz[strays] = state.parameters.xyz[strays]
     return int(strays.sum())
 
 

@@ -43,6 +43,7 @@ class _DeviceState:
     gradients: list[_Table]
     first: list[_Table]
     second: list[_Table]
+    average: list[_Table]
     steps: wp.array
     face: wp.array
     loose: wp.array
@@ -100,15 +101,16 @@ class WarpStep:
         """A copy in the host's memory, after everything that is queued."""
         self._settle()
         state = self._state
-        parameters, first, second = (
+        parameters, first, second, average = (
             Parameters(*(_tensor(table.rows) for table in tables))
-            for tables in (state.parameters, state.first, state.second)
+            for tables in (state.parameters, state.first, state.second, state.average)
         )
         return TrainState(
             parameters=parameters,
             gradients=Parameters(*(torch.zeros_like(tensor) for tensor in parameters)),
             first=first,
             second=second,
+            average=average,
             steps=_tensor(state.steps),
             face=_tensor(state.face),
             loose=_tensor(state.loose).bool(),
@@ -132,6 +134,7 @@ class WarpStep:
                 gradients=tables(state.gradients),
                 first=tables(state.first),
                 second=tables(state.second),
+                average=tables(state.average),
                 steps=array(state.steps, wp.int32),
                 face=array(state.face, wp.int32),
                 loose=array(state.loose.to(torch.uint8), wp.uint8),
@@ -151,13 +154,13 @@ class WarpStep:
         return told
 
     def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
-        """The view as the splats show it now, after everything that is queued."""
+        """The view as the splats' running average shows it, after everything that is queued."""
         self._settle()
         with _room(self._device):
             self._uploads.begin()
             vertices = self._send_mesh(view)
             self._uploads.finish()
-            parameters, frames = _rows(self._state.parameters), self._see(vertices, view, degree)
+            parameters, frames = _rows(self._state.average), self._see(vertices, view, degree)
             return np.array(self._rasteriser.forward(parameters, self._state.face, frames, background).image.numpy())
 
     def _settle(self) -> None:
@@ -253,11 +256,11 @@ class WarpStep:
 
     def _adam(self, wanted: wp.array, rates: Mapping[str, float]) -> None:
         state, launch = self._state, self._rasteriser.launch
-        correct = self._rasteriser.scratch.take("correct", len(self), wp.vec2)
+        correct = self._rasteriser.scratch.take("correct", len(self), wp.vec3)
         logarithms = math.log(BETA1), math.log(BETA2)
-        launch(rows.count_steps, len(self), wanted, *logarithms, state.steps, correct)
+        launch(rows.count_steps, len(self), wanted, *logarithms, self._settings.averaging, state.steps, correct)
         for name, *tables in zip(
-            Parameters._fields, state.parameters, state.gradients, state.first, state.second, strict=True
+            Parameters._fields, state.parameters, state.gradients, state.first, state.second, state.average, strict=True
         ):
             values = [table.values for table in tables]
             rest, rate_rest = (3, rates["sh_rest"]) if name == "sh" else (values[0].shape[1], 0.0)

@@ -334,22 +334,22 @@ def test_background_is_exchanged_as_on_the_cpu() -> None:
 def test_adam_is_the_other_back_ends_and_keeps_broken_rows() -> None:
     """Catches a wrong moment or correction, and NaN or a square beyond float32 that gets into a row."""
     rng = np.random.default_rng(5)
-    tables = [np.abs(rng.normal(size=(7, 6))).astype(np.float32) for _ in range(4)]
+    tables = [np.abs(rng.normal(size=(7, 6))).astype(np.float32) for _ in range(5)]
     tables[1][2, 5], tables[1][3, 0], tables[1][4, 1] = np.nan, 1e20, -np.inf
     steps, wanted = np.arange(7, dtype=np.int32) ** 5, np.array([1, 1, 1, 1, 1, 0, 1], np.uint8)
     rates = np.float32([[0.1] * 3 + [0.01] * 3])
     device = [wp.array(table, device=DEVICE) for table in tables]
-    counts, correct = wp.array(steps, device=DEVICE), wp.zeros(7, wp.vec2, device=DEVICE)
+    counts, correct = wp.array(steps, device=DEVICE), wp.zeros(7, wp.vec3, device=DEVICE)
     marks = wp.array(wanted, device=DEVICE)
     logarithms = np.log(np.float64(BETA1)), np.log(np.float64(BETA2))
-    wp.launch(rows.count_steps, 7, [marks, *logarithms, counts, correct], device=DEVICE)
+    wp.launch(rows.count_steps, 7, [marks, *logarithms, 0.05, counts, correct], device=DEVICE)
     wp.launch(
         rows.adam, (7, 6), [marks, correct, *device, 0.1, 0.01, 3, *(float(b) for b in (BETA1, BETA2, EPSILON))],
         device=DEVICE,
     )  # fmt: skip
     listed = np.flatnonzero(wanted).astype(np.int32)
     parts = [(table,) for table in tables]
-    adam_rows(listed, steps, *parts, rates, BETA1, BETA2, EPSILON)
+    adam_rows(listed, steps, *parts, rates, BETA1, BETA2, EPSILON, np.float32(0.05))
     np.testing.assert_array_equal(counts.numpy(), steps)
     for got, want in zip(device, tables, strict=True):
         np.testing.assert_allclose(got.numpy(), want, rtol=2e-6, atol=2e-7)

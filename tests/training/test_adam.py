@@ -37,7 +37,8 @@ def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
 
 @pytest.mark.parametrize(("seed", "degree"), [(0, 1), (1, 1), (2, 3), (3, 0)])
 def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) -> None:
-    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε.
+    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε, and a
+    running average that begins with the initial value, or goes on while its row is frozen.
 
     With constant colour, other parameters have more columns than `sh`.
     """
@@ -46,6 +47,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
     rows = separate_rows(state)
     groups = [{"params": [row[name] for row in rows], "lr": rate} for name, rate in RATES.items()]
     theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    history: list[list[torch.Tensor]] = [[] for _ in rows]
     for _ in range(25):
         listed = np.flatnonzero(rng.random(6) < [1, 0.7, 0.5, 0.3, 0.1, 0.0]).astype(np.int32)
         # Sizes over many orders of magnitude: those of real gradients are 1e-8 to 1e-3.
@@ -57,7 +59,15 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
         theirs.step()
-        adam.step(state, listed, RATES)
+        adam.step(state, listed, RATES, averaging=0.2)
+        for n in listed:
+            history[n].append(rows[n]["xyz"].detach().clone())
+    for n, values in enumerate(history):
+        # The first five count alike, then the newest counts a fifth.
+        average = torch.stack(values[:5]).mean(0) if values else state.parameters.xyz[n]
+        for value in values[5:]:
+            average = 0.8 * average + 0.2 * value
+        np.testing.assert_allclose(state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5)
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity", "strain_color"):
             # 25 float32 steps of at most the rate each
@@ -82,7 +92,8 @@ def test_frozen_rows_keep_every_bit() -> None:
     for name in before:
         np.testing.assert_array_equal(after[name][frozen], before[name][frozen], err_msg=name)
     moved = [name for name in before if (after[name][listed] != before[name][listed]).any(axis=1).all()]
-    trained = [f"{part}/{name}" for part in ("parameters", "first", "second") for name in state.parameters._fields]
+    parts = ("parameters", "average", "first", "second")
+    trained = [f"{part}/{name}" for part in parts for name in state.parameters._fields]
     assert set(trained) | {"steps"} == set(moved)
 
 

@@ -33,8 +33,9 @@ def control(state: TrainState, room: int = 1000, share: float = 1.0, seed: int =
     return control_density(state, room, share, np.random.default_rng(seed))
 
 
-def test_survivors_keep_everything_and_children_start_anew() -> None:
-    """Catches moments of one row given to another after splitting, which throws splats about for many steps."""
+def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
+    """Catches moments of one row given to another after splitting, and children without a second moment: both throw
+    splats about for many steps."""
     pulled = [3, 17, 30]
     state = busy_state(pulled)
     before = bits(state)
@@ -44,9 +45,14 @@ def test_survivors_keep_everything_and_children_start_anew() -> None:
     for name, old in before.items():
         if name not in ("pull", "seen"):
             np.testing.assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
+    parents = np.tile(pulled, 2)  # in the order of their pull
     for name, tensor in tensors_of(new).items():
-        if name.startswith(("first", "second", "steps")):
+        if name.startswith("first"):
             assert not tensor[COUNT - 3 :].any()
+        elif name.startswith(("second", "steps")):
+            np.testing.assert_array_equal(after[name][COUNT - 3 :], before[name][parents], err_msg=name)
+    for value, average in zip(new.parameters, new.average, strict=True):
+        assert torch.equal(value[COUNT - 3 :], average[COUNT - 3 :])
     assert not new.pull.any()
     assert not new.seen.any()
     assert {len(t) for t in tensors_of(new).values()} == {COUNT + 3}

@@ -89,7 +89,10 @@ def test_stray_resets(to: float) -> None:
     for name, old in before.items():
         if name in ("parameters/xyz", "first/xyz", "second/xyz"):
             np.testing.assert_array_equal(after[name][~strays], old[~strays])
-        if name == "parameters/xyz":
+        if name == "average/xyz":
+            np.testing.assert_array_equal(after[name][~strays], old[~strays])
+            np.testing.assert_array_equal(after[name][strays], after["parameters/xyz"][strays])
+        elif name == "parameters/xyz":
             length = np.linalg.norm(xyz[strays].astype(float), axis=1, keepdims=True)
             wanted = xyz[strays] / length * to * limit[face[strays], None]
             np.testing.assert_allclose(state.parameters.xyz.numpy()[strays], wanted, rtol=1e-5)

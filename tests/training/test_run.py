@@ -212,7 +212,7 @@ def test_without_held_out_views_the_latest_avatar_is_kept(toy: Capture, tmp_path
     bare = replace(toy, views={"train": toy.views["train"]})
     train(bare, tmp_path, make_run(toy))
     avatar = read_avatar(tmp_path / "avatar.npz")
-    np.testing.assert_array_equal(avatar.splats.xyz, read_checkpoint(tmp_path).state.parameters.xyz)
+    np.testing.assert_array_equal(avatar.splats.xyz, read_checkpoint(tmp_path).state.average.xyz)
     assert all("psnr" not in line for line in read_metrics(tmp_path))
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from capture import factory
 from PIL import Image
@@ -56,8 +57,9 @@ def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
 def disturb(trainer: Trainer) -> None:
     """Rows unlike each other, and as many coefficients as there may be."""
     rng = np.random.default_rng(1)
-    for value in trainer.state.arrays():
+    for value, average in zip(trainer.state.arrays(), trainer.state.average, strict=True):
         value += rng.normal(0, 0.2 if value.ndim != 2 else 1e-3, value.shape).astype(np.float32)
+        average.copy_(torch.from_numpy(value))
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
@@ -116,8 +118,8 @@ def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
     trainer = make_trainer(toy)
     view, _ = large(view_of(toy, 1))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    everything = len(cpu_step(trainer)._render(view, WHITE, 0).tiles)
-    assert 0 < len(cpu_step(trainer)._render(view, WHITE, 0, focus).tiles) < 0.8 * everything
+    everything = len(cpu_step(trainer)._render(trainer.state.arrays(), view, WHITE, 0).tiles)
+    assert 0 < len(cpu_step(trainer)._render(trainer.state.arrays(), view, WHITE, 0, focus).tiles) < 0.8 * everything
 
 
 @pytest.mark.parametrize("timestep", [0, 4])

@@ -15,16 +15,20 @@ LARGEST = np.float32(1e18)
 
 @parallel(lambda rows, *_: len(rows))
 @jit
-def adam_rows(first_row, past_row, rows, steps, parameters, gradients, firsts, seconds, rates, beta1, beta2, epsilon):
+def adam_rows(
+    first_row, past_row, rows, steps, parameters, gradients, firsts, seconds, averages, rates, beta1, beta2, epsilon,
+    newest,
+):  # fmt: skip
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
-    parameters, gradients, firsts, seconds: equally long tuples of (N, D) arrays; steps (N,) int32; rates (P, max D):
-    learning rate by parameter and column. Rows that are not listed are not touched: neither parameters, moments nor
-    count. A row whose gradient is not finite, or beyond LARGEST, keeps that parameter and its moments.
+    parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
+    (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
+    `newest`, or as one of so many steps while those are few. Rows that are not listed are not touched at all.
+    A row whose gradient is not finite, or beyond LARGEST, keeps that parameter, its moments and its average.
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
-    correct1, correct2 = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    correct1, correct2, blend = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
     for begin in range(first_row, past_row, CHUNK):
         end = min(past_row, begin + CHUNK)
         for n in range(begin, end):
@@ -32,15 +36,18 @@ def adam_rows(first_row, past_row, rows, steps, parameters, gradients, firsts, s
             count = np.float64(steps[rows[n]])
             correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
             correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
+            blend[n - begin] = max(np.float64(newest), 1.0 / count)
         for p in range(len(parameters)):
             _adam_block(
-                rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], correct1, correct2, rates[p],
-                beta1, beta2, epsilon,
+                rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], averages[p],
+                correct1, correct2, blend, rates[p], beta1, beta2, epsilon,
             )  # fmt: skip
 
 
 @part_jit
-def _adam_block(rows, parameter, gradient, first, second, correct1, correct2, rates, beta1, beta2, epsilon):
+def _adam_block(
+    rows, parameter, gradient, first, second, average, correct1, correct2, blend, rates, beta1, beta2, epsilon
+):
     """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorises."""
     width = parameter.shape[1]
     for n in range(len(rows)):
@@ -50,14 +57,16 @@ def _adam_block(rows, parameter, gradient, first, second, correct1, correct2, ra
             unsound += ZERO if abs(gradient[i, c]) < LARGEST else ONE
         if unsound != ZERO:
             continue
-        scale1, scale2 = correct1[n], correct2[n]
+        scale1, scale2, share = correct1[n], correct2[n], blend[n]
         for c in range(width):
             g = gradient[i, c]
             m = beta1 * first[i, c] + (ONE - beta1) * g
             v = beta2 * second[i, c] + (ONE - beta2) * g * g
             first[i, c] = m
             second[i, c] = v
-            parameter[i, c] -= rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
+            value = parameter[i, c] - rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
+            parameter[i, c] = value
+            average[i, c] += share * (value - average[i, c])
 
 
 @jit

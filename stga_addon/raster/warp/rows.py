@@ -22,10 +22,12 @@ def count_steps(
     wanted: wp.array[wp.uint8],
     log_beta1: wp.float64,
     log_beta2: wp.float64,
+    newest: wp.float32,
     steps: wp.array[wp.int32],
-    correct: wp.array[wp.vec2],
+    correct: wp.array[wp.vec3],
 ):
-    """Add a step to the wanted rows, and write what corrects their first and second moment's bias.
+    """Add a step to the wanted rows, and write what corrects their first and second moment's bias and how much the
+    step counts in their running average: `newest`, or one of so many steps while those are few.
 
     In float64, because 1 − βⁿ cancels.
     """
@@ -35,17 +37,18 @@ def count_steps(
     steps[i] = steps[i] + 1
     n, one = wp.float64(steps[i]), wp.float64(1.0)
     first, second = one / (one - wp.exp(n * log_beta1)), one / wp.sqrt(one - wp.exp(n * log_beta2))
-    correct[i] = wp.vec2(float(first), float(second))
+    correct[i] = wp.vec3(float(first), float(second), wp.max(newest, float(one / n)))
 
 
 @wp.kernel
 def adam(
     wanted: wp.array[wp.uint8],
-    correct: wp.array[wp.vec2],
+    correct: wp.array[wp.vec3],
     parameter: wp.array2d[wp.float32],
     gradient: wp.array2d[wp.float32],
     first: wp.array2d[wp.float32],
     second: wp.array2d[wp.float32],
+    average: wp.array2d[wp.float32],
     rate: wp.float32,
     rate_rest: wp.float32,
     rest: wp.int32,
@@ -69,7 +72,9 @@ def adam(
     first[i, c] = m
     second[i, c] = v
     step = wp.where(c < rest, rate, rate_rest) * m * correct[i][0] / (wp.sqrt(v) * correct[i][1] + epsilon)
-    parameter[i, c] = parameter[i, c] - step
+    value = parameter[i, c] - step
+    parameter[i, c] = value
+    average[i, c] = average[i, c] + correct[i][2] * (value - average[i, c])
 
 
 @wp.func
