@@ -1,19 +1,30 @@
 """Whether Auto is right: the effects that a capture calls for, against all of them, at the same number of iterations.
 
-    python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 1500] [--only full static one-camera] [--each]
+    python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 500] [--seeds 3] [--only full static one-camera]
+    python benchmarks/effects.py CAPTURE … --each
+    python benchmarks/effects.py CAPTURE … --switch strain-color view-color [--only full uneven]
 
-Derives two captures from CAPTURE, its first training timestep and its middle training camera, and trains each with the
-effects decided by Auto and with all that can be on. Prints the held-out view's PSNR and the seconds of training.
---each instead trains the full capture with all effects but one, for what each of them costs. Selection is left to
-Auto throughout: it is another way to train, not something more to compute. Run it on an idle machine.
+The first derives two captures from CAPTURE, its first training timestep and its middle training camera, trains each
+with the effects decided by Auto and with all that can be on, and says whether Auto is within 0.1 dB of all, in less
+time. --each trains with all effects but one, for what each of them costs. --switch trains with one effect on and off,
+the others decided by Auto, for what it brings; the capture "uneven" has the channels of each training camera
+multiplied by 0.9 to 1.1. Prints tables in Markdown: PSNR of the held-out view, means over seeds ± their standard
+deviation, and milliseconds of an iteration. Selection is left to Auto: it is another way to train, not something more
+to compute. Each seed trains all variants of a capture in another order. Run it on an idle machine.
 """
 
 import argparse
 import json
+import random
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
@@ -21,6 +32,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.effects.facts import Facts
 from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import EFFECTS
+from stga_addon.report.results import Spread, spread_of
 from stga_addon.training.evaluations import read_metrics
 from stga_addon.training.folder import Run
 from stga_addon.training.metrics import measure
@@ -29,6 +41,20 @@ from stga_addon.training.settings import make_settings
 from stga_addon.training.tracking import refined
 
 LEFT_TO_AUTO = ("selection",)
+DIFFERING = ("full", "static", "one-camera")
+CLOSE = 0.1
+"""dB that Auto may lose against all effects."""
+
+Choices = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a variant came to over seeds: PSNR in dB by split, milliseconds of an iteration, effects that were on."""
+
+    psnr: Mapping[str, Spread]
+    pace: Spread
+    on: str
 
 
 def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]) -> Path:
@@ -45,19 +71,37 @@ def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]
     return folder
 
 
-def captures(root: Path, folder: Path) -> dict[str, Path]:
-    """Name -> folder: the capture itself, one timestep of it, one camera of it."""
+def uneven(root: Path, folder: Path) -> Path:
+    """The capture, which has masks, as unlike cameras would have taken it; those held out are as they were."""
+    derive(root, folder, lambda split, frame: True)
+    path = folder / "transforms_train.json"
+    document = json.loads(path.read_text("utf-8"))
+    for number, frame in enumerate(document["frames"]):
+        gain = np.random.default_rng(frame["camera_index"]).uniform(0.9, 1.1, 3)
+        image = np.asarray(Image.open(root / frame["file_path"]).convert("RGB"), np.float32)
+        cover = np.asarray(Image.open(root / frame["fg_mask_path"]).convert("L"), np.float32)[..., None] / 255
+        image *= 1 + cover * (gain - 1)  # what is behind the head was put there later, by no camera
+        frame["file_path"] = f"uneven_{number:05d}.png"
+        Image.fromarray(np.clip(image + 0.5, 0, 255).astype(np.uint8)).save(folder / frame["file_path"])
+    path.write_text(json.dumps(document), "utf-8")
+    return folder
+
+
+def captures(root: Path, folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Name -> folder: the capture itself, one timestep of it, one camera of it, and with unlike cameras."""
     frames = json.loads((root / "transforms_train.json").read_text("utf-8"))["frames"]
     first = min(frame["timestep_index"] for frame in frames)
     cameras = sorted({frame["camera_index"] for frame in frames})
     middle = cameras[len(cameras) // 2]
-    return {
-        "full": root,
-        "static": derive(root, folder / "static", lambda split, frame: frame["timestep_index"] == first),
-        "one-camera": derive(
+    made: dict[str, Callable[[], Path]] = {
+        "full": lambda: root,
+        "static": lambda: derive(root, folder / "static", lambda split, frame: frame["timestep_index"] == first),
+        "one-camera": lambda: derive(
             root, folder / "one-camera", lambda split, frame: split != "train" or frame["camera_index"] == middle
         ),
+        "uneven": lambda: uneven(root, folder / "uneven"),
     }
+    return {name: made[name]() for name in names}
 
 
 def possible(capture: Capture, iterations: int) -> list[str]:
@@ -67,42 +111,122 @@ def possible(capture: Capture, iterations: int) -> list[str]:
     return [name for name, verdict in looked.items() if verdict is not None and (verdict.on or not verdict.only)]
 
 
-def trained(capture: Capture, flame: Path | None, iterations: int, choices: dict[str, str]) -> tuple[float, float, str]:
-    """PSNR of the held-out view, seconds of training, and the effects that were on."""
-    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects=choices))
+def trained(
+    capture: Capture, flame: Path | None, iterations: int, seed: int, choices: Choices
+) -> tuple[dict[str, float], float, str]:
+    """PSNR by split, milliseconds of an iteration, and the effects that were on."""
+    settings, plan = plan_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
-        capture = refined(capture, Path(folder))
-    names = ", ".join(decision.effect for decision in plan if decision.on)
-    return measure(avatar, capture, "val").psnr, seconds, names
+        shown = refined(capture, Path(folder))
+    psnr = {split: measure(avatar, shown, split).psnr for split in ("val", "test") if shown.views.get(split)}
+    return psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
 
 
-def report(name: str, result: tuple[float, float, str], iterations: int) -> None:
-    psnr, seconds, names = result
-    print(f"{name:<24}{psnr:8.2f} dB{seconds:8.1f} s{1000 * seconds / iterations:8.1f} ms/it  {names}", flush=True)
+def compare(
+    capture: Capture, flame: Path | None, iterations: int, seeds: int, variants: Mapping[str, Choices]
+) -> dict[str, Outcome]:
+    """Variant -> what came of it."""
+    found: dict[str, list[tuple[dict[str, float], float, str]]] = {name: [] for name in variants}
+    for seed in range(seeds):
+        for name in random.Random(seed).sample(list(variants), len(variants)):
+            found[name].append(trained(capture, flame, iterations, seed, variants[name]))
+            psnr, pace, on = found[name][-1]
+            scores = ", ".join(f"{split} {value:.2f} dB" for split, value in psnr.items())
+            print(f"{capture.root.name}, {name}, seed {seed}: {scores}, {pace:.1f} ms: {on}", file=sys.stderr)
+    return {name: _outcome(runs) for name, runs in found.items()}
+
+
+def _outcome(runs: Sequence[tuple[dict[str, float], float, str]]) -> Outcome:
+    psnr = {split: spread_of([scores[split] for scores, _, _ in runs]) for split in runs[0][0]}
+    return Outcome(psnr, spread_of([pace for _, pace, _ in runs]), runs[0][2])
+
+
+def cell(value: Spread, decimals: int) -> str:
+    return f"{value.mean:.{decimals}f}" + (f" ± {value.spread:.{decimals}f}" if value.count > 1 else "")
+
+
+def row(*cells: str) -> None:
+    print("| " + " | ".join(cells) + " |", flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--flame", type=Path)
-    parser.add_argument("--iterations", type=int, default=1500)
-    parser.add_argument("--only", nargs="+", choices=("full", "static", "one-camera"))
-    parser.add_argument("--each", action="store_true")
+    parser.add_argument("--iterations", type=int, default=500)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", nargs="+", choices=(*DIFFERING, "uneven"))
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--each", action="store_true")
+    what.add_argument("--switch", nargs="+", choices=[effect.name for effect in EFFECTS], metavar="EFFECT")
     options = parser.parse_args()
-    iterations = options.iterations
+    table = each if options.each else switch if options.switch else auto_and_all
+    names = options.only or (DIFFERING if table is auto_and_all else ("full",))
     with tempfile.TemporaryDirectory() as folder:
-        for name, root in captures(options.capture.resolve(), Path(folder)).items():
-            if name not in (options.only or (["full"] if options.each else [name])):
-                continue
-            capture = open_capture(root, options.flame)
-            everything = dict.fromkeys(possible(capture, iterations), "on")
-            runs = {"Auto": {}, "all": everything}
-            if options.each:
-                runs.update({f"all but {effect}": {**everything, effect: "off"} for effect in everything})
-            for variant, choices in runs.items():
-                report(f"{name}, {variant}", trained(capture, options.flame, iterations, choices), iterations)
+        opened = {
+            name: open_capture(root, options.flame)
+            for name, root in captures(options.capture.resolve(), Path(folder), names).items()
+        }
+        table(opened, options)
+
+
+def auto_and_all(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
+    """One row a capture: is Auto right?"""
+    row("capture", "Auto, val", "all on, val", "Δ", "Auto, ms", "all on, ms", "Auto is right", "only by all on")
+    row(*["---"] * 8)
+    for name, capture in opened.items():
+        everything = dict.fromkeys(possible(capture, options.iterations), "on")
+        variants: dict[str, Choices] = {"Auto": {}, "all on": everything}
+        auto, every = compare(capture, options.flame, options.iterations, options.seeds, variants).values()
+        difference = auto.psnr["val"].mean - every.psnr["val"].mean
+        more = [effect for effect in every.on.split(", ") if effect not in auto.on.split(", ")]
+        right = not more or (difference > -CLOSE and auto.pace.mean < every.pace.mean)
+        row(
+            name, cell(auto.psnr["val"], 2), cell(every.psnr["val"], 2), f"{difference:+.2f}", cell(auto.pace, 1),
+            cell(every.pace, 1), "yes" if right else "no", ", ".join(more) or "nothing",
+        )  # fmt: skip
+
+
+def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
+    """One row an effect: what is saved without it?"""
+    for name, capture in opened.items():
+        everything = dict.fromkeys(possible(capture, options.iterations), "on")
+        variants = {effect: {**everything, effect: "off"} for effect in everything if changes(effect)}
+        outcomes = compare(
+            capture, options.flame, options.iterations, options.seeds, {"all on": everything, **variants, "Auto": {}}
+        )
+        every = outcomes["all on"]
+        row(f"{name}, without", "val", "Δ", "ms", "saved")
+        row(*["---"] * 5)
+        for variant, outcome in outcomes.items():
+            difference = outcome.psnr["val"].mean - every.psnr["val"].mean
+            saved = every.pace.mean - outcome.pace.mean
+            title = {"all on": "none: all on", "Auto": "(Auto)"}.get(variant, f"`{variant}`")
+            row(title, cell(outcome.psnr["val"], 2), f"{difference:+.2f}", cell(outcome.pace, 1), f"{saved:+.1f}")
+
+
+def changes(effect: str) -> bool:
+    """Whether training differs by the effect: the joints of Blender's rig cost it nothing."""
+    return next(known for known in EFFECTS if known.name == effect).off != {} or effect == "exposure"
+
+
+def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
+    """One row an effect and capture: what does it bring?"""
+    row("capture", "effect", "decided", "on against off, val", "test", "ms")
+    row(*["---"] * 6)
+    for name, capture in opened.items():
+        _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
+        decided = {decision.effect: f"{'on' if decision.on else 'off'}: {decision.reason}" for decision in plan}
+        for effect in options.switch:
+            variants = {choice: {effect: choice} for choice in ("on", "off")}
+            on, off = compare(capture, options.flame, options.iterations, options.seeds, variants).values()
+            gains = [
+                f"{on.psnr[split].mean - off.psnr[split].mean:+.2f}" if split in on.psnr else ""
+                for split in ("val", "test")
+            ]
+            row(name, f"`{effect}`", decided[effect], *gains, f"{on.pace.mean - off.pace.mean:+.1f}")
 
 
 if __name__ == "__main__":

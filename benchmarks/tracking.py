@@ -3,9 +3,9 @@
     python benchmarks/tracking.py CAPTURE --flame FILE [--iterations 500] [--errors 0 0.5 1]
 
 CAPTURE should be tracked exactly, as the demo's is. Disturbs the parameters of its training timesteps by random steps
-(1: 2 mm, 1° a joint, 0.15 of an expression), trains with the effect and without, and prints how far the meshes are
-from where they should be, the PSNR of the held-out view and of the unseen timesteps, which are not disturbed, and the
-time of an iteration, for which the machine should be idle.
+(1: 2 mm, 1° a joint, 0.15 of an expression), trains with the effect and without, and prints a table in Markdown: what
+Auto would decide, how far the meshes are from where they should be, the PSNR of the held-out view and of the unseen
+timesteps, which are not disturbed, and the time of an iteration, for which the machine should be idle.
 """
 
 import argparse
@@ -22,6 +22,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.effects.facts import Facts
 from stga_addon.effects.plan import plan_effects
+from stga_addon.effects.rules import tracking
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.training.evaluations import read_metrics
 from stga_addon.training.folder import Run
@@ -75,15 +76,18 @@ def main() -> None:
     parser.add_argument("--errors", type=float, nargs="+", default=[0, 0.5, 1])
     options = parser.parse_args()
     true = open_capture(options.capture, options.flame)
+    print("| error | mesh outside the masks | Auto | tracking | mm | val | unseen | ms an iteration |")
+    print("|" + " --- |" * 8)
     for error in options.errors:
         capture = lose_track(true, error)
-        outside = Facts(capture, make_settings(iterations=1)).outside
-        print(f"error {error:g}: {outside:.2%} of the mesh outside the masks", flush=True)
+        facts = Facts(capture, make_settings(iterations=1))
+        decided = tracking(facts)
+        auto = "on" if decided is not None and decided.on else "off"
         for choice in ("off", "on"):
             shown, psnr, pace = trained(capture, options.flame, options.iterations, choice)
-            quality = ", ".join(f"{split} {value:.2f} dB" for split, value in psnr.items())
             print(
-                f"  {choice:<4}{millimetres(shown, true):6.2f} mm  {quality}  {1000 * pace:.1f} ms an iteration",
+                f"| {error:g} | {facts.outside:.2%} | {auto} | {choice} | {millimetres(shown, true):.2f} "
+                f"| {psnr['val']:.2f} | {psnr['test']:.2f} | {1000 * pace:.1f} |",
                 flush=True,
             )
 

@@ -85,16 +85,13 @@ def parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     train.add_argument("--schedule", choices=SCHEDULES, help="paper: by its letter")
     train.add_argument("--preset", choices=tuple(PRESETS), help="how good, and so how long; `stga plan` says how long")
     train.add_argument("--target-psnr", type=float, metavar="DB", help="stop when the held-out views reach it")
-    train.add_argument("--stop-when-flat", action="store_true", help="stop when more time no longer helps")
+    train.add_argument(
+        "--stop-when-flat", action="store_true", default=None, help="stop when more time no longer helps"
+    )
     train.add_argument("--threshold", type=float, help="selection threshold in metres")
     _add_effects(train)
     train.add_argument("--resume", action="store_true", help="continue the run in the folder")
-    train.add_argument(
-        "--device",
-        choices=DEVICES,
-        default="auto",
-        help="cuda: an NVIDIA GPU; auto: that where it works, else the CPU; warp-cpu: the GPU's code on the CPU",
-    )
+    _add_device(train)
     train.add_argument("--seed", type=int, help="fixes every random choice (default 0)")
 
     job = commands.add_parser("job", help="train what Blender's panel wrote down in a run's folder")
@@ -136,13 +133,15 @@ def parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="what a capture holds, and which effects it calls for")
     _add_capture(info, head)
     _add_effects(info)
+    _add_device(info)
     info.add_argument("--json", action="store_true", help="the effects alone, for programs")
     info.add_argument("--presets", action="store_true", help="with --json: also the presets and their time, as `plan`")
 
     plan = commands.add_parser("plan", help="the presets, and how long each would train on this machine")
     _add_capture(plan, head)
+    _add_device(plan)
 
-    benchmark = commands.add_parser("benchmark", help="what accuracy costs in time: strategies and presets compared")
+    benchmark = commands.add_parser("benchmark", help="what accuracy costs in time on the CPU: strategies and presets")
     _add_capture(benchmark, head)
     benchmark.add_argument("--budget", type=duration, default=180.0, metavar="TIME", help="of each run (default 3m)")
     benchmark.add_argument("--seeds", type=int, default=3, help="runs of each variant (default 3)")
@@ -176,6 +175,15 @@ def _add_effects(command: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=on|off",
         help="decide an effect instead of the capture (docs/effects.md); may be repeated",
+    )
+
+
+def _add_device(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--device",
+        choices=DEVICES,
+        default="auto",
+        help="cuda: an NVIDIA GPU; auto: that where it works, else the CPU; warp-cpu: the GPU's code on the CPU",
     )
 
 

@@ -6,7 +6,7 @@ from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,14 +21,18 @@ from .flame.motion import driven
 from .flame.sequence import sequence_mesh
 from .selection import SelectionOptions, select_capture
 
+if TYPE_CHECKING:
+    from .training.metrics import Quality
+
 
 def train(options: Namespace) -> None:
     """Train, or continue, a run."""
     from .effects.plan import decide, describe_plan
-    from .report.summary import conclude
+    from .report.summary import CurveDrawer, conclude
     from .training.device import choose_device
     from .training.folder import read_run
     from .training.progress import ProgressBar
+    from .training.run import Progress
     from .training.run import train as train_run
 
     if not options.capture.is_dir():
@@ -43,18 +47,24 @@ def train(options: Namespace) -> None:
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
         capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
-        run = decide(_new_run(options, capture), capture, device)
+        run = decide(_new_run(options, capture, device), capture, device)
     for warning in capture.warnings:
         print(f"warning: {warning}")
     _print_table(describe_plan(run.plan))
+    draw = CurveDrawer(options.out)
     with ProgressBar() as bar:
+
+        def report(progress: Progress) -> bool:
+            draw()
+            return bar.report(progress)
+
         selection = None if options.head is None else options.head.selection()
-        avatar = train_run(capture, options.out, run, selection, options.resume, bar.report, device)
+        avatar = train_run(capture, options.out, run, selection, options.resume, report, device)
     for line in conclude(options.out):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
-        print(f"its meshes: {options.out / 'tracking.npz'}, in Blender with Apply Motion")
+        print(f"its meshes: {options.out / 'tracking.npz'}, in Blender with Apply Motion, Own Offsets")
 
 
 def job(options: Namespace) -> None:
@@ -84,6 +94,7 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
         "seed": settings.seed,
         "preset": settings.preset,
         "target_psnr": settings.target_psnr,
+        "stop_when_flat": settings.stop_when_flat,
         "principal_point": run.principal_point,
     }
     for name, value in began_with.items():
@@ -102,11 +113,11 @@ def _choices(options: Namespace) -> dict[str, str]:
     return parse_choices(options.effect)
 
 
-def _new_run(options: Namespace, capture: Capture) -> Any:
+def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
     from .training.folder import Run
     from .training.settings import make_settings
 
-    changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": options.stop_when_flat}
+    changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": bool(options.stop_when_flat)}
     if options.seed is not None:
         changes["seed"] = options.seed
     if options.iterations is not None:
@@ -114,7 +125,7 @@ def _new_run(options: Namespace, capture: Capture) -> Any:
     elif options.budget is not None:
         changes["seconds"] = options.budget
     else:
-        changes["seconds"] = 120.0 if options.preset is None else _planned(capture, options.preset)
+        changes["seconds"] = 120.0 if options.preset is None else _planned(capture, options.preset, device)
     if options.strategy is not None:
         changes["strategy"] = options.strategy
     if options.threshold is not None:
@@ -127,12 +138,12 @@ def _new_run(options: Namespace, capture: Capture) -> Any:
     return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
 
 
-def _planned(capture: Capture, preset: str) -> float:
-    """Seconds that a preset takes here, which are printed."""
+def _planned(capture: Capture, preset: str, device: str) -> float:
+    """Seconds that a preset takes on this machine's device, which are printed."""
     from .report.calibration import plan_presets
     from .training.forecast import clock
 
-    (plan,) = plan_presets(capture, [preset])
+    (plan,) = plan_presets(capture, [preset], device=device)
     print(f"{preset}: {plan.iterations} iterations, {clock(plan.seconds)} on this machine")
     return plan.seconds
 
@@ -217,6 +228,7 @@ def _unique_names(paths: list[str]) -> list[str]:
 def eval(options: Namespace) -> None:
     """Print the quality of a run's avatar on a split, and write it beside the run."""
     from .files import write_json
+    from .training.lpips import SMALLEST
     from .training.metrics import measure
 
     if not options.run.is_dir():
@@ -227,13 +239,19 @@ def eval(options: Namespace) -> None:
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{options.split}'")
     quality = measure(avatar, capture, options.split, perceptual=True)
-    lpips = "not measured (package lpips is not installed)" if quality.lpips is None else f"{quality.lpips:.4f}"
-    print(f"{options.split}: {len(views)} views, PSNR {quality.psnr:.3f} dB, SSIM {quality.ssim:.4f}, LPIPS {lpips}")
+    print(f"{options.split}: {len(views)} views, {_describe(quality)}")
     for region, name in (("mask", "inside the head mask"), ("selected", "where something moves")):
         if region in quality.regions:
-            part = quality.regions[region]
-            print(f"  {name}: PSNR {part.psnr:.3f} dB, SSIM {part.ssim:.4f}")
+            print(f"  {name}: {_describe(quality.regions[region])}")
+    if quality.lpips is None:
+        print("LPIPS was not measured: it needs its weights, whose file STGA_LPIPS names (docs/dependencies.md),")
+        print(f"and images of {SMALLEST} pixels a side or more")
     write_json(options.run / f"quality_{options.split}.json", {"views": len(views), **quality.as_json()})
+
+
+def _describe(quality: "Quality") -> str:
+    lpips = "" if quality.lpips is None else f", LPIPS {quality.lpips:.4f}"
+    return f"PSNR {quality.psnr:.3f} dB, SSIM {quality.ssim:.4f}{lpips}"
 
 
 def select(options: Namespace) -> None:
@@ -296,19 +314,21 @@ def info(options: Namespace) -> None:
     """Print what a capture holds, and the effects that training on it would compute."""
     from .capture.summary import describe
     from .effects.plan import describe_plan, plan_effects
+    from .training.device import choose_device
     from .training.plan import plan_to_json
     from .training.settings import make_settings
 
     capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
     plan: tuple[Any, ...] = ()
     if capture.views.get("train"):
-        _, plan = plan_effects(capture, make_settings(iterations=1, effects=_choices(options)))
+        device, _ = choose_device(options.device)
+        _, plan = plan_effects(capture, make_settings(iterations=1, effects=_choices(options)), device)
     if options.json:
         found: dict[str, Any] = {"plan": plan_to_json(plan)}
         if options.presets and plan:
             from .report.calibration import plan_presets
 
-            found["presets"] = [preset.as_json() for preset in plan_presets(capture)]
+            found["presets"] = [preset.as_json() for preset in plan_presets(capture, device=device)]
         print(json.dumps(found))
         return
     _print_table(describe(capture))
@@ -326,10 +346,13 @@ def _print_table(lines: Sequence[tuple[str, str]]) -> None:
 def plan(options: Namespace) -> None:
     """Print what each preset is for, and how long it would train on this machine."""
     from .report.calibration import plan_presets
+    from .training.device import choose_device
     from .training.forecast import clock
 
     capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
-    for plan in plan_presets(capture):
+    device, why = choose_device(options.device)
+    print(why)
+    for plan in plan_presets(capture, device=device):
         print(f"{plan.preset:<9} {plan.iterations:6d} iterations  about {clock(plan.seconds):<10}  {plan.purpose}")
 
 

@@ -237,6 +237,22 @@ def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.C
     assert not (tmp_path / "none").exists()
 
 
+WITHOUT_TORCH = """
+import sys
+sys.modules.update(dict.fromkeys(("torch", "numba", "warp")))  # importing one of them fails
+from stga_addon.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_info_needs_no_torch(root: Path) -> None:
+    """Catches an import by which a capture can only be looked at where it could be trained."""
+    command = [sys.executable, "-c", WITHOUT_TORCH, "info", str(root)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stderr
+    assert "view-color" in done.stdout
+
+
 # Mistakes
 
 
@@ -268,6 +284,15 @@ def test_resuming_what_is_not_there(
     assert not (tmp_path / "none").exists()
     other = factory.write_mesh_capture(tmp_path / "other", TIMESTEPS, CAMERAS)
     assert f"this run trains {root.resolve()}, not" in refused(capsys, "train", other, "--out", trained, "--resume")
+
+
+@pytest.mark.parametrize("option", [["--stop-when-flat"], ["--target-psnr", 30], ["--preset", "final"], ["--seed", 5]])
+def test_resuming_with_another_goal(
+    trained: Path, root: Path, capsys: pytest.CaptureFixture[str], option: list[object]
+) -> None:
+    """Catches an option that is given and does nothing."""
+    message = refused(capsys, "train", root, "--out", trained, "--resume", *option)
+    assert f"{option[0]}: this run began with" in message
 
 
 def test_an_avatar_without_capture(

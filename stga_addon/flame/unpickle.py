@@ -158,17 +158,20 @@ class _RestrictedUnpickler(pickle.Unpickler):
 def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
     """The arrays of a pickled dictionary, dense, by key; `names` limits which entries are looked at.
 
-    scipy.sparse matrices are densified and chumpy objects replaced by their value. Raises StgaError where the file is
-    missing, truncated, too large, no dictionary of arrays, or asks for any other class (named in the message).
+    A name such as "a/b" means the entry b of the dictionary a. scipy.sparse matrices are densified and chumpy
+    objects replaced by their value. Raises StgaError where the file is missing, truncated, too large, no dictionary
+    of arrays, or asks for any other class (named in the message).
     """
     loaded, room = _load(path)
     if not isinstance(loaded, dict):
         raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
     arrays = {}
     for key in names if names is not None else [name for name in loaded if isinstance(name, str)]:
-        if key in loaded:
+        folder, _, name = ("", "", key) if key in loaded else key.rpartition("/")
+        entries = _entries(loaded, folder)
+        if name in entries:
             try:
-                arrays[key] = _dense(loaded[key])
+                arrays[key] = _dense(entries[name])
             except _Stray as error:
                 raise StgaError(f"{path}: {key} is {error}, expected an array of numbers") from error
             except Exception as error:
@@ -178,6 +181,14 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
             if room < 0:
                 raise StgaError(f"{path}: {key} and the arrays before it are larger than the file can hold")
     return arrays
+
+
+def _entries(loaded: dict[Any, Any], folder: str) -> dict[Any, Any]:
+    """The dictionary at a path of keys such as "a/b"; empty where there is none."""
+    for part in folder.split("/") if folder else ():
+        found = loaded.get(part)
+        loaded = found if isinstance(found, dict) else {}
+    return loaded
 
 
 def _load(path: Path) -> tuple[Any, int]:

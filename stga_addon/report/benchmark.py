@@ -67,10 +67,17 @@ def run_benchmark(
     for of_seed in jobs.values():
         for job in of_seed.values():
             job.check()
+    left = sum(not job.finished for of_seed in jobs.values() for job in of_seed.values())
+    if left:
+        total = clock(left * seconds)
+        tell(f"{left} runs of {clock(seconds)}: {total} of training; what starting and measuring take is on top")
     try:
         for seed, of_seed in jobs.items():
             if not all(job.finished for job in of_seed.values()):
                 race(list(of_seed.values()), lambda text, seed=seed: tell(f"seed {seed}: {text}"))  # type: ignore[misc]
+    except KeyboardInterrupt:
+        tell(f"what is finished stands in {out / 'report.txt'}; the same command goes on from here")
+        raise
     finally:
         report = _write(run, jobs, seconds, out)
     return report
@@ -119,8 +126,9 @@ def report_text(outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], se
     if not table:
         return f"{capture.name}: no run is finished yet"
     counts = sorted({spreads["iterations"].count for spreads in table.values()})
+    seeds = f"{'–'.join(map(str, counts))} seed{'' if counts == [1] else 's'}"
     lines = [
-        f"{capture.name}, {clock(seconds)} of training each, {'–'.join(map(str, counts))} seeds; mean ± spread",
+        f"{capture.name}, {clock(seconds)} of training each, {seeds}; mean ± spread",
         "",
         *table_lines(table),
         "",

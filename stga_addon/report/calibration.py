@@ -42,20 +42,25 @@ class Plan:
         return dict(vars(self))
 
 
-def plan_presets(capture: Capture, names: Iterable[str] = tuple(PRESETS), seconds: float = SECONDS) -> list[Plan]:
-    """Time each preset for a few `seconds`. Raises StgaError where the capture has no training views."""
+def plan_presets(
+    capture: Capture, names: Iterable[str] = tuple(PRESETS), seconds: float = SECONDS, device: str = "cpu"
+) -> list[Plan]:
+    """Time each preset for a few `seconds` on a device of `choose_device`.
+
+    Raises StgaError where the capture has no training views.
+    """
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     plans = []
     for name in names:
         iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
-        settings, _ = plan_effects(capture, make_settings(preset=name, iterations=iterations, effects={}))
-        pace = seconds_per_iteration(capture, settings, seconds)
+        settings, _ = plan_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
+        pace = seconds_per_iteration(capture, settings, seconds, device)
         plans.append(Plan(name, PRESETS[name].purpose, iterations, iterations * pace))
     return plans
 
 
-def seconds_per_iteration(capture: Capture, settings: Settings, seconds: float = SECONDS) -> float:
+def seconds_per_iteration(capture: Capture, settings: Settings, seconds: float = SECONDS, device: str = "cpu") -> float:
     """Mean time of an iteration, from a run in small of which nothing is kept.
 
     Shares of the budget pass as in the whole run, so that coarse images, degrees of colour and local iterations count
@@ -63,7 +68,7 @@ def seconds_per_iteration(capture: Capture, settings: Settings, seconds: float =
     """
     compile_kernels()
     wanted = settings.strategy == "selective"
-    trainer = Trainer(capture, settings, select_capture(capture, settings.selection) if wanted else {})
+    trainer = Trainer(capture, settings, select_capture(capture, settings.selection) if wanted else {}, device=device)
     views = list(islice(view_order(capture.views["train"], settings.views_per_visit, settings.seed), VIEWS))
     sizes = {settings.scale, settings.scale * COARSE} if settings.coarse_span else {settings.scale}
     images = {size: cycle([_ready(view, size, settings.background) for view in views]) for size in sizes}

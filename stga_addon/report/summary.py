@@ -1,26 +1,56 @@
-"""What a run came to, in a few lines read from its metrics."""
+"""How a run goes and what it came to, in a picture and a few lines, read from its metrics."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
+from ..errors import StgaError
 from ..files import replacing
-from ..training.evaluations import read_metrics
+from ..training.evaluations import METRICS, read_metrics
 from ..training.folder import read_run
 from ..training.forecast import clock, curve_of, hits, level_since, missed
 from .pictures import run_chart
 from .results import evaluation_share
 
 CURVE = "curve.png"
+DRAWING_SHARE = 0.01
+"""Largest share of the time that goes into drawing the curve again while a run trains."""
 
 
-def conclude(folder: Path) -> list[str]:
-    """The lines for a person whose run has ended; leaves the curve as a picture in the run's folder."""
+class CurveDrawer:
+    """Keeps the curve in a run's folder up to date, with the last forecast; to be called now and then."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._drawn, self._wait_until = folder, -1, 0.0
+
+    def __call__(self) -> None:
+        now = perf_counter()
+        if now < self._wait_until:
+            return
+        path = self._folder / METRICS
+        size = path.stat().st_size if path.exists() else 0
+        if size != self._drawn:
+            with suppress(StgaError):  # training goes on without; where the disk is full, it will say so itself
+                draw_curve(self._folder)
+            self._drawn = size
+        spent = perf_counter() - now
+        self._wait_until = now + spent / DRAWING_SHARE
+
+
+def draw_curve(folder: Path) -> None:
+    """Replace the picture of the curve in a run's folder; nothing before the first evaluation."""
     metrics = read_metrics(folder)
     if curve_of(metrics):
         with replacing(folder / CURVE) as partial:
             run_chart(metrics).save(partial, format="PNG")
-    return describe_run(metrics, read_run(folder).settings.target_psnr)
+
+
+def conclude(folder: Path) -> list[str]:
+    """The lines for a person whose run has ended; leaves the curve as a picture in the run's folder."""
+    draw_curve(folder)
+    return describe_run(read_metrics(folder), read_run(folder).settings.target_psnr)
 
 
 def describe_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:

@@ -3,15 +3,17 @@
 import ctypes
 import os
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import StgaError
-from .cpu_step import CpuStep
-from .frames import FrameStore
-from .settings import Settings
-from .state import TrainState
-from .step import Step
+
+if TYPE_CHECKING:  # to ask for the device, `stga info` needs neither torch nor numba
+    from .frames import FrameStore
+    from .settings import Settings
+    from .state import TrainState
+    from .step import Step
 
 LEAST_FREE = 1 << 30
 """Bytes of GPU memory below which training does not begin there."""
@@ -33,12 +35,16 @@ def choose_device(wanted: str) -> tuple[str, str]:
     return "cpu", f"training on the CPU: {reason}"
 
 
-def make_step(device: str, settings: Settings, lengths: np.ndarray, frames: FrameStore, state: TrainState) -> Step:
+def make_step(
+    device: str, settings: "Settings", lengths: np.ndarray, frames: "FrameStore", state: "TrainState"
+) -> "Step":
     """What computes iterations on a device of `choose_device`.
 
     lengths (F,): what a triangle's limits are multiples of. Raises StgaError where the settings need another device.
     """
     if device == "cpu":
+        from .cpu_step import CpuStep
+
         return CpuStep(settings, lengths, frames, state)
     if settings.tracking:
         raise StgaError(f"effect tracking: FLAME's parameters are refined on the CPU only, not on {device}")

@@ -23,6 +23,11 @@ HORIZONS = (5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600)
 """Seconds that a forecast may look ahead."""
 STILL = 0.02
 """dB: a smaller gain is none."""
+LEAST = 0.2
+"""Of what a curve will ever gain, this share must be left at a target to call it in reach: with less, it would take 25
+times as long as was trained."""
+SOON = 1.1
+"""Times the time trained that a target takes at least which the scatter alone kept from being reached."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +120,19 @@ def missed(curve: Curve, target: float) -> str:
     level = level_since(curve)
     if level is not None:
         return f"{lead}: nothing was gained after {clock(level)}, so more time would not help; more splats may"
-    rate = _rate(curve)
-    if rate <= 0:
+    if len(curve) < FEWEST:
+        return f"{lead}: there are too few evaluations to say how long it would take"
+    t, psnr = np.array(curve, np.float64).T
+    now, gain, _ = _continued(t, psnr, np.inf)
+    if gain <= 0:
         return f"{lead}: the curve does not rise steadily"
-    more = clock((target - best) / rate)
-    return f"{lead}: it still rose by {60 * rate:.2f} dB a minute; at that rate, which falls with time, {more} more"
+    left = 1 - (target - now) / gain  # share of the gain that is still to come once the target is reached
+    if left < LEAST:
+        beyond = target > now + (1 + DOUBT) * gain
+        says = "more time alone would not reach it" if beyond else "only a much longer budget might reach it"
+        return f"{lead}: the curve levels off at about {now + gain:.1f} dB; {says}"
+    reach = max(left**-2, SOON)
+    return f"{lead}: as the curve goes, it would take about {clock((reach - 1) * t[-1])} more"
 
 
 def clock(seconds: float) -> str:
@@ -144,12 +157,3 @@ def _continued(t: np.ndarray, psnr: np.ndarray, reach: float) -> tuple[float, fl
     now = float(np.median(levels))
     scatter = max(2 * RESOLUTION, 3 * float(np.median(np.abs(levels - now))))
     return now, slope * (1 - reach**-0.5), scatter
-
-
-def _rate(curve: Curve) -> float:
-    """dB a second over the last third of the time."""
-    t, psnr = np.array(curve, np.float64).T
-    late = t >= LATE * t[-1]
-    if late.sum() < 2:
-        return 0.0
-    return float(np.polyfit(t[late], psnr[late], 1)[0])

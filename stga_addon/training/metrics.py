@@ -1,27 +1,25 @@
-"""How close renderings come to the images: PSNR, SSIM and, where its package is installed, LPIPS."""
+"""How close renderings come to the images: PSNR, SSIM and, where its weights are known, LPIPS."""
 
 import importlib.util
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
 from ..avatar.file import Avatar
 from ..capture.model import Capture, View
 from ..raster.draw import draw_avatar
+from . import lpips
 from .losses import similarity
 from .watch import Sight, look
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None without its package.
+    """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None without its weights.
 
     regions  the same by region of the images ("mask", "selected"), over the views that have the region
     """
@@ -95,9 +93,9 @@ def _scores(
     if where is not None:
         image = np.where(where, image, target.transpose(2, 0, 1).astype(np.float32) / 255)
         share = float(where.mean())
-    lpips = _lpips(image, target) if perceptual else None
     ssim = 1 - (1 - similarity(image, target)) / share
-    return decibels, ssim, np.nan if lpips is None else lpips
+    apart = _lpips(image, target) if perceptual else None
+    return decibels, ssim, np.nan if apart is None else apart
 
 
 def _mean(scores: list[tuple[float, float, float]]) -> Quality:
@@ -105,19 +103,8 @@ def _mean(scores: list[tuple[float, float, float]]) -> Quality:
     return Quality(float(mean[0]), float(mean[1]), None if np.isnan(mean[2]) else float(mean[2]))
 
 
-@cache
-def _network() -> Any:
-    if importlib.util.find_spec("lpips") is None:
-        return None
-    import lpips
-
-    return lpips.LPIPS(net="alex", verbose=False).eval()
-
-
 def _lpips(image: np.ndarray, target: np.ndarray) -> float | None:
-    network = _network()
-    if network is None:
+    network = lpips.network()
+    if network is None or min(target.shape[:2]) < lpips.SMALLEST:
         return None
-    pair = [torch.from_numpy(image), torch.from_numpy(target.transpose(2, 0, 1).astype(np.float32) / 255)]
-    with torch.no_grad():
-        return float(network(*(2 * p[None] - 1 for p in pair)))
+    return network.distance(image, target.transpose(2, 0, 1).astype(np.float32) / 255)

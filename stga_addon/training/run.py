@@ -15,6 +15,7 @@ from ..capture.model import Capture
 from ..errors import StgaError
 from ..selection import select_capture
 from . import folder as run_folder
+from . import lpips
 from .evaluations import read_metrics
 from .exposure import even_exposure
 from .folder import Checkpoint, Run
@@ -76,8 +77,10 @@ def train(
     selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
     checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
     device: one of `device.choose_device`.
-    Raises StgaError where the capture has nothing to train on, or the folder is in use or holds another run.
+    Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or the
+    weights of LPIPS are named and are none.
     """
+    lpips.network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
@@ -180,7 +183,7 @@ class _Loop:
                 speed = (trainer.iteration - first) / max(self.elapsed - started, 1e-9)
                 if self.report(self._progress(speed)):
                     break
-        self._evaluate(last=True)
+        self._evaluate(perceptual=self._share() >= 1 or self._enough())  # who stops a run is not made to wait
         self._save()
         self.report(self._progress(speed, "trained"))
 
@@ -214,7 +217,7 @@ class _Loop:
             return True
         return self.settings.stop_when_flat and level_since(curve) is not None
 
-    def _evaluate(self, last: bool = False) -> None:
+    def _evaluate(self, perceptual: bool = False) -> None:
         """Look at the held-out views, keep the avatar if it is the best so far, and write the metrics down."""
         share = min(1.0, self._share())
         self.evaluations = max(self.evaluations, int(share * EVALUATIONS))
@@ -227,7 +230,7 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.sights:
-            quality = evaluate(lambda view: self.trainer.draw(view, share), self.sights, perceptual=last)
+            quality = evaluate(lambda view: self.trainer.draw(view, share), self.sights, perceptual)
             self.psnr = quality.psnr
             line.update(quality.as_json())
         # Without held-out views the latest avatar counts as the best.
@@ -256,11 +259,12 @@ class _Loop:
             self.outlook = f"no gain since {clock(level)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None
         if target is not None and end is not None and end.psnr + end.error < target:
-            self.outlook += f"; {target:g} dB is not in sight ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"
+            far = f"{target:g} dB is not in sight ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"
+            self.outlook = "; ".join(filter(None, (self.outlook, far)))
 
     def _avatar(self) -> Avatar:
         return Avatar(
-            self.trainer.state.splats(),
+            self.trainer.state.averaged(),
             self.settings.convention,
             self.capture.neutral.astype(np.float32),
             self.capture.faces,

@@ -27,7 +27,7 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     watch, seen = Stopwatch(), []
 
     class Trainer:
-        def __init__(self, *_: Any) -> None:
+        def __init__(self, *_: Any, **__: Any) -> None:
             pass
 
         def step(self, view: Any, image: Any, share: float, mask: Any) -> None:

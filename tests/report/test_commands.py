@@ -17,11 +17,29 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_plan(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches presets that are not told, or without their time."""
-    assert main(["plan", str(toy_root)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    """Catches presets that are not told, or without their time, or without what was timed."""
+    assert main(["plan", str(toy_root), "--device", "cpu"]) == 0
+    device, *lines = capsys.readouterr().out.splitlines()
+    assert device == "training on the CPU, as asked for"
     assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
     assert lines[1].split()[1:6] == ["3000", "iterations", "about", "3", "s"]
+
+
+def test_what_is_timed_is_what_will_train(
+    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a GPU that is given the minutes of the CPU."""
+    timed: list[str] = []
+    monkeypatch.setattr(calibration, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
+    device = ["--device", "warp-cpu"]
+    assert main(["plan", str(toy_root), *device]) == 0
+    assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
+    made = []
+    monkeypatch.setattr("stga_addon.training.run.train", lambda *call: made.append(call[-1]) or tmp_path)
+    monkeypatch.setattr("stga_addon.report.summary.conclude", lambda folder: [])
+    assert main(["train", str(toy_root), "--preset", "draft", "--out", str(tmp_path), *device]) == 0
+    assert timed == ["warp-cpu"] * 7
+    assert made == ["warp-cpu"]
 
 
 def test_a_preset_is_trained_for_its_time(

@@ -64,9 +64,10 @@ def test_one_job(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "nowhere" in json.loads(answers.getvalue())["error"]
 
 
-def interrupt_at(text: str) -> Callable[[str], None]:
-    def tell(told: str) -> None:
-        if text in told:
+def interrupt_at(text: str, told: list[str]) -> Callable[[str], None]:
+    def tell(line: str) -> None:
+        told.append(line)
+        if text in line:
             raise KeyboardInterrupt
 
     return tell
@@ -77,14 +78,20 @@ def test_a_benchmark_is_interrupted_and_goes_on(toy: Capture, tmp_path: Path, mo
     """Catches work lost to Ctrl-C, runs trained twice or not in turns, and files that are missing at the end."""
     monkeypatch.setattr(race_module, "SLICE_S", 0.5)
     run = Run(toy.root, None, "vhap", make_settings(seconds=1.0))
+    told: list[str] = []
     with pytest.raises(KeyboardInterrupt):
-        run_benchmark(toy, run, VARIANTS, 2.0, 1, tmp_path, interrupt_at("2 of 4 turns"))
+        run_benchmark(toy, run, VARIANTS, 2.0, 1, tmp_path, interrupt_at("2 of 4 turns", told))
+    assert told[-1] == f"what is finished stands in {tmp_path / 'report.txt'}; the same command goes on from here"
     assert "no run is finished yet" in (tmp_path / "report.txt").read_text()
     kept = {name: read_checkpoint(tmp_path / f"{name}-0").elapsed_s for name in VARIANTS}
     assert all(0.5 <= elapsed < 1.9 for elapsed in kept.values())
-    told: list[str] = []
+    told.clear()
     report = run_benchmark(toy, run, VARIANTS, 2.0, 1, tmp_path, told.append)
-    assert [text for text in told if "starting" in text] == [f"seed 0: starting {name}-0" for name in VARIANTS]
+    assert (
+        told[1]
+        == f"{len(VARIANTS)} runs of 2 s: {2 * len(VARIANTS)} s of training; what starting and measuring take is on top"
+    )
+    assert [text for text in told if ": starting" in text] == [f"seed 0: starting {name}-0" for name in VARIANTS]
     for name in VARIANTS:
         assert f"| {name}" in report
         checkpoint, lines = read_checkpoint(tmp_path / f"{name}-0"), read_metrics(tmp_path / f"{name}-0")
