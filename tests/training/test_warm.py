@@ -1,6 +1,7 @@
 """Kernels are compiled before the clock of a run starts."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -60,3 +61,23 @@ def test_training_compiles_nothing_new(tmp_path: Path, transparent: bool) -> Non
     assert warmed >= 8
     new = {name: counts for name, counts in kernels.items() if counts[0] != counts[1]}
     assert not new
+
+
+COLD = """
+import json
+from stga_addon.raster.kernels import image_loss, rows
+from stga_addon.training.warm import compile_kernels
+compile_kernels()
+kernels = [getattr(kernel, "__wrapped__", kernel) for kernel in (image_loss.image_loss, rows.adam_rows)]
+print(json.dumps([sum(kernel.stats.cache_hits.values()) for kernel in kernels]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_a_second_process_compiles_half_of_the_kernels(tmp_path: Path) -> None:
+    """Catches a first start that waits for a second process and then compiles everything again, or never starts one."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", COLD], capture_output=True, text=True, timeout=300, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [1, 1]
