@@ -63,10 +63,9 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         for n in listed:
             history[n].append(rows[n]["xyz"].detach().clone())
     for n, values in enumerate(history):
-        # The first five count alike, then the newest counts a fifth.
-        average = torch.stack(values[:5]).mean(0) if values else state.parameters.xyz[n]
-        for value in values[5:]:
-            average = 0.8 * average + 0.2 * value
+        average = state.parameters.xyz[n]
+        for count, value in enumerate(values, 1):
+            average = average.double().lerp(value, max(0.2, 4 / (count + 3)))
         np.testing.assert_allclose(state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5)
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity", "strain_color"):

@@ -23,8 +23,9 @@ def adam_rows(
 
     parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
     (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
-    `newest`, or as one of so many steps while those are few. Rows that are not listed are not touched at all.
-    A row whose gradient is not finite, or beyond LARGEST, keeps that parameter, its moments and its average.
+    `newest`, or 4 / (steps + 3) where that is more: the first steps are long, and soon to be forgotten. Rows that are
+    not listed are not touched at all. A row whose gradient is not finite, or beyond LARGEST, keeps that parameter, its
+    moments and its average.
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
@@ -36,7 +37,7 @@ def adam_rows(
             count = np.float64(steps[rows[n]])
             correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
             correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
-            blend[n - begin] = max(np.float64(newest), 1.0 / count)
+            blend[n - begin] = max(np.float64(newest), 4.0 / (count + 3.0))
         for p in range(len(parameters)):
             _adam_block(
                 rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], averages[p],

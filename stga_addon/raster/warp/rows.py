@@ -27,7 +27,7 @@ def count_steps(
     correct: wp.array[wp.vec3],
 ):
     """Add a step to the wanted rows, and write what corrects their first and second moment's bias and how much the
-    step counts in their running average: `newest`, or one of so many steps while those are few.
+    step counts in their running average: `newest`, or more in the beginning.
 
     In float64, because 1 − βⁿ cancels.
     """
@@ -37,7 +37,7 @@ def count_steps(
     steps[i] = steps[i] + 1
     n, one = wp.float64(steps[i]), wp.float64(1.0)
     first, second = one / (one - wp.exp(n * log_beta1)), one / wp.sqrt(one - wp.exp(n * log_beta2))
-    correct[i] = wp.vec3(float(first), float(second), wp.max(newest, float(one / n)))
+    correct[i] = wp.vec3(float(first), float(second), wp.max(newest, float(wp.float64(4.0) / (n + wp.float64(3.0)))))
 
 
 @wp.kernel
