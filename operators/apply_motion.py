@@ -50,6 +50,10 @@ class ApplyMotion(bpy.types.Operator):
         soft_max=2.0,
         max=10.0,
     )
+    own_offsets: bpy.props.BoolProperty(
+        name="Own Offsets",
+        description="The motion is this head's own, refined: its tracked per-frame offsets, if it has any, play along",
+    )
     start: bpy.props.IntProperty(name="Start Frame", description="Frame of the first keyframe", default=1, min=0)
     fps: bpy.props.FloatProperty(
         name="Recorded At",
@@ -74,6 +78,12 @@ class ApplyMotion(bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
 
     @classmethod
+    def description(cls, context: Any, properties: Any) -> str:
+        if properties.own_offsets:
+            return "Put this head on its tracking as training refined it; what animated it before is kept"
+        return ""  # the class' own
+
+    @classmethod
     def poll(cls, context: Any) -> bool:
         return needs_rig(cls, context)
 
@@ -90,13 +100,15 @@ class ApplyMotion(bpy.types.Operator):
         if not parts:
             raise StgaError("apply motion: no part is chosen; take the expression, jaw, eyes, neck or head")
         name, motion = self._motion(context, head)
-        frames = retimed(motion, self._step(context.scene))
+        step = self._step(context.scene)
+        frames = retimed(motion, step)
         end = self.start + len(frames) - 1
         if end > LAST_FRAME:
             raise StgaError(f"apply motion: would end in frame {end}, Blender counts to {LAST_FRAME}")
         if self.strength != 1.0:
             frames = strengthened(frames, self.strength)
-        apply_motion(head, frames, self.start, name, parts, self.place == "strip", self._warn)
+        tracked = self._tracked(head, step) if self.own_offsets else None
+        apply_motion(head, frames, self.start, name, parts, self.place == "strip", self._warn, tracked)
         if self.fit_range:
             context.scene.frame_end = max(context.scene.frame_end, end)
         context.scene.frame_set(context.scene.frame_current)
@@ -114,6 +126,11 @@ class ApplyMotion(bpy.types.Operator):
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
         numbers = range(context.scene.frame_start, context.scene.frame_end + 1)
         return other.name, performed_motion(other, flame_of(capture_of(other), other.name), numbers, self._warn)
+
+    def _tracked(self, head: Any, step: float) -> tuple[FlameSequence, list[float]]:
+        """What the head was imported from, and where its timesteps come to lie."""
+        own = flame_of(capture_of(head), head.name)
+        return own, [self.start + (timestep - own.timesteps[0]) / step for timestep in own.timesteps]
 
     def _step(self, scene: Any) -> float:
         """Timesteps of the recording that a frame of the scene takes."""

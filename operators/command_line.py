@@ -1,41 +1,82 @@
 """`blender --command stga …`: the same parser as `python -m stga_addon`, about the head of the file that is open."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
 
+from ..stga_addon import task
 from ..stga_addon.capture.model import Capture
+from ..stga_addon.errors import StgaError
+from ..stga_addon.runtime import missing_here
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import evaluated_vertices
 from ..stga_addon.scene.groups import painted_selection
 from ..stga_addon.scene.motion import performed_motion, played
 from . import ids
 from .common import file_path, is_head, settings
+from .runtime import training_python
+
+IN_BLENDER = ("select", "export", "demo")
+"""Commands that need none of the packages which Blender's Python may lack, or need Blender itself."""
+
+if TYPE_CHECKING:
+    from ..stga_addon.cli import OpenHead
 
 _commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from ..stga_addon.cli import OpenHead, main  # only here: enabling the extension loads nothing that a command needs
+    from ..stga_addon.cli import main, parser  # only here: enabling the extension loads nothing that a command needs
+
+    try:
+        head = _open_head()
+        command = parser(head).parse_args(arguments).command
+        if command in IN_BLENDER or not missing_here():
+            return main(arguments, head)
+        return _hand_over(arguments, head, played=command == "render")
+    except StgaError as error:
+        print(f"stga: {error}", file=sys.stderr)
+        return 2
+
+
+def _open_head() -> "OpenHead | None":
+    from ..stga_addon.cli import OpenHead
 
     head = settings(bpy.context).head
     if not is_head(head):
-        return main(arguments)
+        return None
     model, avatar = head.get(tags.FLAME_MODEL), settings(bpy.context).avatar
-    return main(
-        arguments,
-        OpenHead(
-            capture=Path(head[tags.CAPTURE]),
-            flame=Path(model) if model else None,
-            principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
-            avatar=file_path(avatar, "avatar") if avatar else None,
-            selection=lambda: painted_selection(head),
-            played=lambda capture: _played(head, capture),
-        ),
+    return OpenHead(
+        capture=Path(head[tags.CAPTURE]),
+        flame=Path(model) if model else None,
+        principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
+        avatar=file_path(avatar, "avatar") if avatar else None,
+        selection=lambda: painted_selection(head),
+        played=lambda capture: _played(head, capture),
     )
+
+
+def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
+    """Let the training runtime carry out the command; returns its exit code. Raises StgaError where there is none."""
+    from ..stga_addon.handover import write_head
+
+    python = training_python(bpy.context)
+    with TemporaryDirectory() as folder:
+        module = ["stga_addon"]
+        if head is not None:
+            write_head(Path(folder), head, played)
+            module = ["stga_addon.handover", folder]
+        try:
+            return subprocess.call([python, "-m", *module, *arguments], env=task.environment(os.environ))
+        except OSError as error:
+            raise StgaError(f"{python}: cannot be started as a Python interpreter ({error.strerror})") from error
 
 
 def _played(head: Any, capture: Capture) -> Capture:

@@ -11,7 +11,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import configure_scene, import_cameras
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.head import import_head
-from ..stga_addon.scene.hierarchy import capture_root
+from ..stga_addon.scene.hierarchy import capture_root, leave_edit_mode
 from . import ids
 from .common import file_path, flame_model_path, flame_property, reporting, settings
 
@@ -40,8 +40,8 @@ class ImportCapture(bpy.types.Operator):
         ),
     )
     correctives: bpy.props.EnumProperty(
-        name="Pose Correctives",
-        description="For which of FLAME's joints the rig has the shape keys and drivers that correct the mesh",
+        name="Correctives",
+        description="Which of FLAME's joints get pose correctives: shape keys and drivers that correct the mesh",
         items=(
             ("all", "Every Joint", "Any bone posed by hand gives FLAME's own mesh"),
             ("moving", "Joints That Move", "Only what this capture turns: fewer shape keys and drivers"),
@@ -88,6 +88,8 @@ def bring_in(
     head[tags.PRINCIPAL_POINT] = principal_point
     settings(context).head = head
     _show_first_frame(context.scene, capture)
+    _select_only(context, head)
+    _frame_in_viewports(context, head)
     if set_up_scene and cameras:
         configure_scene(context.scene, capture, cameras[0], warn=warn)
     for sentence in capture.warnings:
@@ -99,3 +101,24 @@ def bring_in(
 def _show_first_frame(scene: Any, capture: Capture) -> None:
     scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
     scene.frame_set(capture.timesteps[0])
+
+
+def _select_only(context: Any, head: Any) -> None:
+    """As Blender's importers leave what they bring in."""
+    leave_edit_mode()
+    for thing in context.view_layer.objects.selected:
+        thing.select_set(False)
+    if context.view_layer.objects.get(head.name) is head:
+        head.select_set(True)
+        context.view_layer.objects.active = head
+
+
+def _frame_in_viewports(context: Any, head: Any) -> None:
+    """Look at the head, which is small beside Blender's usual scenes; a view through a camera stays."""
+    if bpy.app.background or context.window is None or not head.visible_get(view_layer=context.view_layer):
+        return
+    for area in context.window.screen.areas:
+        if area.type == "VIEW_3D" and area.spaces.active.region_3d.view_perspective != "CAMERA":
+            region = next(region for region in area.regions if region.type == "WINDOW")
+            with context.temp_override(area=area, region=region):
+                bpy.ops.view3d.view_selected()

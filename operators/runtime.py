@@ -106,8 +106,10 @@ class MakeRuntime(bpy.types.Operator):
         cpu, cuda = runtime.SIZES_GB["cpu"], runtime.SIZES_GB["cuda"]
         column.label(text=f"Takes about {cpu:.1f} GB for the CPU, {cuda:.1f} GB for CUDA, in")
         column.label(text=str(runtime_folder()))
+        if not self.wheels and sys.platform == "linux":
+            column.label(text=f"Where pytorch.org cannot be reached: {runtime.SIZES_GB['pypi']:.1f} GB")
         if not self.wheels:
-            source = "Downloads from pytorch.org and pypi.org"
+            source = "Downloads from pypi.org and pytorch.org" if sys.platform == "linux" else "Downloads from pypi.org"
             offline = not bpy.app.online_access
             column.label(text=OFFLINE if offline else source, icon="ERROR" if offline else "URL")
 

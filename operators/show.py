@@ -7,7 +7,7 @@ import bpy
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.materials import TRANSPARENT_BOUNCES, view_transform_hint
-from ..stga_addon.scene.splats import Prepared, show_avatar
+from ..stga_addon.scene.splats import Prepared, hide, show_avatar
 from . import ids
 from .common import file_path, head_of, needs_head, reporting, settings
 
@@ -45,6 +45,8 @@ class ShowAvatar(bpy.types.Operator):
         avatar = read_avatar(path)
         show(context.scene, avatar, head, f"{head.name} {path.stem}", self.hide_head)
         settings(context).avatar = self.filepath
+        if self.hide_head and head.library is not None:
+            self.report({"WARNING"}, f"{head.name}: is linked, and covers the splats in renders; hide it in its file")
         hint = view_transform_hint(context.scene)
         self.report({"WARNING" if hint else "INFO"}, f"{len(avatar.splats)} splats" + (f". {hint}" if hint else ""))
         return {"FINISHED"}
@@ -59,10 +61,7 @@ def show(
     """
     shown = show_avatar(avatar, head, name, prepared)
     if hide_head:
-        head.hide_render = True
-        for layer in scene.view_layers:
-            if layer.objects.get(head.name) is head:
-                head.hide_set(True, view_layer=layer)
+        hide(head, scene)
     getattr(scene, ids.SETTINGS).splats = shown
     return shown
 

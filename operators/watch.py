@@ -227,7 +227,21 @@ def _redraw() -> None:
 
 @persistent
 def _after_load(_: Any) -> None:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            _adopt(scene)
     follow()
+
+
+def _adopt(scene: Any) -> None:
+    """Let the panel work on the one head, and the splats, of a file that was made without it, as `stga demo` does."""
+    chosen = getattr(scene, ids.SETTINGS)
+    heads = [thing for thing in scene.objects if is_head(thing)]
+    shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
+    if chosen.head is None and len(heads) == 1:
+        chosen.head = heads[0]
+        if chosen.splats is None and len(shown) == 1:
+            chosen.splats = shown[0]
 
 
 def register() -> None:

@@ -1,7 +1,7 @@
 """The training runtime: a Python with torch that trains beside Blender; found, tested or made here.
 
 `python -m stga_addon.runtime test FOLDER PYTHON` and `… make FOLDER` are workers that tell in FOLDER/task (`task`).
-FOLDER/venv is the environment that is made, FOLDER/ready is there once it has passed the test.
+FOLDER/venv-… is an environment that was made, `ready` in it is there once it has passed the test.
 """
 
 import argparse
@@ -13,22 +13,35 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from . import task
 from .errors import StgaError
-from .files import replacing
 from .probe import NEEDED
 
 DEVICES = ("auto", "cpu", "cuda")
-SIZES_GB = {"cpu": 1.5, "cuda": 2.0}
-"""Room that a runtime takes: measured, and with the package warp-lang, which is all that a GPU needs beside."""
+OLDEST = 3, 11
+"""Python that can train."""
+SIZES_GB = {"cpu": 1.5, "cuda": 2.0, "pypi": 6.0}
+"""Room that a runtime takes: measured; with the package warp-lang, which is all that a GPU needs beside; and with the
+torch that PyPI has for Linux, measured."""
 OLDEST_CUDA = 12
 """Of the driver, for warp-lang."""
 INDEX = "https://download.pytorch.org/whl/cpu"
-"""PyTorch's CPU build: on a GPU, too, the kernels are ours, and its CUDA builds take gigabytes."""
+"""PyTorch's CPU build: on a GPU, too, the kernels are ours, and the CUDA build, which PyPI has for Linux, takes
+gigabytes. Everything else comes from PyPI, or the mirror of it that pip is configured for."""
+REASONS = {
+    "No space left on device": "the disk is full",
+    "ensurepip": "this Python has no ensurepip; choose another one (3.11 or newer), or install python3-venv",
+    "connection broken by": "the package indexes cannot be reached; check network and proxy, or use a folder of wheels",
+    "No matching distribution": "{}: none that fits this Python and system",
+}
+"""What a failing step printed, {} -> what to tell a person; the first that fits."""
+READY, PROMPT = "ready", "$ "
 PROBE_S = 180.0
 """The first import of torch from a slow disk."""
 
@@ -39,8 +52,8 @@ def task_folder(folder: Path) -> Path:
 
 def made_python(folder: Path) -> Path | None:
     """The interpreter of the runtime that was made in `folder`; None where there is none, or it never got ready."""
-    python = venv_python(folder / "venv")
-    return python if (folder / "ready").exists() and python.exists() else None
+    made = (venv_python(ready.parent) for ready in folder.glob(f"venv-*/{READY}"))
+    return next((python for python in made if python.exists()), None)
 
 
 def venv_python(venv: Path) -> Path:
@@ -86,7 +99,7 @@ def probe(python: str) -> str:
 def describe(python: str, report: dict[str, Any]) -> str:
     """The line of `probe` from what probe.py prints. Raises StgaError where something is missing."""
     version, found, broken = report["python"], report["found"], report["broken"]
-    if tuple(int(part) for part in version.split(".")[:2]) < (3, 11):
+    if tuple(int(part) for part in version.split(".")[:2]) < OLDEST:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
     missing = [package for module, package in NEEDED.items() if module in broken]
     if missing:
@@ -122,39 +135,48 @@ def nvidia_smi() -> str | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def steps(venv: Path, python: str, device: str, wheels: Path | None) -> list[tuple[str, list[str]]]:
-    """(what a person reads, command) in turn; `wheels` is a folder to install from without a network."""
+@dataclass(frozen=True)
+class Step:
+    """What a person reads, a command, and whether making the runtime goes on where it fails."""
+
+    message: str
+    command: list[str]
+    optional: bool = False
+
+
+def steps(venv: Path, python: str, device: str, wheels: Path | None, system: str = sys.platform) -> list[Step]:
+    """What makes a runtime, in turn; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-    others = [package for package in NEEDED.values() if package != "torch"]
-    if device == "cuda":
-        others.append("warp-lang")
-    made = ("making the environment", [python, "-m", "venv", "--clear", str(venv)])
-    if wheels is not None:
-        offline = [*pip, "--no-index", "--find-links", str(wheels), "torch", *others]
-        return [made, ("installing from the folder of wheels", offline)]
-    return [
-        made,
-        ("installing torch", [*pip, "--index-url", INDEX, "torch"]),
-        ("installing the other packages", [*pip, *others]),
+    packages = [*NEEDED.values(), *(["warp-lang"] if device == "cuda" else [])]
+    too_old = f"sys.version_info < {OLDEST} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
+    first = [
+        Step("looking at that Python", [python, "-c", f"import sys; sys.exit({too_old})"]),
+        Step("making the environment", [python, "-m", "venv", str(venv)]),
     ]
+    if wheels is not None:
+        offline = ["--no-index", "--find-links", str(wheels)]
+        return [*first, Step("installing from the folder of wheels", [*pip, *offline, *packages])]
+    small = Step("installing PyTorch's CPU build", [*pip, "--no-deps", "--index-url", INDEX, "torch"], optional=True)
+    rest = Step("installing torch and other packages", [*pip, *packages])
+    return [*first, small, rest] if system == "linux" else [*first, rest]
 
 
 def make(folder: Path, python: str, device: str = "auto", wheels: Path | None = None) -> str:
-    """Make the runtime `folder`/venv of the interpreter `python` and return the line of `probe`.
+    """Make a runtime in `folder` of the interpreter `python` and return the line of `probe`.
 
-    Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
+    It takes the place of an earlier one only once it has passed. Cancelled, it leaves nothing behind and returns "".
+    Raises StgaError with the step that failed.
     """
-    venv, ready = folder / "venv", folder / "ready"
     with task.telling(task_folder(folder)) as teller:
         device = device_for(device, nvidia_smi())
         free = shutil.disk_usage(folder).free / 1e9
         if free < SIZES_GB[device]:
             raise StgaError(f"{folder}: has {free:.1f} GB free, the runtime needs {SIZES_GB[device]:.1f} GB")
-        ready.unlink(missing_ok=True)
+        venv = next(path for number in count(1) if not (path := folder / f"venv-{number}").exists())
         todo = steps(venv, python, device, wheels)
         try:
-            for number, (message, command) in enumerate(todo):
-                if not _run(teller, number / (len(todo) + 1), message, command):
+            for number, step in enumerate(todo):
+                if not _run(teller, number / (len(todo) + 1), step):
                     shutil.rmtree(venv, ignore_errors=True)
                     return ""
             teller.tell(len(todo) / (len(todo) + 1), "testing")
@@ -162,10 +184,18 @@ def make(folder: Path, python: str, device: str = "auto", wheels: Path | None = 
         except StgaError:
             shutil.rmtree(venv, ignore_errors=True)
             raise
-        with replacing(ready) as partial:
-            partial.write_text(line + "\n", encoding="utf-8")
+        (venv / READY).touch()
+        _remove_others(folder, venv)
         teller.tell(1.0, line)
     return line
+
+
+def _remove_others(folder: Path, venv: Path) -> None:
+    """Remove the environments beside `venv`: the one that it replaces, and what killed makers left."""
+    for other in folder.glob("venv-*"):
+        if other != venv:
+            (other / READY).unlink(missing_ok=True)  # on Windows, a worker at work keeps the rest from being removed
+            shutil.rmtree(other, ignore_errors=True)
 
 
 def try_python(folder: Path, python: str) -> str:
@@ -177,27 +207,34 @@ def try_python(folder: Path, python: str) -> str:
     return line
 
 
-def _run(teller: task.Teller, share: float, message: str, command: Sequence[str]) -> bool:
+def _run(teller: task.Teller, share: float, step: Step) -> bool:
     """Run a step whose output goes where this process' goes; False where it was cancelled.
 
-    Raises StgaError where it fails.
+    Raises StgaError where it fails and must not.
     """
-    print("$ " + " ".join(command), flush=True)
+    print(PROMPT + " ".join(step.command), flush=True)
     try:
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        child = subprocess.Popen(step.command, stdin=subprocess.DEVNULL)
     except OSError as error:
-        raise StgaError(f"{command[0]}: cannot be started ({error.strerror or error})") from error
+        raise StgaError(f"{step.command[0]}: cannot be started ({error.strerror or error})") from error
     while child.poll() is None:
-        line = task.log_lines(teller.folder, 1)
-        if teller.tell(share, message, line[0].strip() if line else ""):
+        line = task.log_lines(teller.folder, 9)[-1:]  # pip's may be long
+        if teller.tell(share, step.message, line[0].strip() if line else ""):
             child.terminate()
             child.wait()
             return False
         time.sleep(0.2)
-    if child.returncode:
-        errors = [line for line in task.log_lines(teller.folder, 20) if "error" in line.lower()]
-        raise StgaError(f"{message}: failed, {errors[-1] if errors else f'exit status {child.returncode}'}")
+    if child.returncode and not step.optional:
+        raise StgaError(f"{step.message}: failed, {_reason(task.log_lines(teller.folder, 20), child.returncode)}")
     return True
+
+
+def _reason(lines: Sequence[str], code: int) -> str:
+    """Why a step failed, from the end of what it and those before it printed."""
+    lines = lines[max((row for row, line in enumerate(lines) if line.startswith(PROMPT)), default=-1) + 1 :]
+    known = [reason.format(line) for sign, reason in REASONS.items() for line in lines if sign in line]
+    errors = [line for line in reversed(lines) if "error" in line.lower()]
+    return next(iter([*known, *errors]), f"exit status {code}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -202,9 +202,9 @@ def test_an_interpreter_without_anything_is_named(tmp_path, capture):
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv/bin/python"
     process = task.start(folder_of(tmp_path / "run"), str(python), job.arguments(tmp_path / "run"))
-    assert process.wait(60) == 1
+    assert process.wait(60) == 2
     seen = task.look(folder_of(tmp_path / "run"), process)
-    assert seen.status.error == "the worker ended with exit status 1: ModuleNotFoundError: No module named 'numpy'"
+    assert seen.status.error == f"the worker ended with exit status 2: stga: {python} lacks the package 'numpy'"
 
 
 def _made(folder: Path) -> Path:

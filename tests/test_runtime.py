@@ -10,6 +10,7 @@ import pytest
 from stga_addon import runtime, task
 from stga_addon.errors import StgaError
 from stga_addon.probe import NEEDED
+from stga_addon.runtime import Step
 from stga_addon.task import State
 
 SMI = "| NVIDIA-SMI 575.57.08   Driver Version: 575.57.08   CUDA Version: {} |"
@@ -41,19 +42,31 @@ def test_cuda_that_cannot_be_is_refused():
 
 
 def test_steps(tmp_path):
-    """Catches torch from the wrong index, a network that offline steps would need, and what is never installed."""
-    online = runtime.steps(tmp_path, "/python", "cuda", None)
-    assert online[0][1][:3] == ["/python", "-m", "venv"]
-    assert online[1][1][-3:] == ["--index-url", "https://download.pytorch.org/whl/cpu", "torch"]
-    assert set(online[2][1]) >= {*NEEDED.values(), "warp-lang"} - {"torch"}
-    assert "torch" not in online[2][1]
-    assert all(command[0] == str(runtime.venv_python(tmp_path)) for _, command in online[1:])
-    offline = runtime.steps(tmp_path, "/python", "cpu", tmp_path / "wheels")
-    assert len(offline) == 2
-    assert "--no-index" in offline[1][1]
-    assert str(tmp_path / "wheels") in offline[1][1]
-    assert set(offline[1][1]) >= set(NEEDED.values())
-    assert "warp-lang" not in offline[1][1]
+    """Catches a site's own index passed over, a network that offline steps would need, and what is never installed."""
+    looking, making, small, rest = runtime.steps(tmp_path, "/python", "cuda", None, "linux")
+    assert making.command == ["/python", "-m", "venv", str(tmp_path)]
+    assert rest.command[0] == small.command[0] == str(runtime.venv_python(tmp_path))
+    assert small.command[-3:] == ["--index-url", "https://download.pytorch.org/whl/cpu", "torch"]
+    assert small.optional  # where pytorch.org cannot be reached, there is PyPI
+    assert set(rest.command) >= {*NEEDED.values(), "warp-lang"}
+    assert not rest.optional
+    assert "--index-url" not in rest.command
+    assert runtime.steps(tmp_path, "/python", "cuda", None, "win32") == [looking, making, rest]
+    _, _, offline = runtime.steps(tmp_path, "/python", "cpu", tmp_path / "wheels", "linux")
+    assert "--no-index" in offline.command
+    assert str(tmp_path / "wheels") in offline.command
+    assert set(offline.command) >= set(NEEDED.values())
+    assert "warp-lang" not in offline.command
+
+
+@pytest.mark.parametrize(("newest", "status"), [((3, 11), 0), ((99, 0), 1)])
+def test_an_old_python_is_refused_at_once(newest, status, tmp_path, monkeypatch):
+    """Catches gigabytes that are downloaded for a Python that cannot use them."""
+    monkeypatch.setattr(runtime, "OLDEST", newest)
+    looking = runtime.steps(tmp_path, sys.executable, "cpu", None)[0]
+    done = subprocess.run(looking.command, capture_output=True, text=True)
+    assert done.returncode == status
+    assert ("ERROR: Python 3." in done.stderr) == bool(status)
 
 
 def test_what_an_interpreter_says():
@@ -101,19 +114,21 @@ def tiny(monkeypatch):
     """Only the environment and this package's probe: what pip would do is not this test's."""
     monkeypatch.setattr(runtime, "nvidia_smi", lambda: None)
     monkeypatch.setattr(runtime, "SIZES_GB", {"cpu": 0.0, "cuda": 0.0})
-    made = [sys.executable, "-m", "venv", "--clear", "--without-pip"]
-    monkeypatch.setattr(runtime, "steps", lambda venv, *_: [("making the environment", [*made, str(venv)])])
+    made = [sys.executable, "-m", "venv", "--without-pip"]
+    monkeypatch.setattr(runtime, "steps", lambda venv, *_: [Step("making the environment", [*made, str(venv)])])
 
 
 def test_a_runtime_is_made(tiny, tmp_path, monkeypatch):
     """Catches a runtime that is used before it has passed the test, or not found afterwards."""
     monkeypatch.setattr(runtime, "probe", lambda python: f"good {Path(python).exists()}")
-    python = runtime.venv_python(tmp_path / "venv")
+    python = runtime.venv_python(tmp_path / "venv-1")
     python.parent.mkdir(parents=True)
     python.touch()
     assert runtime.made_python(tmp_path) is None  # what a killed maker leaves
     assert runtime.make(tmp_path, sys.executable) == "good True"
-    assert runtime.made_python(tmp_path) == python
+    made = runtime.made_python(tmp_path)
+    assert made is not None
+    assert [made] == [runtime.venv_python(folder) for folder in tmp_path.glob("venv-*")]
     assert task.read_status(runtime.task_folder(tmp_path)).message == "good True"
 
 
@@ -122,17 +137,56 @@ def test_a_runtime_that_fails_leaves_nothing(tiny, tmp_path):
     with pytest.raises(StgaError, match="lacks torch"):
         runtime.make(tmp_path, sys.executable)
     assert runtime.made_python(tmp_path) is None
-    assert not (tmp_path / "venv").exists()
+    assert not list(tmp_path.glob("venv*"))
     assert task.look(runtime.task_folder(tmp_path)).state == State.FAILED
 
 
-def test_a_failing_step_names_itself(tiny, tmp_path, monkeypatch):
-    """Catches pip's message lost in a log that nobody opens."""
-    log = runtime.task_folder(tmp_path) / task.LOG
-    script = f"import sys; open({str(log)!r}, 'a').write('ERROR: no matching distribution\\n'); sys.exit(1)"
-    monkeypatch.setattr(runtime, "steps", lambda *_: [("installing torch (cpu)", [sys.executable, "-c", script])])
-    with pytest.raises(StgaError, match=r"installing torch \(cpu\): failed, ERROR: no matching distribution"):
+def test_an_attempt_in_vain_keeps_the_runtime(tiny, tmp_path, monkeypatch):
+    """Catches an artist who can train, tries a newer runtime without a network, and can train no more."""
+    with monkeypatch.context() as patched:
+        patched.setattr(runtime, "probe", lambda python: "good")
         runtime.make(tmp_path, sys.executable)
+    before = runtime.made_python(tmp_path)
+    with pytest.raises(StgaError, match="lacks torch"):
+        runtime.make(tmp_path, sys.executable)
+    assert before is not None
+    assert runtime.made_python(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("printed", "reason"),
+    [
+        ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "the disk is full"),
+        (
+            "The virtual environment was not created successfully because ensurepip is not\navailable",
+            "no ensurepip; choo",
+        ),
+        (
+            "WARNING: Retrying after connection broken by 'X'\nERROR: No matching distribution",
+            "indexes cannot be reached",
+        ),
+        ("ERROR: no matching distribution\nnotice", "ERROR: no matching distribution$"),
+        ("connection broken by an optional step\n$ pip\nERROR: no space", "ERROR: no space$"),
+        ("ERROR: No matching distribution found for torch", "for torch: none that fits this Python and system$"),
+        ("bye", "exit status 1$"),
+    ],
+)
+def test_a_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypatch):
+    """Catches pip's message lost in a log that nobody opens, and one that says nothing to an artist."""
+    log = runtime.task_folder(tmp_path) / task.LOG
+    script = f"import sys; open({str(log)!r}, 'a').write({printed + chr(10)!r}); sys.exit(1)"
+    monkeypatch.setattr(runtime, "steps", lambda *_: [Step("installing torch", [sys.executable, "-c", script])])
+    with pytest.raises(StgaError, match=f"installing torch: failed, .*{reason}"):
+        runtime.make(tmp_path, sys.executable)
+
+
+def test_an_optional_step_may_fail(tiny, tmp_path, monkeypatch):
+    """Catches no runtime at all where pytorch.org cannot be reached, and PyPI can."""
+    monkeypatch.setattr(runtime, "probe", lambda python: "good")
+    failing = Step("failing", [sys.executable, "-c", "raise SystemExit(1)"], optional=True)
+    making = runtime.steps
+    monkeypatch.setattr(runtime, "steps", lambda *given: [*making(*given), failing])
+    assert runtime.make(tmp_path, sys.executable) == "good"
 
 
 def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
@@ -140,13 +194,13 @@ def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
     folder = runtime.task_folder(tmp_path)
     script = f"import pathlib, time; pathlib.Path({str(folder / 'cancel')!r}).touch(); time.sleep(600)"
     steps = [
-        ("making the environment", [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")]),
-        ("waiting", [sys.executable, "-c", script]),
+        Step("making the environment", [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv-1")]),
+        Step("waiting", [sys.executable, "-c", script]),
     ]
     monkeypatch.setattr(runtime, "steps", lambda *_: steps)
     assert runtime.make(tmp_path, sys.executable) == ""
     assert task.look(folder).state == State.CANCELLED
-    assert not (tmp_path / "venv").exists()
+    assert not list(tmp_path.glob("venv*"))
 
 
 def test_a_disk_too_small_is_refused(tmp_path, monkeypatch):

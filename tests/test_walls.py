@@ -33,6 +33,7 @@ LAYERS = (
     {"demo"},
     {"commands"},
     {"cli"},
+    {"handover"},
     {"__main__", "__init__", "package"},
 )
 LIGHT = (

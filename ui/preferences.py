@@ -39,18 +39,20 @@ def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
     folder = task_folder(runtime_folder())
     now = watch.snapshot(folder)
     box.label(text="Training Runtime")
-    row = box.row(align=True)
+    row = box.split(factor=0.8, align=True)
     row.prop(stored, "runtime_python")
     row.operator(ids.TEST_RUNTIME)
-    if made_python(runtime_folder()):
-        box.label(text=f"Made here: {runtime_folder() / 'venv'}", icon="CHECKMARK")
+    made = made_python(runtime_folder())
+    if made is not None:
+        box.label(text=f"Made here: {made}", icon="CHECKMARK")
     if now.state.is_alive:
         row = box.row(align=True)
         row.progress(factor=now.status.share, text=now.status.message)
-        row.operator(ids.CANCEL_RUNTIME, icon="CANCEL")
+        row.operator(ids.CANCEL_RUNTIME, text="", icon="CANCEL")
         box.label(text=now.status.remark)
         return
     if now.state.is_mishap:
+        box.label(text="Failed", icon="ERROR")
         draw_mishap(box, context, now.status.error, now.tail, folder)
     elif now.state == State.FINISHED:
         box.label(text=now.status.message, icon="CHECKMARK")

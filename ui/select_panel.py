@@ -67,5 +67,5 @@ def _draw_table(layout: Any, chosen: Any) -> None:
         heading.label(text=text)
     heading.label(icon="BLANK1")
     layout.template_list(
-        SelectedFrames.bl_idname, "", chosen, "selected_frames", chosen, "selected_row", rows=4, maxrows=8
+        SelectedFrames.bl_idname, "", chosen, "selected_frames", chosen, "selected_row", rows=4, maxrows=5
     )

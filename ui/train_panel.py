@@ -97,5 +97,5 @@ def _draw_refined(layout: Any, context: Any, path: Path) -> None:
     column.operator_context = "EXEC_DEFAULT"  # without a file dialog
     column.enabled = head is not None
     apply = column.operator(ids.APPLY_MOTION, text="Apply Refined Tracking", icon="CON_FOLLOWTRACK")
-    apply.filepath, apply.source = str(path), ""
+    apply.filepath, apply.source, apply.own_offsets = str(path), "", True
     apply.start = head[tags.TIMESTEPS][0] if head is not None else 1

@@ -81,7 +81,10 @@ def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tupl
 
 def _model_for(root: Path, model_file: Path | None) -> FlameModel:
     if model_file is None:
-        raise StgaError(f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame")
+        raise StgaError(
+            f"{root}: is tracked with FLAME; give your FLAME model file (.pkl or .npz) with --flame,"
+            " or in the add-on's preferences"
+        )
     return flame_model(model_file)
 
 

@@ -16,6 +16,7 @@ from .hierarchy import Warn, log_warning, place, remove
 
 SENSOR_WIDTH = 36.0  # millimetres; with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # metres
+DISPLAY_SIZE = 0.1  # metres; Blender's own metre would draw every camera of a rig across the head
 SAME_POSE = 1e-9
 SAME_INTRINSICS = 1e-6  # pixels
 
@@ -94,6 +95,7 @@ def _set_intrinsics(data: Any, camera: Camera) -> None:
     data.shift_x = (camera.width / 2 - camera.cx) / camera.width
     data.shift_y = (camera.cy - camera.height / 2) / camera.width * camera.fl_x / camera.fl_y
     data.clip_start = CLIP_START
+    data.display_size = DISPLAY_SIZE
 
 
 def _same_intrinsics(one: Camera, other: Camera) -> bool:

@@ -84,7 +84,7 @@ def write_curve(
     points.foreach_set("interpolation", np.full(len(frames), mode, np.int32))
 
 
-def write_hat_curves(keys: Any, names: Sequence[str], timesteps: Sequence[int]) -> None:
+def write_hat_curves(keys: Any, names: Sequence[str], timesteps: Sequence[float]) -> None:
     """Animate shape keys that take turns: each is 1 at its own timestep and 0 from its neighbours' on, linear between.
 
     keys: the Key data-block; names and timesteps (T), ascending.

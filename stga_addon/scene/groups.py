@@ -102,16 +102,20 @@ def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
 
 def _painted(mesh: Any, groups: int, wanted: list[int]) -> np.ndarray:
     """(len(wanted), V) bool: which vertices have the weight of a selected one in the groups of these indices."""
+    members = [vertex.groups for vertex in mesh.vertices]
+    counts = np.array([len(each) for each in members], np.int64)
+    indices, weights = np.empty(counts.sum(), np.int32), np.empty(counts.sum(), np.float32)
+    ends = np.cumsum(counts)
+    for each, begin, end in zip(members, (ends - counts).tolist(), ends.tolist(), strict=True):
+        if begin < end:
+            each.foreach_get("group", indices[begin:end])
+            each.foreach_get("weight", weights[begin:end])
     row_of = np.full(groups, -1)
     row_of[wanted] = np.arange(len(wanted))
-    painted = np.zeros((len(wanted), len(mesh.vertices)), bool)
-    for vertex in mesh.vertices:
-        members = vertex.groups
-        indices, weights = np.empty(len(members), np.int32), np.empty(len(members), np.float32)
-        members.foreach_get("group", indices)
-        members.foreach_get("weight", weights)
-        rows = row_of[indices[weights >= tags.SELECTED_WEIGHT]]
-        painted[rows[rows >= 0], vertex.index] = True
+    rows, vertices = row_of[indices], np.repeat(np.arange(len(members)), counts)
+    taken = (rows >= 0) & (weights >= tags.SELECTED_WEIGHT)
+    painted = np.zeros((len(wanted), len(members)), bool)
+    painted[rows[taken], vertices[taken]] = True
     return painted
 
 

@@ -23,6 +23,7 @@ from .rig import (
     joint_bone,
     key_motion,
     offset_keys,
+    play_offsets,
     rig_of,
     slider_components,
     still_offsets,
@@ -39,12 +40,15 @@ def apply_motion(
     parts: Sequence[str] = tuple(PARTS),
     as_strip: bool = False,
     warn: Warn = log_warning,
+    tracked: tuple[FlameSequence, Sequence[float]] | None = None,
 ) -> None:
     """Animate the chosen parts of a FLAME head by `frames`, one a Blender frame from `start` on.
 
     What moved it before is not lost. As an action, the new one is a copy of the old in which the parts are exchanged,
     and the old action stays in the file. As a strip, both lie in the NLA editor, and the new one counts only where it
-    lasts. Raises StgaError where the head has no rig, or one that cannot take the motion; nothing is changed then.
+    lasts. tracked: the sequence that the head was imported from, and the Blender frame of each of its timesteps, where
+    its per-frame offsets are to play along; they stay zero without. Raises StgaError where the head has no rig, or one
+    that cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
     _require_fitting(head, rig, frames, parts)
@@ -60,8 +64,12 @@ def apply_motion(
             for curve in [curve for curve in curves if is_of_parts(curve.data_path, parts)]:
                 curves.remove(curve)
     key_motion(head, rig, range(start, start + len(frames)), frames, parts, warn)
-    if "expression" in parts:
-        still_offsets(head, rig, start)
+    if "expression" in parts and offset_keys(head):
+        if tracked is None:
+            still_offsets(head, rig, start)
+        else:
+            own, numbers = tracked
+            play_offsets(head, rig, own, [own.frame(timestep) for timestep in own.timesteps], numbers)
     for owner in owners:
         owner.animation_data.action.use_fake_user = True
         if as_strip:

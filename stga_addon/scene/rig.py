@@ -76,8 +76,8 @@ def add_rig(
     )
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
-        _add_offset_keys(head, sequence, frames, basis, warn)
-        _animate_offset_joints(rig, sequence, frames)
+        _add_offset_keys(head, rig, sequence, frames, basis, warn)
+        play_offsets(head, rig, sequence, frames, sequence.timesteps)
     for joint in np.flatnonzero(moving).tolist():
         _drive_joint(head, rig, joint, list(sliders), directions[joint])
     return rig
@@ -144,6 +144,25 @@ def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:
     """The data-blocks in whose actions the parts are keyframed: the rig, the shape keys, or both."""
     bones = set(parts) & set(PART_JOINTS) or ("expression" in parts and offset_keys(head))
     return ([rig] if bones else []) + ([head.data.shape_keys] if "expression" in parts else [])
+
+
+def play_offsets(
+    head: Any, rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], numbers: Sequence[float]
+) -> None:
+    """Keyframe the per-frame offsets of mesh and joints as they were tracked.
+
+    sequence: the one that the head was imported from, with its frames; numbers: the Blender frame of each, ascending.
+    """
+    names = [f"{OFFSET_KEY}{timestep:05d}" for timestep in sequence.timesteps]
+    compat.write_hat_curves(head.data.shape_keys, names, numbers)
+    moved = np.zeros((len(frames), len(JOINTS), 3))
+    for row, frame in enumerate(frames):
+        if frame.dynamic_offset is not None:
+            moved[row] = joint_positions(sequence.model, frame.dynamic_offset)
+    curves, at = compat.action_curves(rig), np.asarray(numbers)
+    for joint, name in enumerate(JOINTS):
+        for axis in range(3):
+            compat.write_curve(curves, f'["{_offset_property(name)}"]', axis, at, moved[:, joint, axis])
 
 
 def still_offsets(head: Any, rig: Any, frame: int) -> None:
@@ -299,16 +318,17 @@ def _add_pose_keys(head: Any, rig: Any, model: FlameModel, basis: np.ndarray, wa
 
 
 def _add_offset_keys(
-    head: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], basis: np.ndarray, warn: Warn
+    head: Any, rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], basis: np.ndarray, warn: Warn
 ) -> None:
     warn(
         f"{head.name}: the capture has a dynamic_offset per frame, which no rig describes; it became one shape key per"
         f" timestep ({len(frames)})"
     )
-    names = [f"{OFFSET_KEY}{timestep:05d}" for timestep in sequence.timesteps]
-    for name, frame in zip(names, frames, strict=True):
-        _new_key(head, name, basis if frame.dynamic_offset is None else basis + frame.dynamic_offset, 1.0)
-    compat.write_hat_curves(head.data.shape_keys, names, sequence.timesteps)
+    for timestep, frame in zip(sequence.timesteps, frames, strict=True):
+        moved = basis if frame.dynamic_offset is None else basis + frame.dynamic_offset
+        _new_key(head, f"{OFFSET_KEY}{timestep:05d}", moved, 1.0)
+    for name in JOINTS:
+        rig[_offset_property(name)] = [0.0] * 3
 
 
 def _joint_directions(model: FlameModel, components: Sequence[int]) -> np.ndarray:
@@ -327,20 +347,6 @@ def _terms(directions: np.ndarray) -> list[list[int]]:
         reach = np.cumsum(coefficients[order]) * SLIDER
         kept.append(sorted(order[reach > NEGLIGIBLE].tolist()))
     return kept
-
-
-def _animate_offset_joints(rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame]) -> None:
-    """Keyframe how far the per-frame offsets move the joints: three numbers a joint in a property of the rig."""
-    offsets = np.zeros((len(frames), len(JOINTS), 3))
-    for row, frame in enumerate(frames):
-        if frame.dynamic_offset is not None:
-            offsets[row] = joint_positions(sequence.model, frame.dynamic_offset)
-    curves = compat.action_curves(rig)
-    for joint, name in enumerate(JOINTS):
-        rig[_offset_property(name)] = [0.0] * 3
-        for axis in range(3):
-            path, column = f'["{_offset_property(name)}"]', offsets[:, joint, axis]
-            compat.write_curve(curves, path, axis, np.asarray(sequence.timesteps), column)
 
 
 def _drive_joint(head: Any, rig: Any, joint: int, sliders: Sequence[str], directions: np.ndarray) -> None:

@@ -55,7 +55,9 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Pr
     """
     check_head(avatar, head)
     prepared = prepared or prepare(avatar)
-    shown = _splat_object(name or f"{head.name} splats", prepared.splats, head.users_collection[0])
+    own = (collection for collection in head.users_collection if collection.library is None)  # or all are linked
+    collection = next(own, bpy.context.scene.collection)
+    shown = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
     shown[tags.CONVENTION], shown[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
     _add_modifier(shown, avatar.convention, avatar.splats)
     set_input(shown, nodes.HEAD, head)
@@ -66,6 +68,15 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Pr
     shown.matrix_parent_inverse = head.matrix_parent_inverse
     shown.matrix_basis = head.matrix_basis
     return shown
+
+
+def hide(head: Any, scene: Any) -> None:
+    """Hide the head, which would cover its splats; it still moves them. A linked one stays visible in renders."""
+    if head.library is None:
+        head.hide_render = True
+    for layer in scene.view_layers:
+        if layer.objects.get(head.name) is head:
+            head.hide_set(True, view_layer=layer)
 
 
 def can_refresh(shown: Any, avatar: Avatar) -> bool:
@@ -210,8 +221,8 @@ def _write(mesh: Any, attributes: Attributes) -> None:
     if len(mesh.vertices) != len(positions) // 3:
         mesh.clear_geometry()
         mesh.vertices.add(len(positions) // 3)
-    mesh.vertices.foreach_set("co", positions)
-    _write_attributes(mesh, attributes, "POINT")
+    # The attribute, which takes the numbers at once; the vertices' own property takes them one by one.
+    _write_attributes(mesh, {"position": ("FLOAT_VECTOR", "vector", positions), **attributes}, "POINT")
     mesh.update()
 
 

@@ -97,6 +97,31 @@ def test_a_runs_refined_tracking(scene, tmp_path):
         np.testing.assert_allclose(at(timestep), shown.mesh(timestep), atol=TOLERANCE)
 
 
+@pytest.mark.parametrize("place", ["action", "strip"])
+def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
+    """Catches a head that loses what was tracked beside the parameters, also where another motion had exchanged it."""
+    rng = np.random.default_rng(7)
+    folder, model = write_flame_capture(tmp_path / "own")
+    for path in (folder / "flame_param").glob("*.npz"):
+        offset = rng.normal(0, 0.004, (1, len(ball()[0]), 3)).astype(np.float32)
+        np.savez(path, **np.load(path), dynamic_offset=offset)
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    own = open_capture(folder, model)
+    tracking = Tracking(own.flame, own.flame.timesteps)
+    tracking.state.change[:] = rng.normal(0, 0.05, tracking.tracked.shape)
+    write_tracking(tmp_path, tracking)
+    shown = refined(own, tmp_path)
+    path = str(tmp_path / "tracking.npz")
+    bpy.ops.stga.apply_motion(filepath=path, start=0, place=place)
+    assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without
+    bpy.ops.stga.apply_motion(filepath=path, start=0, place=place, own_offsets=True)
+    for timestep in own.timesteps:
+        np.testing.assert_allclose(at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+    bpy.ops.stga.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
+    for timestep in own.timesteps:
+        np.testing.assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+
+
 def test_undo(scene):
     """Catches a motion that undo leaves half of: actions, bindings, frame range."""
     actions, before = sorted(bpy.data.actions.keys()), at(1)

@@ -1,5 +1,6 @@
 """`blender --background head.blend --command stga …`: commands about the head of the open file."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,19 +91,54 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
         assert len(pair["expr"]) == 4
 
 
-def test_render_of_the_open_head(stga, tmp_path):
-    """Catches a render verb that cannot find avatar or capture in the file."""
+@pytest.fixture
+def bare(extension, monkeypatch):
+    """Call it, and Blender's Python lacks what commands need; the runtime is the Python of this test."""
+
+    def make_bare() -> None:
+        monkeypatch.setattr(extension.operators.command_line, "missing_here", lambda: ["torch"])
+        monkeypatch.setattr(extension.operators.command_line, "training_python", lambda context: sys.executable)
+
+    return make_bare
+
+
+@pytest.mark.slow
+def test_render_of_the_open_head(stga, bare, tmp_path):
+    """Catches a render verb that cannot find avatar or capture in the file, and a runtime that draws another motion."""
     pytest.importorskip("numba")
     folder, model = write_flame_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
     show_avatar(tmp_path / "a.npz", open_capture(folder, model))
+    head = bpy.context.scene.stga.head
+    head.data.shape_keys.animation_data.action = None
+    head.data.shape_keys.key_blocks["expr_001"].value = 9.0
     save_and_open(tmp_path / "head.blend")
-    assert stga("render", "--cameras", folder / "transforms_val.json", "--out", tmp_path / "out") == 0
-    assert len(list((tmp_path / "out").glob("*.png"))) == 2
+    cameras = folder / "transforms_val.json"
+    assert stga("render", "--cameras", cameras, "--out", tmp_path / "here") == 0
+    bare()
+    assert stga("render", "--cameras", cameras, "--out", tmp_path / "there") == 0
+    assert stga("render", tmp_path / "a.npz", "--capture", folder, "--flame", model, "--cameras", cameras,
+                "--out", tmp_path / "tracked") == 0  # fmt: skip
+    here, there, tracked = (
+        [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))] for name in ("here", "there", "tracked")
+    )
+    assert len(here) == 2
+    assert here == there
+    assert here != tracked
+
+
+def test_no_runtime_is_one_sentence(stga, extension, folder, monkeypatch, capsys):
+    """Catches a traceback, or success, where nothing can train."""
+    for module in (extension.operators.command_line, extension.operators.runtime.runtime):
+        monkeypatch.setattr(module, "missing_here", lambda: ["torch"])
+    assert stga("train", folder, "--out", folder / "run") == 2
+    assert "training needs a runtime" in capsys.readouterr().err
+    bpy.ops.stga.import_capture(directory=str(folder))
+    assert stga("select") == 0  # needs none
 
 
 @pytest.mark.slow
-def test_training_is_the_panels(stga, folder, tmp_path):
+def test_training_is_the_panels(stga, bare, folder, tmp_path):
     """Catches a headless run that ignores painted groups or settings, and so gives other numbers for the same seed."""
     pytest.importorskip("torch")
     bpy.ops.stga.import_capture(directory=str(folder))
@@ -116,10 +152,14 @@ def test_training_is_the_panels(stga, folder, tmp_path):
     assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), wait=True, **options) == {"FINISHED"}
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert stga("train", "--out", tmp_path / "headless", *arguments) == 0
-    for run in ("panel", "headless"):
+    bare()
+    assert stga("train", "--out", tmp_path / "runtime", *arguments) == 0
+    runs = ("panel", "headless", "runtime")
+    for run in runs:
         with np.load(tmp_path / run / "selection.npz") as stored:
             for timestep, faces in painted.items():
                 np.testing.assert_array_equal(stored[f"{timestep:05d}"], faces)
-    one, other = (read_avatar(tmp_path / run / "avatar.npz").splats for run in ("panel", "headless"))
-    for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    one, *others = (read_avatar(tmp_path / run / "avatar.npz").splats for run in runs)
+    for other in others:
+        for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))

@@ -17,8 +17,11 @@ from capture.factory import (  # noqa: E402
     write_mesh_capture,
 )
 
+from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
+from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.splats import evaluated_splats  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 
@@ -42,6 +45,13 @@ def write_meshes(folder: Path, timesteps: int = 3) -> Path:
     for timestep in range(timesteps):
         write_mesh(folder / f"{timestep:03d}.obj", moved(timestep, vertices), faces)
     return folder / "001.obj"
+
+
+def ball_avatar(path: Path) -> Path:
+    """Of the capture's head, with a splat a triangle."""
+    vertices, faces = ball()[0].astype(np.float32), ball()[1].astype(np.int32)
+    write_avatar(path, Avatar(lattice_splats(vertices, faces, order=0), "stga", vertices, faces))
+    return path
 
 
 def state_of_file() -> dict[str, list[str]]:
@@ -122,6 +132,23 @@ def test_importing_again_keeps_what_an_artist_painted(tmp_path):
     np.testing.assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
 
 
+def test_what_came_in_is_selected(tmp_path):
+    """Catches an import that leaves an artist's other objects selected, or in edit mode, and its head hard to find."""
+    mesh = bpy.data.meshes.new("other")
+    other = bpy.data.objects.new("other", mesh)
+    bpy.context.scene.collection.objects.link(other)
+    bpy.context.view_layer.objects.active = other
+    other.select_set(True)
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    head = bpy.context.scene.stga.head
+    assert other.mode == "OBJECT"
+    assert bpy.context.selected_objects == [head]
+    assert bpy.context.view_layer.objects.active == head
+    cameras = [thing for thing in bpy.data.objects if thing.type == "CAMERA"]
+    assert all(camera.data.display_size < 0.3 * camera.matrix_world.translation.length for camera in cameras)
+
+
 def test_wrong_files_change_nothing(tmp_path, model):
     """Catches half an import, a traceback, and a sentence that does not name the file."""
     (tmp_path / "noise.npz").write_bytes(b"no archive")
@@ -149,10 +176,13 @@ def test_linked_heads_are_left_alone(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, target):
-        target.objects = [name]
-    linked = target.objects[0]
-    bpy.context.scene.collection.objects.link(linked)
+        target.collections = ["capture"]
+    bpy.context.scene.collection.children.link(target.collections[0])
+    linked = target.collections[0].objects[name]
     bpy.context.scene.stga.head = linked
+    assert bpy.ops.stga.show_avatar(filepath=str(ball_avatar(tmp_path / "a.npz"))) == {"FINISHED"}
+    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(linked.data.polygons)
+    assert not linked.hide_render
     for operator in ("select", "heat_map", "apply_motion"):
         with pytest.raises(RuntimeError, match="linked from another file"):
             getattr(bpy.ops.stga, operator)()

@@ -244,6 +244,21 @@ def test_a_worker_that_died(extension, worker):
     assert watch.tick() is None
 
 
+def test_a_file_that_was_made_without_the_panel(extension, tmp_path):
+    """Catches a demo.blend that an artist opens to an empty panel, and a choice of theirs that is not kept."""
+    folder = write_mesh_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder))
+    name = bpy.context.scene.stga.head.name
+    bpy.context.scene.stga.head = None
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "demo.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
+    assert bpy.context.scene.stga.head.name == name
+    bpy.context.scene.stga.head = bpy.data.objects.new("other", None)
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
+    assert bpy.context.scene.stga.head.name == "other"
+
+
 @pytest.mark.slow
 def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
     """Catches a runtime that a script cannot make or test, and a network used although Blender is offline."""

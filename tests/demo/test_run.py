@@ -41,5 +41,6 @@ def test_the_blend_file_opens_with_head_groups_and_splats(tmp_path):
     splats = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
     assert len(heads) == 1
     assert len(splats) == 1
+    assert heads[0].hide_get(), "the head covers its splats"
     assert [group for group in heads[0].vertex_groups if group.name.startswith("stga_")]
     assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == SMALL.cameras

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+from mathutils import Vector
 
 PART, RESULT, CAPTURE, BLEND, PYTHON = sys.argv[sys.argv.index("--") + 1 :]
 STEP_S, PATIENCE_S = 0.1, 180.0
@@ -72,7 +73,9 @@ def first() -> Iterator[Callable[[], bool]]:
     runtime = task_folder(runtime_folder())
     yield lambda: not watch.snapshot(runtime).state.is_alive
     seen["runtime"] = watch.snapshot(runtime).status.message or watch.snapshot(runtime).status.error
-    bpy.ops.stga.import_capture(directory=CAPTURE)
+    with in_window():
+        bpy.ops.stga.import_capture(directory=CAPTURE)
+    yield looks_at_head
     bpy.ops.stga.select()
     bpy.ops.wm.save_as_mainfile(filepath=BLEND)
     timed("click on Train", bpy.ops.stga.train)(directory="//run", minutes=30)
@@ -137,6 +140,19 @@ def second() -> Iterator[Callable[[], bool]]:
 def in_window() -> Any:
     """A timer's context has none, and undo wants one."""
     return bpy.context.temp_override(window=bpy.context.window_manager.windows[0])
+
+
+def looks_at_head() -> bool:
+    """Whether every viewport shows the head, and little else: Blender's own cube is two metres high."""
+    head = chosen().head
+    corners = [head.matrix_world @ Vector(corner) for corner in head.bound_box]
+    center, size = sum(corners, Vector()) / len(corners), (corners[6] - corners[0]).length
+    areas = [area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D"]
+    views = [area.spaces.active.region_3d for area in areas]
+    return all(
+        (view.view_location - center).length < 0.1 * size and 0.2 * size < view.view_distance < 5 * size
+        for view in views
+    )
 
 
 def splats_at_work() -> list[float]:

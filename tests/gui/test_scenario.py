@@ -39,11 +39,11 @@ def blender(home: Path, *arguments: object) -> None:
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
-def play(home: Path, part: str, *file: object) -> dict[str, Any]:
+def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
     """What a part of scenario.py saw."""
     result = home / f"{part}.json"
     script = Path(__file__).with_name("scenario.py")
-    blender(home, *file, "--python", script, "--", part, result, home / "capture", home / "head.blend", sys.executable)
+    blender(home, *file, "--python", script, "--", part, result, capture, home / "head.blend", sys.executable)
     seen: dict[str, Any] = json.loads(result.read_text())
     assert "traceback" not in seen, seen["traceback"]
     for name, times in seen["held up ms"].items():
@@ -54,8 +54,8 @@ def play(home: Path, part: str, *file: object) -> dict[str, Any]:
 
 def test_training_in_a_window(home: Path) -> None:
     """Catches what only a window has: the timer, its end, undo, reopening, and workers that outlive Blender."""
-    write_mesh_capture(home / "capture")
-    seen = play(home, "first")
+    capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
+    seen = play(home, "first", capture)
     assert seen["runtime"].startswith(f"Python {sys.version.split()[0]}, torch ")
     assert {"iteration", "per_second", "left_s", "splats", "memory_mb"} <= set(seen["figures"])
     assert seen["refreshed"]
@@ -69,7 +69,7 @@ def test_training_in_a_window(home: Path) -> None:
     assert seen["reopened"]
     os.kill(seen["left"], 0)  # Blender has quit, the worker goes on
 
-    then = play(home, "second", home / "head.blend")
+    then = play(home, "second", capture, home / "head.blend")
     assert then["found"] == seen["left"]
     assert "already holds a run" in then["refused"]
     assert then["finished"]["avatar"] == str(home / "short/avatar.npz")
