@@ -156,7 +156,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
             ),
             pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),
-        "Adam": (lambda: adam.step(state, rows, RATES), len(rows) * 59 * 4 * 7),
+        "Adam": (lambda: adam.step(state, rows, RATES), len(rows) * 59 * 4 * 9),
     }  # fmt: skip
     return {name: (median_ms(call, repeats), moved) for name, (call, moved) in work.items()}
 
