@@ -24,7 +24,7 @@ from .disk_driver import FULL_AT, ITERATIONS
 
 # In a namespace of its own a process may mount a disk without being root, and nobody else sees it.
 PRIVATE = ["unshare", "-rm"]
-SMALL_DISK = 'mount -t tmpfs -o size=2m small "$1" && exec "$2" "$3" "$1" "$4"'
+SMALL_DISK = 'mount -t tmpfs -o size=3m small "$1" && exec "$2" "$3" "$1" "$4"'
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def can_mount() -> bool:
 @pytest.mark.slow
 def test_a_full_and_a_read_only_disk(root: Path, tmp_path: Path) -> None:
     """Catches a checkpoint destroyed by the one that did not fit, a traceback, and a run that cannot go on when there
-    is room again; on a real file system of 2 MB."""
+    is room again; on a real file system of 3 MB."""
     if not can_mount():
         pytest.skip("private mounts (unshare -rm) are not available")
     driver = str(Path(__file__).with_name("disk_driver.py"))
