@@ -148,6 +148,11 @@ def environment(outer: Mapping[str, str]) -> dict[str, str]:
     }
 
 
+def same_packages(outer: Mapping[str, str]) -> dict[str, str]:
+    """What another process of this very interpreter is told: to find every package where this one does."""
+    return {**outer, "PYTHONPATH": os.pathsep.join([str(PACKAGES), *filter(None, sys.path)])}
+
+
 def look(folder: Path, process: subprocess.Popen[bytes] | None = None) -> Snapshot:
     """The task as it is now. process: its worker, where this process started it."""
     code = None if process is None else process.poll()

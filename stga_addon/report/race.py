@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import StgaError
+from ..task import same_packages
 from ..training.folder import Run, read_run, write_run
 from .runner import QUALITY
 
@@ -81,7 +82,6 @@ class _Runner:
         """Start the process and wait until it could train."""
         write_run(self.job.out, self.job.run)
         package = __package__.split(".")[-2]
-        root = str(Path(__file__).resolve().parents[2])
         # A process of its own group: an interruption reaches only us, and we let it save.
         with (self.job.out / "log.txt").open("a", encoding="utf-8") as log:
             self._process = subprocess.Popen(
@@ -91,7 +91,7 @@ class _Runner:
                 stderr=log,
                 text=True,
                 encoding="utf-8",
-                env={**os.environ, "PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])},
+                env=same_packages(os.environ),
                 start_new_session=True,
             )
         self._listen()

@@ -25,10 +25,9 @@ def control_density(state: TrainState, room: int, share: float, rng: np.random.G
     count = max(0, min(room, int(share * len(state))))
     hardest = np.argsort(-pull, kind="stable")[:count]
     hardest = hardest[pull[hardest] > 0]
-    parents = keep_rows(state, torch.from_numpy(np.tile(hardest, 2)))
-    children = replace(
-        new_state(_halves(state.splats().rows(hardest), rng)), second=parents.second, steps=parents.steps
-    )
+    parents = keep_rows(state, torch.from_numpy(hardest))
+    pairs = join(parents, parents)
+    children = replace(new_state(_halves(parents.splats(), rng)), second=pairs.second, steps=pairs.steps)
     keep = ~_dispensable(state)
     keep[hardest] = False
     state = join(keep_rows(state, torch.from_numpy(keep)), children)

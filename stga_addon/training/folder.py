@@ -138,6 +138,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "global_every": (1, math.inf),
     "density_every": (0, math.inf),
     "stray_every": (0, math.inf),
+    "averaging": (0, 1),
     "stray_to": (0, 1),
     "growth": (0, 100),
     "warm_up": (0, 1),

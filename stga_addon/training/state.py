@@ -77,7 +77,7 @@ def new_state(splats: Splats) -> TrainState:
 
 
 def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
-    """The rows marked in `keep` (N,) bool, with everything that belongs to them."""
+    """The rows at `keep`, a mask (N,) or indices, with everything that belongs to them."""
     return _map(lambda tensors: tensors[0][keep], state)
 
 

@@ -14,6 +14,7 @@ from ..raster.kernels import CACHE
 from ..raster.kernels.image_loss import change_background
 from ..raster.kernels.rows import distance_limit, scale_limit
 from ..raster.render import Parameters, camera_frames, render_backward, render_forward, touched_tiles
+from ..task import same_packages
 from . import adam
 from .losses import image_gradient, whole_image
 from .state import TrainState, new_state
@@ -44,14 +45,13 @@ def _second_process() -> "subprocess.Popen[bytes] | None":
     # As part of an extension the package has another name and another cache.
     if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
         return None
-    root = str(Path(__file__).resolve().parents[2])
     try:
         return subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import _optimise; _optimise()"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])},
+            env=same_packages(os.environ),
         )
     except OSError:
         return None

@@ -681,6 +681,7 @@ SETTINGS: list[dict[str, Any]] = [
     {"stray_every": -1},
     {"growth": 1e12},
     {"growth": -2.0},
+    {"averaging": -1.0},
     {"ssim_weight": float("nan")},
     {"warm_up": float("nan")},
     {"sh_steps": ["a"]},

@@ -221,6 +221,17 @@ def test_nothing_beside_the_mesh_gives_no_seeds(toy: Capture) -> None:
     assert not full.loose.any()
 
 
+def test_draw_shows_the_average(toy: Capture) -> None:
+    """Catches evaluations of other splats than those that the avatar is made of."""
+    trainer = make_trainer(toy)
+    view = view_of(toy, 1)
+    picture = trainer.draw(view)
+    trainer.state.parameters.opacity.fill_(-20.0)
+    np.testing.assert_array_equal(trainer.draw(view), picture)
+    trainer.state.average.opacity.fill_(-20.0)
+    assert trainer.draw(view).min() == 1
+
+
 def test_draw_is_a_copy(toy: Capture) -> None:
     """Catches pictures that change when the next one is drawn, since buffers are used again."""
     trainer = make_trainer(toy)
