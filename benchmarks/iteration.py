@@ -26,7 +26,7 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.demo.head import synthetic_head
-from stga_addon.raster.kernels.bins import count_pairs, depth_order, fill_pairs
+from stga_addon.raster.kernels.bins import PARTS, count_pairs, depth_order, fill_pairs, lay_out
 from stga_addon.raster.kernels.blend import blend_backward, blend_forward
 from stga_addon.raster.kernels.project import project_backward, project_forward
 from stga_addon.raster.kernels.threads import threads
@@ -117,23 +117,30 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     )  # fmt: skip
     project_forward(*project)
     order = depth_order(depth, r.visible)
-    pairs = len(r.pair_slot)
+    pairs, rows = len(r.pair_slot), r.visible
+    counts = np.empty((PARTS, tiles_x * tiles_y), np.int32)
+    count_pairs(r.projected, extent_y, rect, order, tiles_x, counts, r.slot_count)
+    places = counts.copy()
+    lay_out(rows, r.slot_count, places, r.slot_start)
     v_image, screen = np.empty_like(r.image), np.empty(n, np.float32)
     bands = whole_image(camera.height, camera.width)
     zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
     pair_gradients = np.empty((pairs, 9), np.float32)
-    rows = r.visible
     work = {
         "project": (lambda: project_forward(*project), n * (59 + 16) * 4),
         "sort by depth": (lambda: depth_order(depth, r.visible), len(rows) * 6 * 8),
-        "count pairs": (lambda: count_pairs(rect, order, tiles_x, tiles_y, r.slot_start, r.slot_count), n * 24),
+        "count pairs": (lambda: count_pairs(r.projected, extent_y, rect, order, tiles_x, counts, r.slot_count), n * 60),
+        "lay out pairs": (lambda: lay_out(rows, r.slot_count, counts.copy(), r.slot_start), counts.nbytes + n * 8),
         "fill pairs": (
-            lambda: fill_pairs(rect, order, tiles_x, tiles_y, r.slot_start, r.start, r.pair_splat, r.pair_slot),
-            pairs * 8 + n * 20,
+            lambda: fill_pairs(
+                r.projected, extent_y, rect, order, tiles_x, places.copy(), r.slot_start, r.pair_splat, r.pair_slot,
+                r.pair_rows,
+            ),
+            pairs * 10 + n * 60,
         ),
         "blend": (
             lambda: blend_forward(
-                r.tiles, tiles_x, r.start, r.pair_splat, r.projected, r.extent_y, background, r.image,
+                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_rows, r.projected, background, r.image,
                 r.transmittance, r.last,
             ),
             pairs * 44 + pixels * 20,
@@ -144,7 +151,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         ),
         "blend backward": (
             lambda: blend_backward(
-                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_slot, wanted, r.projected, r.extent_y, background,
+                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_rows, r.pair_slot, wanted, r.projected, background,
                 r.transmittance, r.last, v_image, zero, pair_gradients,
             ),
             pairs * (48 + 36) + pixels * 24,
@@ -152,7 +159,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         "project backward": (
             lambda: project_backward(
                 rows, *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
-                False, False, r.projected, r.slot_start, r.slot_count, pair_gradients, False, *gradients, screen,
+                False, False, r.projected, r.slot_start, r.slot_count, pair_gradients, *gradients, screen,
             ),
             pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),

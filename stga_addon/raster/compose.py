@@ -52,15 +52,16 @@ def _blended(
     projected: np.ndarray, depth: np.ndarray, extent_y: np.ndarray, rect: np.ndarray, camera: Camera, with_depth: bool
 ) -> Composition:
     tiles_x, tiles_y = tile_grid(camera)
-    bins = sort_into_tiles(depth, rect, camera, Scratch().take)
+    bins = sort_into_tiles(projected, depth, extent_y, rect, camera, Scratch().take)
     tiles = deal(np.arange(tiles_x * tiles_y, dtype=np.int32))
 
     def blend() -> tuple[np.ndarray, np.ndarray]:
         image = np.empty((3, camera.height, camera.width), np.float32)
         transmittance = np.empty((camera.height, camera.width), np.float32)
         last = np.empty((camera.height, camera.width), np.int32)
-        start, splat = bins.start, bins.pair_splat
-        blend_forward(tiles, tiles_x, start, splat, projected, extent_y, BLACK, image, transmittance, last)
+        blend_forward(
+            tiles, tiles_x, bins.start, bins.pair_splat, bins.pair_rows, projected, BLACK, image, transmittance, last
+        )
         return image, 1 - transmittance
 
     rgb, alpha = blend()

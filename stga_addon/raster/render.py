@@ -9,7 +9,7 @@ import numpy as np
 from ..avatar.embedding import FaceFrames
 from ..avatar.splats import no_strain_color
 from ..capture.camera import Camera
-from .kernels.bins import count_pairs, depth_order, fill_pairs, mark_tiles, reaching
+from .kernels.bins import PARTS, count_pairs, depth_order, fill_pairs, lay_out, mark_tiles, reaching
 from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
 from .kernels.project import project_backward, project_forward
 from .kernels.threads import PIECES, threads
@@ -64,6 +64,7 @@ class Rendering:
     slot_count: np.ndarray
     start: np.ndarray
     pair_splat: np.ndarray
+    pair_rows: np.ndarray
     pair_slot: np.ndarray
     tiles: np.ndarray
     background: np.ndarray
@@ -135,8 +136,10 @@ def render_forward(
         *splats, degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
         depth_as_colour, antialiased, projected, depth, extent_y, rect,
     )  # fmt: skip
-    drawn = None if focus is None else _near(_touched(rect, focus, (camera.height, camera.width)), reach)
-    bins = sort_into_tiles(depth, rect, camera, take, drawn)
+    drawn = None
+    if focus is not None:
+        drawn = _near(_touched(projected, extent_y, rect, focus, (camera.height, camera.width)), reach)
+    bins = sort_into_tiles(projected, depth, extent_y, rect, camera, take, drawn)
     tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
     tiles = deal(tiles if drawn is None else tiles[drawn.ravel()])
     image = take("image", (3, camera.height, camera.width))
@@ -144,11 +147,11 @@ def render_forward(
     last = take("last", (camera.height, camera.width), np.int32)
     background = np.asarray(background, np.float32)
     blend_forward(
-        tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, background, image, transmittance, last
+        tiles, tiles_x, bins.start, bins.pair_splat, bins.pair_rows, projected, background, image, transmittance, last
     )
     return Rendering(
         image, transmittance, bins.visible, projected, extent_y, rect, last, bins.slot_start, bins.slot_count,
-        bins.start, bins.pair_splat, bins.pair_slot, tiles, background, degree, depth_as_colour, antialiased,
+        bins.start, bins.pair_splat, bins.pair_rows, bins.pair_slot, tiles, background, degree, depth_as_colour, antialiased,
     )  # fmt: skip
 
 
@@ -160,17 +163,20 @@ class Bins(NamedTuple):
     slot_count: np.ndarray
     start: np.ndarray
     pair_splat: np.ndarray
+    pair_rows: np.ndarray
     pair_slot: np.ndarray
 
 
 def sort_into_tiles(
+    projected: np.ndarray,
     depth: np.ndarray,
+    extent_y: np.ndarray,
     rect: np.ndarray,
     camera: Camera,
     take: Callable[..., np.ndarray],
     drawn: np.ndarray | None = None,
 ) -> Bins:
-    """Projected splats in tiles, front to back; depth (N,) and rect (N, 4) from `project_forward`, take: a `Scratch`'s.
+    """Projected splats in tiles, front to back; arrays as from `project_forward`, take: a `Scratch`'s.
 
     Splats of several projections may stand in the arrays one after the other. drawn (tiles_y, tiles_x) bool: leave out
     the splats that reach none of these tiles.
@@ -181,11 +187,16 @@ def sort_into_tiles(
         visible = reaching(rect, visible, drawn)
     order = depth_order(depth, visible)
     slot_start, slot_count = take("slot_start", depth.shape, np.int32), take("slot_count", depth.shape, np.int32)
-    start = count_pairs(rect, order, tiles_x, tiles_y, slot_start, slot_count)
+    counts = take("counts", (PARTS, tiles_x * tiles_y), np.int32)
+    count_pairs(projected, extent_y, rect, order, tiles_x, counts, slot_count)
+    start = lay_out(visible, slot_count, counts, slot_start)
     pair_splat = take("pair_splat", (start[-1],), np.int32)
     pair_slot = take("pair_slot", (start[-1],), np.int32)
-    fill_pairs(rect, order, tiles_x, tiles_y, slot_start, start, pair_splat, pair_slot)
-    return Bins(visible, slot_start, slot_count, start, pair_splat, pair_slot)
+    pair_rows = take("pair_rows", (start[-1], 2), np.uint8)
+    fill_pairs(
+        projected, extent_y, rect, order, tiles_x, counts, slot_start, pair_splat, pair_slot, pair_rows
+    )  # fmt: skip
+    return Bins(visible, slot_start, slot_count, start, pair_splat, pair_rows, pair_slot)
 
 
 def render_backward(
@@ -197,13 +208,12 @@ def render_backward(
     gradients: Parameters,
     v_transmittance: np.ndarray | None = None,
     focus: np.ndarray | None = None,
-    add: bool = False,
     scratch: "Scratch | None" = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. focus (N,) bool: splats that need a gradient; None
-    means all. Overwrites (or adds to) those rows of `gradients` that belong to a visible, wanted splat and leaves
+    means all. Overwrites those rows of `gradients` that belong to a visible, wanted splat and leaves
     all others as they are.
     Returns the rows written (M,) int32, and screen (N,): for those rows, the length of the gradient with respect to
     the projected centre in units of half the image.
@@ -220,14 +230,14 @@ def render_backward(
     if v_transmittance is None:
         v_transmittance = np.broadcast_to(np.float32(0), rendering.transmittance.shape)
     blend_backward(
-        tiles, tiles_x, rendering.start, rendering.pair_splat, rendering.pair_slot, wanted, rendering.projected,
-        rendering.extent_y, rendering.background, rendering.transmittance, rendering.last, v_image,
+        tiles, tiles_x, rendering.start, rendering.pair_splat, rendering.pair_rows, rendering.pair_slot, wanted,
+        rendering.projected, rendering.background, rendering.transmittance, rendering.last, v_image,
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
         rows, *complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world,
         seen.lens, seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected,
-        rendering.slot_start, rendering.slot_count, pair_gradients, add, *complete(gradients), screen,
+        rendering.slot_start, rendering.slot_count, pair_gradients, *complete(gradients), screen,
     )  # fmt: skip
     return rows, screen
 
@@ -241,12 +251,14 @@ def complete(splats: Parameters) -> Parameters:
 
 def touched_tiles(rendering: Rendering, focus: np.ndarray) -> np.ndarray:
     """(tiles_y, tiles_x) bool: the tiles that a splat of `focus` (N,) bool reaches."""
-    return _touched(rendering.rect, focus, rendering.last.shape)
+    return _touched(rendering.projected, rendering.extent_y, rendering.rect, focus, rendering.last.shape)
 
 
-def _touched(rect: np.ndarray, focus: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _touched(
+    projected: np.ndarray, extent_y: np.ndarray, rect: np.ndarray, focus: np.ndarray, size: tuple[int, ...]
+) -> np.ndarray:
     marked = np.zeros([-(-pixels // TILE) for pixels in size], bool)
-    mark_tiles(rect, focus, marked)
+    mark_tiles(projected, extent_y, rect, focus, marked)
     return marked
 
 

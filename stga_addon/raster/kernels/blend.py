@@ -45,24 +45,16 @@ def _exp2(x):
     return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
-@inline_jit
-def _row_range(mean_y, extent_y, top):
-    """First and past-the-last of the tile's 16 rows whose pixel centres lie within extent_y of mean_y."""
-    first = np.int64(max(np.float32(0.0), np.ceil(mean_y - extent_y - top - np.float32(0.5))))
-    last = np.int64(min(np.float32(TILE - 1), np.floor(mean_y + extent_y - top - np.float32(0.5))))
-    return first, last + 1
-
-
 @parallel(lambda tiles, *_: len(tiles))
 @jit
 def blend_forward(
     first_tile, past_tile,
-    tiles, tiles_x, start, pair_splat, projected, extent_y, background, image, transmittance, last,
+    tiles, tiles_x, start, pair_splat, pair_rows, projected, background, image, transmittance, last,
 ):  # fmt: skip
     """Render the listed tiles.
 
     tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int32 into the pair
-    list; pair_splat (P,) int32 front to back in each tile; projected (N, 9); extent_y (N,) pixels.
+    list; pair_splat (P,) int32 and pair_rows (P, 2) uint8, as in `bins.py`, front to back in each tile; projected (N, 9).
     background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept
     because the backward needs its small values exactly), and last (H, W) int32: one past the last contributing pair
     of the tile, counted from the tile's start.
@@ -94,7 +86,7 @@ def blend_forward(
             shear = projected[i, SHEAR]
             opacity = projected[i, OPACITY]
             red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
-            first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
+            first, past = pair_rows[j, 0], pair_rows[j, 1]
             order = np.float32(j - begin + 1)
             for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
                 dy = s[Y + p] - mean_y
@@ -126,7 +118,7 @@ def blend_forward(
 @jit
 def blend_backward(
     first_tile, past_tile,
-    tiles, tiles_x, start, pair_splat, pair_slot, wanted, projected, extent_y, background, transmittance, last,
+    tiles, tiles_x, start, pair_splat, pair_rows, pair_slot, wanted, projected, background, transmittance, last,
     v_image, v_transmittance, grads,
 ):  # fmt: skip
     """Gradient of every wanted (tile, splat) pair of the listed tiles.
@@ -173,7 +165,7 @@ def blend_backward(
             qx, qy = np.float32(-0.5) * LOG2E * precision_x, np.float32(-0.5) * LOG2E * precision_y
             opacity = projected[i, OPACITY]
             red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
-            first, past = _row_range(projected[i, MEAN_Y], extent_y[i], y0)
+            first, past = pair_rows[j, 0], pair_rows[j, 1]
             order = np.float32(j - begin + 1)
             for p in range(np.uint64(first * TILE), np.uint64(past * TILE)):
                 dy = s[Y + p] - mean_y

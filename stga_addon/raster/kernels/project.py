@@ -253,10 +253,10 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
 def project_backward(
     begin, end, visible,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, slot_start, slot_count, grads, add,
+    depth_as_colour, antialiased, projected, slot_start, slot_count, grads,
     v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
 ):  # fmt: skip
-    """Write the gradient of each listed splat to its row of v_* (or add it); the counterpart of `project_forward`.
+    """Write the gradient of each listed splat to its row of v_*; the counterpart of `project_forward`.
 
     visible (M,) int32: the splats to differentiate. slot_start, slot_count (N,) int32: where their pairs' gradients
     lie in grads (P, 9). screen (N,): length of the gradient with respect to the projected centre in units of half the
@@ -269,13 +269,8 @@ def project_backward(
     g = np.empty(PROJECTED, np.float32)
     for n in range(begin, end):
         i = visible[n]
-        if not add:
-            v_xyz[i, :] = ZERO
-            v_rotation[i, :] = ZERO
-            v_log_scale[i, :] = ZERO
-            v_opacity[i] = ZERO
-            v_sh[i, :, :] = ZERO
-            v_strain_color[i, :, :] = ZERO
+        v_sh[i, :, :] = ZERO
+        v_strain_color[i, :, :] = ZERO
         for c in range(PROJECTED):
             g[c] = ZERO
         for slot in range(slot_start[i], slot_start[i] + slot_count[i]):
@@ -327,9 +322,9 @@ def project_backward(
             v00, v01, v02 = v00 + b00, v01 + b01, v02 + b02
             v10, v11, v12 = v10 + b10 + shear * b00, v11 + b11 + shear * b01, v12 + b12 + shear * b02
         by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
-        v_log_scale[i, 0] += by0
-        v_log_scale[i, 1] += by1
-        v_log_scale[i, 2] += by2
+        v_log_scale[i, 0] = by0
+        v_log_scale[i, 1] = by1
+        v_log_scale[i, 2] = by2
         # A = U·R·diag(s): to R, then through the normalised quaternion.
         v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
         p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
@@ -341,10 +336,10 @@ def project_backward(
         vq2 = TWO * (q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22))
         vq3 = TWO * (q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11))
         radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
-        v_rotation[i, 0] += (vq0 - radial * q0) * rn
-        v_rotation[i, 1] += (vq1 - radial * q1) * rn
-        v_rotation[i, 2] += (vq2 - radial * q2) * rn
-        v_rotation[i, 3] += (vq3 - radial * q3) * rn
+        v_rotation[i, 0] = (vq0 - radial * q0) * rn
+        v_rotation[i, 1] = (vq1 - radial * q1) * rn
+        v_rotation[i, 2] = (vq2 - radial * q2) * rn
+        v_rotation[i, 3] = (vq3 - radial * q3) * rn
         # to U, and through it to the camera-space position (the Jacobian depends on it).
         d00, d01 = v00 * r00 + v01 * r01 + v02 * r02, v00 * r10 + v01 * r11 + v02 * r12
         d02 = v00 * r20 + v01 * r21 + v02 * r22
@@ -361,7 +356,7 @@ def project_backward(
         vz -= (vtx * slope_x + vty * slope_y) * rz
 
         # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
-        v_opacity[i] += g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
+        v_opacity[i] = g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
         if depth_as_colour:
             vz += g[RED]
         else:
@@ -388,6 +383,6 @@ def project_backward(
             vx += to_world[0, 0] * ex + to_world[1, 0] * ey + to_world[2, 0] * ez
             vy += to_world[0, 1] * ex + to_world[1, 1] * ey + to_world[2, 1] * ez
             vz += to_world[0, 2] * ex + to_world[1, 2] * ey + to_world[2, 2] * ez
-        v_xyz[i, 0] += c00 * vx + c10 * vy + c20 * vz
-        v_xyz[i, 1] += c01 * vx + c11 * vy + c21 * vz
-        v_xyz[i, 2] += c02 * vx + c12 * vy + c22 * vz
+        v_xyz[i, 0] = c00 * vx + c10 * vy + c20 * vz
+        v_xyz[i, 1] = c01 * vx + c11 * vy + c21 * vz
+        v_xyz[i, 2] = c02 * vx + c12 * vy + c22 * vz
