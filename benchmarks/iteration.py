@@ -117,11 +117,11 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     )  # fmt: skip
     project_forward(*project)
     order = depth_order(depth, r.visible)
-    pairs, rows = len(r.pair_slot), r.visible
+    pairs, rows = len(r.pair_splat), r.visible
     counts = np.empty((PARTS, tiles_x * tiles_y), np.int32)
-    count_pairs(r.projected, extent_y, rect, order, tiles_x, counts, r.slot_count)
+    count_pairs(rect, order, tiles_x, counts, r.pairs)
     places = counts.copy()
-    lay_out(rows, r.slot_count, places, r.slot_start)
+    lay_out(rows, r.pairs, places, r.first_pair)
     v_image, screen = np.empty_like(r.image), np.empty(n, np.float32)
     bands = whole_image(camera.height, camera.width)
     zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
@@ -129,18 +129,15 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     work = {
         "project": (lambda: project_forward(*project), n * (59 + 16) * 4),
         "sort by depth": (lambda: depth_order(depth, r.visible), len(rows) * 6 * 8),
-        "count pairs": (lambda: count_pairs(r.projected, extent_y, rect, order, tiles_x, counts, r.slot_count), n * 60),
-        "lay out pairs": (lambda: lay_out(rows, r.slot_count, counts.copy(), r.slot_start), counts.nbytes + n * 8),
+        "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts, r.pairs), n * 24),
+        "lay out pairs": (lambda: lay_out(rows, r.pairs, counts.copy(), r.first_pair), counts.nbytes + n * 8),
         "fill pairs": (
-            lambda: fill_pairs(
-                r.projected, extent_y, rect, order, tiles_x, places.copy(), r.slot_start, r.pair_splat, r.pair_slot,
-                r.pair_rows,
-            ),
-            pairs * 10 + n * 60,
+            lambda: fill_pairs(rect, order, tiles_x, places.copy(), r.first_pair, r.splat_pairs, r.pair_splat),
+            pairs * 8 + n * 24,
         ),
         "blend": (
             lambda: blend_forward(
-                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_rows, r.projected, background, r.image,
+                r.tiles, tiles_x, r.start, r.pair_splat, r.projected, extent_y, background, r.pair_rows, r.image,
                 r.transmittance, r.last,
             ),
             pairs * 44 + pixels * 20,
@@ -151,7 +148,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         ),
         "blend backward": (
             lambda: blend_backward(
-                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_rows, r.pair_slot, wanted, r.projected, background,
+                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_rows, wanted, r.projected, background,
                 r.transmittance, r.last, v_image, zero, pair_gradients,
             ),
             pairs * (48 + 36) + pixels * 24,
@@ -159,7 +156,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         "project backward": (
             lambda: project_backward(
                 rows, *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
-                False, False, r.projected, r.slot_start, r.slot_count, pair_gradients, *gradients, screen,
+                False, False, r.projected, r.first_pair, r.pairs, r.splat_pairs, pair_gradients, *gradients, screen,
             ),
             pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..capture.camera import Camera
-from .kernels.blend import BLUE, GREEN, PROJECTED, RED, blend_forward
+from .kernels.blend import blend_forward
+from .kernels.layout import BLUE, GREEN, PROJECTED, RED
 from .kernels.project import project_forward
 from .layer import Composition, Layer
 from .render import (
@@ -52,15 +53,16 @@ def _blended(
     projected: np.ndarray, depth: np.ndarray, extent_y: np.ndarray, rect: np.ndarray, camera: Camera, with_depth: bool
 ) -> Composition:
     tiles_x, tiles_y = tile_grid(camera)
-    bins = sort_into_tiles(projected, depth, extent_y, rect, camera, Scratch().take)
+    bins = sort_into_tiles(depth, rect, camera, Scratch().take)
     tiles = deal(np.arange(tiles_x * tiles_y, dtype=np.int32))
+    pair_rows = np.empty((len(bins.pair_splat), 4), np.uint8)
 
     def blend() -> tuple[np.ndarray, np.ndarray]:
         image = np.empty((3, camera.height, camera.width), np.float32)
         transmittance = np.empty((camera.height, camera.width), np.float32)
         last = np.empty((camera.height, camera.width), np.int32)
         blend_forward(
-            tiles, tiles_x, bins.start, bins.pair_splat, bins.pair_rows, projected, BLACK, image, transmittance, last
+            tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, BLACK, pair_rows, image, transmittance, last
         )
         return image, 1 - transmittance
 

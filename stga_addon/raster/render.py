@@ -10,7 +10,8 @@ from ..avatar.embedding import FaceFrames
 from ..avatar.splats import no_strain_color
 from ..capture.camera import Camera
 from .kernels.bins import PARTS, count_pairs, depth_order, fill_pairs, lay_out, mark_tiles, reaching
-from .kernels.blend import PROJECTED, TILE, blend_backward, blend_forward
+from .kernels.blend import blend_backward, blend_forward
+from .kernels.layout import PROJECTED, TILE
 from .kernels.project import project_backward, project_forward
 from .kernels.threads import PIECES, threads
 
@@ -60,12 +61,12 @@ class Rendering:
     extent_y: np.ndarray
     rect: np.ndarray
     last: np.ndarray
-    slot_start: np.ndarray
-    slot_count: np.ndarray
+    first_pair: np.ndarray
+    pairs: np.ndarray
+    splat_pairs: np.ndarray
     start: np.ndarray
     pair_splat: np.ndarray
     pair_rows: np.ndarray
-    pair_slot: np.ndarray
     tiles: np.ndarray
     background: np.ndarray
     degree: int
@@ -139,19 +140,20 @@ def render_forward(
     drawn = None
     if focus is not None:
         drawn = _near(_touched(projected, extent_y, rect, focus, (camera.height, camera.width)), reach)
-    bins = sort_into_tiles(projected, depth, extent_y, rect, camera, take, drawn)
+    bins = sort_into_tiles(depth, rect, camera, take, drawn)
     tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
     tiles = deal(tiles if drawn is None else tiles[drawn.ravel()])
     image = take("image", (3, camera.height, camera.width))
     transmittance = take("transmittance", (camera.height, camera.width))
     last = take("last", (camera.height, camera.width), np.int32)
+    pair_rows = take("pair_rows", (len(bins.pair_splat), 4), np.uint8)
     background = np.asarray(background, np.float32)
     blend_forward(
-        tiles, tiles_x, bins.start, bins.pair_splat, bins.pair_rows, projected, background, image, transmittance, last
+        tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, background, pair_rows, image, transmittance, last
     )
     return Rendering(
-        image, transmittance, bins.visible, projected, extent_y, rect, last, bins.slot_start, bins.slot_count,
-        bins.start, bins.pair_splat, bins.pair_rows, bins.pair_slot, tiles, background, degree, depth_as_colour, antialiased,
+        image, transmittance, bins.visible, projected, extent_y, rect, last, bins.first_pair, bins.pairs, bins.splat_pairs,
+        bins.start, bins.pair_splat, pair_rows, tiles, background, degree, depth_as_colour, antialiased,
     )  # fmt: skip
 
 
@@ -159,18 +161,15 @@ class Bins(NamedTuple):
     """Which splats touch which tile, as `blend_forward` wants it; visible (M,) int32: those that touch any."""
 
     visible: np.ndarray
-    slot_start: np.ndarray
-    slot_count: np.ndarray
+    first_pair: np.ndarray
+    pairs: np.ndarray
+    splat_pairs: np.ndarray
     start: np.ndarray
     pair_splat: np.ndarray
-    pair_rows: np.ndarray
-    pair_slot: np.ndarray
 
 
 def sort_into_tiles(
-    projected: np.ndarray,
     depth: np.ndarray,
-    extent_y: np.ndarray,
     rect: np.ndarray,
     camera: Camera,
     take: Callable[..., np.ndarray],
@@ -186,17 +185,14 @@ def sort_into_tiles(
     if drawn is not None:
         visible = reaching(rect, visible, drawn)
     order = depth_order(depth, visible)
-    slot_start, slot_count = take("slot_start", depth.shape, np.int32), take("slot_count", depth.shape, np.int32)
+    first_pair, pairs = take("first_pair", depth.shape, np.int32), take("pairs", depth.shape, np.int32)
     counts = take("counts", (PARTS, tiles_x * tiles_y), np.int32)
-    count_pairs(projected, extent_y, rect, order, tiles_x, counts, slot_count)
-    start = lay_out(visible, slot_count, counts, slot_start)
+    count_pairs(rect, order, tiles_x, counts, pairs)
+    start = lay_out(visible, pairs, counts, first_pair)
+    splat_pairs = take("splat_pairs", (start[-1],), np.int32)
     pair_splat = take("pair_splat", (start[-1],), np.int32)
-    pair_slot = take("pair_slot", (start[-1],), np.int32)
-    pair_rows = take("pair_rows", (start[-1], 2), np.uint8)
-    fill_pairs(
-        projected, extent_y, rect, order, tiles_x, counts, slot_start, pair_splat, pair_slot, pair_rows
-    )  # fmt: skip
-    return Bins(visible, slot_start, slot_count, start, pair_splat, pair_rows, pair_slot)
+    fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
+    return Bins(visible, first_pair, pairs, splat_pairs, start, pair_splat)
 
 
 def render_backward(
@@ -225,19 +221,19 @@ def render_backward(
     if focus is not None:
         tiles = tiles[touched_tiles(rendering, focus).ravel()[tiles]]
         rows = rows[focus[rows]]
-    pair_gradients = take("pair_gradients", (len(rendering.pair_slot), PROJECTED))
+    pair_gradients = take("pair_gradients", (len(rendering.pair_splat), PROJECTED))
     screen = take("screen", (n,))
     if v_transmittance is None:
         v_transmittance = np.broadcast_to(np.float32(0), rendering.transmittance.shape)
     blend_backward(
-        tiles, tiles_x, rendering.start, rendering.pair_splat, rendering.pair_rows, rendering.pair_slot, wanted,
+        tiles, tiles_x, rendering.start, rendering.pair_splat, rendering.pair_rows, wanted,
         rendering.projected, rendering.background, rendering.transmittance, rendering.last, v_image,
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
         rows, *complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world,
         seen.lens, seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected,
-        rendering.slot_start, rendering.slot_count, pair_gradients, *complete(gradients), screen,
+        rendering.first_pair, rendering.pairs, rendering.splat_pairs, pair_gradients, *complete(gradients), screen,
     )  # fmt: skip
     return rows, screen
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from ..raster.kernels.blend import TILE
+from ..raster.kernels.layout import TILE
 from ..raster.kernels.image_loss import REACH, image_loss
 
 __all__ = ["REACH", "image_gradient", "similarity", "tile_rectangles", "whole_image"]

@@ -1,14 +1,12 @@
 """Which splats touch which tile, front to back."""
 
-import math
-
 import numpy as np
 
-from . import jit, part_jit
-from .blend import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
+from . import jit
+from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
+from .outline import outline, rows_within
 from .threads import parallel
 
-ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 RADIX_BITS = 11
 PARTS = 16
 """Equal parts of the splats, near to far, whose pairs are counted and listed side by side."""
@@ -42,81 +40,35 @@ def depth_order(depth, candidates):
     return values
 
 
-@part_jit
-def _ellipse(projected, extent_y, i):
-    """What `_rows` wants to know of splat i's outline, on which α = 1/255.
-
-    On it the squares that make the exponent (see `blend.py`) add up to PRECISION_Y·extent_y².
-    """
-    precision_x, shear, precision_y = projected[i, PRECISION_X], projected[i, SHEAR], projected[i, PRECISION_Y]
-    reach = extent_y[i]
-    shrink = ONE / (precision_x * shear * shear + precision_y)
-    chord = precision_y * reach * reach * shrink
-    # Rounding, of differences of squares above all, must not cost a pixel.
-    slack = np.float32(0.01) + np.float32(1e-3) * math.sqrt(chord) + np.float32(1e-6) * reach
-    return (
-        projected[i, MEAN_X] - HALF, projected[i, MEAN_Y] - HALF, reach, shear * reach, precision_x * shear * shrink,
-        chord, precision_x * precision_y * shrink * shrink, slack,
-    )  # fmt: skip
-
-
-@part_jit
-def _rows(ellipse, column, above, below):
-    """First and past-the-last row of pixels, of those from `above` to before `below`, that a column of tiles shares
-    with an ellipse; the first is not before the other where there are none.
-
-    Between the column's outermost pixel centres the ellipse is highest where it is highest altogether, or else at the
-    nearer edge, and likewise lowest.
-    """
-    mean_x, mean_y, reach, lean, rate, chord, cut, slack = ellipse
-    low = np.float32(column * TILE) - mean_x
-    high = low + np.float32(TILE - 1)
-    nearest = min(max(ZERO, low), high)
-    if cut * nearest * nearest > np.float32(1.00001) * chord:
-        return np.int64(0), np.int64(0)
-    top, bottom = min(max(-lean, low), high), min(max(lean, low), high)
-    up = rate * top - math.sqrt(max(ZERO, chord - cut * top * top)) - slack
-    down = rate * bottom + math.sqrt(max(ZERO, chord - cut * bottom * bottom)) + slack
-    first = np.ceil(max(np.float32(above), mean_y + max(up, -reach)))
-    past = np.floor(min(np.float32(below - 1), mean_y + min(down, reach))) + ONE
-    return np.int64(min(first, np.float32(below))), np.int64(max(past, np.float32(above)))
-
-
 @parallel(lambda *_: PARTS)
 @jit
-def count_pairs(part, past_part, projected, extent_y, rect, order, tiles_x, counts, pairs):
+def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
     """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
 
-    projected (N, 9), extent_y (N,) and rect (N, 4) as from `project_forward`. Writes counts (PARTS, tiles) int32 and pairs
-    (N,) int32, of the splats in `order`.
+    rect (N, 4) int32 tile bounds. Writes counts (PARTS, tiles) int32 and pairs (N,) int32, of the splats in `order`.
     """
     for k in range(part, past_part):
         counts[k, :] = 0
         for n in range(k * len(order) // PARTS, (k + 1) * len(order) // PARTS):
             i = order[n]
-            count = 0
-            above, below = rect[i, 1] * TILE, rect[i, 3] * TILE
-            ellipse = _ellipse(projected, extent_y, i)
-            for x in range(rect[i, 0], rect[i, 2]):
-                first, past = _rows(ellipse, x, above, below)
-                if first < past:
-                    for y in range(first // TILE, (past - 1) // TILE + 1):
-                        counts[k, y * tiles_x + x] += 1
-                        count += 1
-            pairs[i] = count
+            x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
+            pairs[i] = (x1 - x0) * (y1 - y0)
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    counts[k, y * tiles_x + x] += 1
 
 
 @jit
-def lay_out(visible, pairs, counts, slot_start):
+def lay_out(visible, pairs, counts, first_pair):
     """Turn the counts of `count_pairs` into the places where each part's pairs begin.
 
-    visible (M,) int32: the splats in the order in which their pairs' gradients are to lie: splat i's from slot_start[i]
-    on. Returns start (tiles + 1,) int64: where each tile's list begins.
+    visible (M,) int32: the splats in the order in which their pairs are to be found: splat i's from first_pair[i] on.
+    Returns start (tiles + 1,) int64: where each tile's list begins.
     """
-    slots = 0
+    found = 0
     for n in range(len(visible)):
-        slot_start[visible[n]] = slots
-        slots += pairs[visible[n]]
+        first_pair[visible[n]] = found
+        found += pairs[visible[n]]
     start = np.zeros(counts.shape[1] + 1, np.int64)
     for tile in range(counts.shape[1]):
         place = start[tile]
@@ -130,30 +82,24 @@ def lay_out(visible, pairs, counts, slot_start):
 
 @parallel(lambda *_: PARTS)
 @jit
-def fill_pairs(
-    part, past_part, projected, extent_y, rect, order, tiles_x, place, slot_start, pair_splat, pair_slot, pair_rows
-):
+def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
     """Write every tile's pairs front to back, from the places of `lay_out` on, which move along.
 
-    pair_splat (P,) int32; pair_slot (P,) int32: where the pair's gradient belongs; pair_rows (P, 2) uint8: first and
-    past-the-last of the tile's rows of pixels that the splat may reach.
+    pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat stand, its first at
+    first_pair[i].
     """
     for k in range(part, past_part):
         for n in range(k * len(order) // PARTS, (k + 1) * len(order) // PARTS):
             i = order[n]
-            slot = slot_start[i]
-            above, below = rect[i, 1] * TILE, rect[i, 3] * TILE
-            ellipse = _ellipse(projected, extent_y, i)
-            for x in range(rect[i, 0], rect[i, 2]):
-                first, past = _rows(ellipse, x, above, below)
-                if first < past:
-                    for y in range(first // TILE, (past - 1) // TILE + 1):
-                        at = place[k, y * tiles_x + x]
-                        place[k, y * tiles_x + x] += 1
-                        pair_splat[at], pair_slot[at] = i, slot
-                        pair_rows[at, 0] = max(first - y * TILE, 0)
-                        pair_rows[at, 1] = min(past - y * TILE, TILE)
-                        slot += 1
+            x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
+            found = first_pair[i]
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    at = place[k, y * tiles_x + x]
+                    place[k, y * tiles_x + x] = at + 1
+                    pair_splat[at] = i
+                    splat_pairs[found] = at
+                    found += 1
 
 
 @jit
@@ -177,10 +123,14 @@ def mark_tiles(projected, extent_y, rect, focus, marked):
     """Set marked (tiles_y, tiles_x) bool where a splat of focus (N,) bool has a pair."""
     for i in range(len(rect)):
         if focus[i]:
-            above, below = rect[i, 1] * TILE, rect[i, 3] * TILE
-            ellipse = _ellipse(projected, extent_y, i)
+            top = rect[i, 1] * TILE
+            ellipse = outline(
+                projected[i, MEAN_X], projected[i, MEAN_Y] - np.float32(top), projected[i, PRECISION_X],
+                projected[i, SHEAR], projected[i, PRECISION_Y], extent_y[i],
+            )  # fmt: skip
+            rows = np.float32(rect[i, 3] * TILE - top)
             for x in range(rect[i, 0], rect[i, 2]):
-                first, past = _rows(ellipse, x, above, below)
+                first, past = rows_within(ellipse, np.float32(x * TILE), np.float32(TILE), rows)
                 if first < past:
-                    for y in range(first // TILE, (past - 1) // TILE + 1):
-                        marked[y, x] = True
+                    for y in range(np.int64(first) // TILE, (np.int64(past) - 1) // TILE + 1):
+                        marked[rect[i, 1] + y, x] = True

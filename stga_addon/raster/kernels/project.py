@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from . import jit, part_jit
-from .blend import (
+from .layout import (
     BLUE,
     GREEN,
     MEAN_X,
@@ -27,6 +27,8 @@ from .threads import parallel
 LOW_PASS = np.float32(0.3)
 """Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
 NEAR = np.float32(0.01)
+BLOCK = 64
+"""So many splats' gradients are gathered at a time."""
 LIFT = np.float32(2.0**90)
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 SH = np.array(
@@ -248,34 +250,47 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
     )  # fmt: skip
 
 
+@part_jit
+def _sum_pairs(splats, first_pair, pairs, splat_pairs, grads, sums):
+    """Sums (BLOCK, 9) of the gradients of each splat's pairs, in a loop so short that memory is asked for many at once."""
+    for n in range(len(splats)):
+        i = splats[n]
+        g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
+        for k in range(first_pair[i], first_pair[i] + pairs[i]):
+            j = splat_pairs[k]
+            g0, g1, g2 = g0 + grads[j, 0], g1 + grads[j, 1], g2 + grads[j, 2]
+            g3, g4, g5 = g3 + grads[j, 3], g4 + grads[j, 4], g5 + grads[j, 5]
+            g6, g7, g8 = g6 + grads[j, 6], g7 + grads[j, 7], g8 + grads[j, 8]
+        sums[n, 0], sums[n, 1], sums[n, 2], sums[n, 3], sums[n, 4] = g0, g1, g2, g3, g4
+        sums[n, 5], sums[n, 6], sums[n, 7], sums[n, 8] = g5, g6, g7, g8
+
+
 @parallel(lambda visible, *_: len(visible))
 @jit
 def project_backward(
     begin, end, visible,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, slot_start, slot_count, grads,
+    depth_as_colour, antialiased, projected, first_pair, pairs, splat_pairs, grads,
     v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of v_*; the counterpart of `project_forward`.
 
-    visible (M,) int32: the splats to differentiate. slot_start, slot_count (N,) int32: where their pairs' gradients
-    lie in grads (P, 9). screen (N,): length of the gradient with respect to the projected centre in units of half the
+    visible (M,) int32: the splats to differentiate. first_pair, pairs (N,) int32: where in splat_pairs (P,) int32 it
+    stands, and for how many pairs, which rows of grads (P, 9) are theirs. screen (N,): length of the gradient with respect to the projected centre in units of half the
     image (what density control asks for), written for each listed splat.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
     basis, weight = np.empty(16, np.float32), np.empty(16, np.float32)
-    g = np.empty(PROJECTED, np.float32)
+    sums = np.empty((BLOCK, PROJECTED), np.float32)
     for n in range(begin, end):
         i = visible[n]
+        if (n - begin) % BLOCK == 0:
+            _sum_pairs(visible[n : min(end, n + BLOCK)], first_pair, pairs, splat_pairs, grads, sums)
+        g = sums[(n - begin) % BLOCK]
         v_sh[i, :, :] = ZERO
         v_strain_color[i, :, :] = ZERO
-        for c in range(PROJECTED):
-            g[c] = ZERO
-        for slot in range(slot_start[i], slot_start[i] + slot_count[i]):
-            for c in range(PROJECTED):
-                g[c] += grads[slot, c]
         half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]
         screen[i] = math.sqrt(half_x * half_x + half_y * half_y)
         f = face[i]

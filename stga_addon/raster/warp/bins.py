@@ -9,7 +9,7 @@ not written, and everything that follows then finds nothing to do, so that the h
 
 import warp as wp
 
-from ..kernels.blend import TILE as _TILE
+from ..kernels.layout import TILE as _TILE
 
 wp.set_module_options({"enable_backward": False})
 

@@ -12,7 +12,7 @@ what they are given, every lane counts as the leading one, and rows are added to
 import warp as wp
 
 from ..kernels import blend as cpu
-from ..kernels.blend import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
+from ..kernels.layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
 from .bins import NO
 from .project import Projected
 

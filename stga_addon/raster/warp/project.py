@@ -9,9 +9,9 @@ A splat's row is read and written by one thread: 59 floats in a row, so the cach
 import warp as wp
 
 from ..kernels import project as cpu
-from ..kernels.blend import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
-from ..kernels.blend import PROJECTED as _PROJECTED
-from ..kernels.blend import TILE as _TILE
+from ..kernels.layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
+from ..kernels.layout import PROJECTED as _PROJECTED
+from ..kernels.layout import TILE as _TILE
 
 wp.set_module_options({"enable_backward": False})  # gradients are kernels of their own
 

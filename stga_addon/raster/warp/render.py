@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from ...capture.camera import Camera
-from ..kernels.blend import PIXELS, TILE
+from ..kernels.layout import PIXELS, TILE
 from ..render import BLACK, Parameters, tile_grid
 from . import bins, blend
 from .project import Lens, Projected, project_backward, project_forward
