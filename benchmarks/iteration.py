@@ -112,8 +112,8 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     projected, depth = np.empty_like(r.projected), np.empty(n, np.float32)
     extent_y, rect = np.empty(n, np.float32), np.empty((n, 4), np.int32)
     project = (
-        *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size, False, False,
-        projected, depth, extent_y, rect,
+        np.arange(n), np.ones((tiles_y, tiles_x), bool), *arrays, 3, face, seen.origin, seen.matrix, seen.strain,
+        seen.to_world, seen.lens, seen.size, False, False, projected, depth, extent_y, rect,
     )  # fmt: skip
     project_forward(*project)
     order = depth_order(depth, r.visible)

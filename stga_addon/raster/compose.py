@@ -29,13 +29,14 @@ def compose(layers: Sequence[Layer], camera: Camera, with_depth: bool = False) -
     n = sum(counts)
     projected, depth = np.empty((n, PROJECTED), np.float32), np.empty(n, np.float32)
     extent_y, rect = np.empty(n, np.float32), np.empty((n, 4), np.int32)
-    begin = 0
+    begin, everywhere = 0, np.ones(tile_grid(camera)[::-1], bool)
     for layer, count in zip(layers, counts, strict=True):
         splats, seen, part = layer.splats, _seen(layer, camera), slice(begin, begin + count)
         arrays = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
         project_forward(
-            *complete(arrays), splats.sh_degree, splats.face, seen.origin, seen.matrix, seen.strain, seen.to_world,
-            seen.lens, seen.size, False, layer.antialiased, projected[part], depth[part], extent_y[part], rect[part],
+            np.arange(count), everywhere, *complete(arrays), splats.sh_degree, splats.face, seen.origin, seen.matrix,
+            seen.strain, seen.to_world, seen.lens, seen.size, False, layer.antialiased, projected[part], depth[part],
+            extent_y[part], rect[part],
         )  # fmt: skip
         begin += count
     return _blended(projected, depth, extent_y, rect, camera, with_depth)
@@ -62,8 +63,9 @@ def _blended(
         transmittance = np.empty((camera.height, camera.width), np.float32)
         last = np.empty((camera.height, camera.width), np.int32)
         blend_forward(
-            tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, BLACK, pair_rows, image, transmittance, last
-        )
+            tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, BLACK, pair_rows, image, transmittance,
+            last,
+        )  # fmt: skip
         return image, 1 - transmittance
 
     rgb, alpha = blend()

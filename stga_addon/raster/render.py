@@ -9,10 +9,10 @@ import numpy as np
 from ..avatar.embedding import FaceFrames
 from ..avatar.splats import no_strain_color
 from ..capture.camera import Camera
-from .kernels.bins import PARTS, count_pairs, depth_order, fill_pairs, lay_out, mark_tiles, reaching
+from .kernels.bins import PARTS, count_pairs, depth_order, fill_pairs, lay_out, mark_tiles
 from .kernels.blend import blend_backward, blend_forward
 from .kernels.layout import PROJECTED, TILE
-from .kernels.project import project_backward, project_forward
+from .kernels.project import compose_frames, project_backward, project_forward
 from .kernels.threads import PIECES, threads
 
 BLACK = np.zeros(3, np.float32)
@@ -51,14 +51,14 @@ class Rendering:
 
     image (3, H, W) float32 over the background; transmittance (H, W) = 1 − alpha.
     With restricted tiles, pixels of other tiles are undefined.
-    visible (M,) int32: the splats that reach a rendered tile.
+    visible (M,) int32: the splats that reach a rendered tile. focus (N,) bool: those that need a gradient, or None for
+    all; touched (tiles_y, tiles_x) bool: the tiles that they reach.
     """
 
     image: np.ndarray
     transmittance: np.ndarray
     visible: np.ndarray
     projected: np.ndarray
-    extent_y: np.ndarray
     rect: np.ndarray
     last: np.ndarray
     first_pair: np.ndarray
@@ -68,6 +68,8 @@ class Rendering:
     pair_splat: np.ndarray
     pair_rows: np.ndarray
     tiles: np.ndarray
+    focus: np.ndarray | None
+    touched: np.ndarray
     background: np.ndarray
     degree: int
     depth_as_colour: bool
@@ -92,16 +94,17 @@ class Scratch:
 
 def camera_frames(frames: FaceFrames, camera: Camera) -> CameraFrames:
     """Compose face frames with a camera in float64, so that distance from the origin costs no precision."""
-    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-    # One (F·3, 3) product instead of F small ones: columns of every frame's rotation, as rows.
-    columns = frames.rotation.transpose(0, 2, 1).reshape(-1, 3) @ rotation.T
-    matrix = columns.reshape(-1, 3, 3).transpose(0, 2, 1) * frames.scale[:, None, None]
+    turn, shift = np.float64(camera.world_to_camera[:3, :3]), np.float64(camera.world_to_camera[:3, 3])
+    parts = (frames.origin, frames.rotation, frames.scale, turn, shift)
+    origin = np.empty((len(frames.origin), 3), np.float32)
+    matrix = np.empty((len(frames.origin), 3, 3), np.float32)
+    compose_frames(*(np.ascontiguousarray(part, np.float64) for part in parts), origin, matrix)
     return CameraFrames(
         camera=camera,
-        origin=(frames.origin @ rotation.T + translation).astype(np.float32),
-        matrix=np.ascontiguousarray(matrix, np.float32),
+        origin=origin,
+        matrix=matrix,
         strain=frames.strain,
-        to_world=np.ascontiguousarray(rotation.T, np.float32),
+        to_world=np.ascontiguousarray(turn.T, np.float32),
         lens=np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy], np.float32),
         size=np.array([camera.width, camera.height], np.int64),
     )
@@ -133,27 +136,36 @@ def render_forward(
     tiles_x, tiles_y = tile_grid(camera)
     projected, depth = take("projected", (n, PROJECTED)), take("depth", (n,))
     extent_y, rect = take("extent_y", (n,)), take("rect", (n, 4), np.int32)
-    project_forward(
-        *splats, degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
-        depth_as_colour, antialiased, projected, depth, extent_y, rect,
-    )  # fmt: skip
-    drawn = None
-    if focus is not None:
-        drawn = _near(_touched(projected, extent_y, rect, focus, (camera.height, camera.width)), reach)
-    bins = sort_into_tiles(depth, rect, camera, take, drawn)
-    tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
-    tiles = deal(tiles if drawn is None else tiles[drawn.ravel()])
+
+    def project(rows: np.ndarray, drawn: np.ndarray) -> None:
+        project_forward(
+            rows, drawn, *splats, degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens,
+            seen.size, depth_as_colour, antialiased, projected, depth, extent_y, rect,
+        )  # fmt: skip
+
+    touched = drawn = np.ones((tiles_y, tiles_x), bool)
+    if focus is None:
+        project(np.arange(n), drawn)
+    else:
+        project(np.flatnonzero(focus), drawn)
+        touched = np.zeros_like(drawn)
+        mark_tiles(rect, np.flatnonzero(focus), touched)
+        drawn = _near(touched, reach)
+        project(np.flatnonzero(~focus), drawn)
+    bins = sort_into_tiles(depth, rect, camera, take)
+    tiles = deal(np.flatnonzero(drawn).astype(np.int32))
     image = take("image", (3, camera.height, camera.width))
     transmittance = take("transmittance", (camera.height, camera.width))
     last = take("last", (camera.height, camera.width), np.int32)
     pair_rows = take("pair_rows", (len(bins.pair_splat), 4), np.uint8)
     background = np.asarray(background, np.float32)
     blend_forward(
-        tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, background, pair_rows, image, transmittance, last
-    )
+        tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, background, pair_rows, image, transmittance,
+        last,
+    )  # fmt: skip
     return Rendering(
-        image, transmittance, bins.visible, projected, extent_y, rect, last, bins.first_pair, bins.pairs, bins.splat_pairs,
-        bins.start, bins.pair_splat, pair_rows, tiles, background, degree, depth_as_colour, antialiased,
+        image, transmittance, bins.visible, projected, rect, last, bins.first_pair, bins.pairs, bins.splat_pairs,
+        bins.start, bins.pair_splat, pair_rows, tiles, focus, touched, background, degree, depth_as_colour, antialiased,
     )  # fmt: skip
 
 
@@ -173,17 +185,13 @@ def sort_into_tiles(
     rect: np.ndarray,
     camera: Camera,
     take: Callable[..., np.ndarray],
-    drawn: np.ndarray | None = None,
 ) -> Bins:
     """Projected splats in tiles, front to back; arrays as from `project_forward`, take: a `Scratch`'s.
 
-    Splats of several projections may stand in the arrays one after the other. drawn (tiles_y, tiles_x) bool: leave out
-    the splats that reach none of these tiles.
+    Splats of several projections may stand in the arrays one after the other.
     """
     tiles_x, tiles_y = tile_grid(camera)
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
-    if drawn is not None:
-        visible = reaching(rect, visible, drawn)
     order = depth_order(depth, visible)
     first_pair, pairs = take("first_pair", depth.shape, np.int32), take("pairs", depth.shape, np.int32)
     counts = take("counts", (PARTS, tiles_x * tiles_y), np.int32)
@@ -203,24 +211,22 @@ def render_backward(
     v_image: np.ndarray,
     gradients: Parameters,
     v_transmittance: np.ndarray | None = None,
-    focus: np.ndarray | None = None,
     scratch: "Scratch | None" = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
-    v_image (3, H, W); v_transmittance (H, W), zero if None. focus (N,) bool: splats that need a gradient; None
-    means all. Overwrites those rows of `gradients` that belong to a visible, wanted splat and leaves
-    all others as they are.
+    v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients` that belong to a
+    visible splat, one in focus if the rendering has a focus, and leaves all others as they are.
     Returns the rows written (M,) int32, and screen (N,): for those rows, the length of the gradient with respect to
     the projected centre in units of half the image.
     """
     n, take = len(splats.xyz), (scratch or Scratch()).take
     tiles_x, _ = tile_grid(seen.camera)
     tiles, rows = rendering.tiles, rendering.visible
-    wanted = np.ones(n, bool) if focus is None else focus
-    if focus is not None:
-        tiles = tiles[touched_tiles(rendering, focus).ravel()[tiles]]
-        rows = rows[focus[rows]]
+    wanted = np.ones(n, bool)
+    if rendering.focus is not None:
+        wanted = rendering.focus
+        tiles, rows = tiles[rendering.touched.ravel()[tiles]], rows[wanted[rows]]
     pair_gradients = take("pair_gradients", (len(rendering.pair_splat), PROJECTED))
     screen = take("screen", (n,))
     if v_transmittance is None:
@@ -243,19 +249,6 @@ def complete(splats: Parameters) -> Parameters:
     if splats.strain_color is not None:
         return splats
     return splats._replace(strain_color=no_strain_color(len(splats.xyz)))
-
-
-def touched_tiles(rendering: Rendering, focus: np.ndarray) -> np.ndarray:
-    """(tiles_y, tiles_x) bool: the tiles that a splat of `focus` (N,) bool reaches."""
-    return _touched(rendering.projected, rendering.extent_y, rendering.rect, focus, rendering.last.shape)
-
-
-def _touched(
-    projected: np.ndarray, extent_y: np.ndarray, rect: np.ndarray, focus: np.ndarray, size: tuple[int, ...]
-) -> np.ndarray:
-    marked = np.zeros([-(-pixels // TILE) for pixels in size], bool)
-    mark_tiles(projected, extent_y, rect, focus, marked)
-    return marked
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:

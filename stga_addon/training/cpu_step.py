@@ -13,7 +13,6 @@ from ..raster.render import (
     camera_frames,
     render_backward,
     render_forward,
-    touched_tiles,
 )
 from . import adam
 from .frames import FrameStore
@@ -71,16 +70,12 @@ class CpuStep:
         """Fill the gradients of the rows that matter; returns those rows, their screen pull and the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
         rendering = self._render(self.state.arrays(), view, background, degree, focus)
-        if focus is None:
-            rectangles = whole_image(height, width)
-        else:
-            tiles = touched_tiles(rendering, focus)
-            rectangles = tile_rectangles(tiles, height, width)
+        rectangles = whole_image(height, width) if focus is None else tile_rectangles(rendering.touched, height, width)
         v_image = self._scratch.take("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
         rows, screen = render_backward(
             rendering, self.state.arrays(), self.state.face.numpy(), self._seen, v_image,
-            Parameters(*(g.numpy() for g in self.state.gradients)), focus=focus, scratch=self._scratch,
+            Parameters(*(g.numpy() for g in self.state.gradients)), scratch=self._scratch,
         )  # fmt: skip
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from ..raster.kernels.layout import TILE
 from ..raster.kernels.image_loss import REACH, image_loss
+from ..raster.kernels.layout import TILE
 
 __all__ = ["REACH", "image_gradient", "similarity", "tile_rectangles", "whole_image"]
 

@@ -13,7 +13,7 @@ from ..capture.camera import Camera
 from ..raster.kernels import CACHE
 from ..raster.kernels.image_loss import change_background
 from ..raster.kernels.rows import distance_limit, scale_limit
-from ..raster.render import Parameters, camera_frames, render_backward, render_forward, touched_tiles
+from ..raster.render import Parameters, camera_frames, render_backward, render_forward
 from ..task import same_packages
 from . import adam
 from .losses import image_gradient, whole_image
@@ -78,7 +78,6 @@ def _render() -> None:
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     seen, face = camera_frames(WORLD, camera), state.face.numpy()
     rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
-    touched_tiles(rendering, np.ones(2, bool))
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     render_backward(rendering, state.arrays(), face, seen, np.zeros_like(rendering.image), gradients)
 

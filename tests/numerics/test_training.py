@@ -113,7 +113,7 @@ def test_nothing_and_everything_selected() -> None:
     for focus in (None, np.ones(40, bool), np.zeros(40, bool)):
         rendering = render_forward(splats, face, seen, 1, focus=focus, reach=REACH)
         gradients = Parameters(*(np.full_like(a, 7) for a in splats if a is not None))
-        rows, _ = render_backward(rendering, splats, face, seen, v_image, gradients, focus=focus)
+        rows, _ = render_backward(rendering, splats, face, seen, v_image, gradients)
         results.append((rows, gradients))
     np.testing.assert_array_equal(results[0][0], results[1][0])
     for name in NAMES:

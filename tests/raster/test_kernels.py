@@ -201,9 +201,7 @@ def raw_gradients(scene: Scene, fill: float = 0.0, scratch: Scratch | None = Non
     rendering = render_forward(splats, face, seen, scene.degree, scratch=scratch, **options)
     v_image, v_alpha, _ = (v.float().numpy() for v in random_cotangents(scene.camera, 3))
     gradients = Parameters(*(np.full_like(a, fill) for a in splats if a is not None))
-    rows, screen = render_backward(
-        rendering, splats, face, seen, v_image, gradients, -v_alpha, options.get("focus"), scratch
-    )
+    rows, screen = render_backward(rendering, splats, face, seen, v_image, gradients, -v_alpha, scratch)
     return rendering, gradients, rows, screen
 
 

@@ -3,8 +3,6 @@
 import numpy as np
 
 from . import jit
-from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
-from .outline import outline, rows_within
 from .threads import parallel
 
 RADIX_BITS = 11
@@ -103,34 +101,9 @@ def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_p
 
 
 @jit
-def reaching(rect, visible, drawn):
-    """The splats of visible (M,) int32 that reach a tile of drawn (tiles_y, tiles_x) bool, in their order."""
-    kept = np.empty_like(visible)
-    count = 0
-    for n in range(len(visible)):
-        i = visible[n]
-        found = False
+def mark_tiles(rect, splats, marked):
+    """Set marked (tiles_y, tiles_x) bool where one of the splats (M,) reaches; rect (N, 4)."""
+    for i in splats:
         for y in range(rect[i, 1], rect[i, 3]):
             for x in range(rect[i, 0], rect[i, 2]):
-                found |= drawn[y, x]
-        kept[count] = i
-        count += found
-    return kept[:count]
-
-
-@jit
-def mark_tiles(projected, extent_y, rect, focus, marked):
-    """Set marked (tiles_y, tiles_x) bool where a splat of focus (N,) bool has a pair."""
-    for i in range(len(rect)):
-        if focus[i]:
-            top = rect[i, 1] * TILE
-            ellipse = outline(
-                projected[i, MEAN_X], projected[i, MEAN_Y] - np.float32(top), projected[i, PRECISION_X],
-                projected[i, SHEAR], projected[i, PRECISION_Y], extent_y[i],
-            )  # fmt: skip
-            rows = np.float32(rect[i, 3] * TILE - top)
-            for x in range(rect[i, 0], rect[i, 2]):
-                first, past = rows_within(ellipse, np.float32(x * TILE), np.float32(TILE), rows)
-                if first < past:
-                    for y in range(np.int64(first) // TILE, (np.int64(past) - 1) // TILE + 1):
-                        marked[rect[i, 1] + y, x] = True
+                marked[y, x] = True

@@ -108,7 +108,7 @@ def blend_forward(
     """Render the listed tiles.
 
     tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int64 into the pair
-    list; pair_splat (P,) int32 front to back in each tile; projected (N, 9) and extent_y (N,) as from `project_forward`.
+    list; pair_splat (P,) int32 front to back in each tile; projected (N, 9) and extent_y (N,) from `project_forward`.
     background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept
     because the backward needs its small values exactly), last (H, W) int32: one past the last contributing pair
     of the tile, counted from the tile's start, and pair_rows (P, 4) uint8: first and past-the-last row of the tile's

@@ -115,15 +115,33 @@ def _basis_gradient(degree, x, y, z, w):
     return gx, gy, gz
 
 
-@parallel(lambda xyz, *_: len(xyz))
+@parallel(lambda origin, *_: len(origin))
+@jit
+def compose_frames(begin, end, origin, rotation, scale, turn, shift, seen_origin, seen_matrix):
+    """Face frames as a camera sees them: seen_matrix = turn @ rotation · scale, seen_origin = turn @ origin + shift.
+
+    origin (F, 3), rotation (F, 3, 3), scale (F,), turn (3, 3) and shift (3,) float64, so that distance from the origin
+    costs no precision. Writes seen_origin (F, 3) and seen_matrix (F, 3, 3) float32.
+    """
+    for f in range(begin, end):
+        for r in range(3):
+            t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
+            seen_origin[f, r] = t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
+            for c in range(3):
+                along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
+                seen_matrix[f, r, c] = scale[f] * along
+
+
+@parallel(lambda rows, *_: len(rows))
 @jit
 def project_forward(
-    begin, end,
+    begin, end, rows, drawn,
     xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
     depth_as_colour, antialiased, projected, depth, extent_y, rect,
 ):  # fmt: skip
-    """Project N embedded splats, those in [begin, end).
+    """Project the listed ones of N embedded splats.
 
+    rows (M,): the splats to project. drawn (tiles_y, tiles_x) bool: one that reaches none of these tiles is not seen.
     xyz, rotation (wxyz), log_scale, opacity (logit), sh (N, K, 3), strain_color (N, S, 3), face: as in `Splats`;
     `degree` ≤ the stored.
     origin (F, 3), matrix (F, 3, 3): camera-space frames, scale included: camera point = matrix @ xyz + origin.
@@ -141,7 +159,8 @@ def project_forward(
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, width, height)
     basis = np.empty(16, np.float32)
-    for i in range(begin, end):
+    for n in range(begin, end):
+        i = rows[n]
         rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = 0
         f = face[i]
         lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
@@ -191,7 +210,7 @@ def project_forward(
         x1 = np.int32(min(limit_x, max(ZERO, np.ceil((mean_x + ex) / size_))))
         y0 = np.int32(min(limit_y, max(ZERO, np.floor((mean_y - ey) / size_))))
         y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
-        if x1 <= x0 or y1 <= y0:
+        if not _any_drawn(drawn, x0, y0, x1, y1):
             continue
         rd = ONE / math.sqrt(x * x + y * y + z * z)
         dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
@@ -224,6 +243,15 @@ def project_forward(
 
 
 @part_jit
+def _any_drawn(drawn, x0, y0, x1, y1):
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            if drawn[y, x]:
+                return True
+    return False
+
+
+@part_jit
 def _tan_limits(fx, fy, cx, cy, width, height):
     """Bounds of x/z and y/z in the projection's Jacobian: the image plus 0.3 of its half field of view."""
     half_x, half_y = HALF * np.float32(width) / fx, HALF * np.float32(height) / fy
@@ -252,7 +280,7 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
 
 @part_jit
 def _sum_pairs(splats, first_pair, pairs, splat_pairs, grads, sums):
-    """Sums (BLOCK, 9) of the gradients of each splat's pairs, in a loop so short that memory is asked for many at once."""
+    """Sum the gradients of each splat's pairs to sums (BLOCK, 9): a short loop asks memory for many of them at once."""
     for n in range(len(splats)):
         i = splats[n]
         g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
@@ -275,9 +303,9 @@ def project_backward(
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of v_*; the counterpart of `project_forward`.
 
-    visible (M,) int32: the splats to differentiate. first_pair, pairs (N,) int32: where in splat_pairs (P,) int32 it
-    stands, and for how many pairs, which rows of grads (P, 9) are theirs. screen (N,): length of the gradient with respect to the projected centre in units of half the
-    image (what density control asks for), written for each listed splat.
+    visible (M,) int32: the splats to differentiate. grads (P, 9): gradients of all pairs; those of splat i are its rows
+    splat_pairs[first_pair[i] : first_pair[i] + pairs[i]]. screen (N,): length of the gradient with respect to the
+    projected centre in units of half the image (what density control asks for), written for each listed splat.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     strains = min(strain.shape[1], strain_color.shape[1])

@@ -12,18 +12,19 @@ what they are given, every lane counts as the leading one, and rows are added to
 import warp as wp
 
 from ..kernels import blend as cpu
+from ..kernels import layout
 from ..kernels.layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
 from .bins import NO
 from .project import Projected
 
 wp.set_module_options({"enable_backward": False})
 
-TILE, PIXELS = wp.constant(cpu.TILE), wp.constant(cpu.PIXELS)
+TILE, PIXELS = wp.constant(layout.TILE), wp.constant(layout.PIXELS)
 ALPHA_MAX, ALPHA_MIN, STOP = (wp.constant(float(c)) for c in (cpu.ALPHA_MAX, cpu.ALPHA_MIN, cpu.STOP))
 LANES = wp.constant(32)
 PARTS = wp.constant(2)
 """Warps a tile has in the backward, and rows a pair: more warps fill a GPU better, fewer add up less."""
-SHARE = cpu.PIXELS // (32 * 2)
+SHARE = layout.PIXELS // (32 * 2)
 
 Share = wp.types.vector(length=SHARE, dtype=wp.float32)
 """A value of each of a lane's pixels."""
@@ -208,7 +209,7 @@ def blend_backward(
         if _largest_of_warp(counts) == 0:
             continue
         total = Projected(g0, gx, gy, gxx, gxy, gyy, g_red, g_green, g_blue)
-        for c in range(wp.static(cpu.PROJECTED)):
+        for c in range(wp.static(layout.PROJECTED)):
             total[c] = _over_warp(total[c])
         if _leads():
             by_x = row[PRECISION_X] * total[1]
