@@ -62,8 +62,10 @@ def ellipsoid(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray,
 
 
 def _splats(count: int, size: np.ndarray, rng: np.random.Generator) -> Splats:
-    """Splats on random triangles; size (F,): the smallest standard deviation on each, metres."""
-    face = rng.integers(0, len(size), count).astype(np.int32)
+    """Splats on random triangles, in the triangles' order, as a lattice has them; size (F,): the smallest standard
+    deviation on each, metres.
+    """
+    face = np.sort(rng.integers(0, len(size), count)).astype(np.int32)
     sigma = size[face][:, None]
     return Splats(
         xyz=(rng.normal(size=(count, 3)) * 0.8 * sigma).astype(np.float32),

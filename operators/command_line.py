@@ -65,16 +65,16 @@ def _open_head() -> "OpenHead | None":
 
 def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
     """Let the training runtime carry out the command; returns its exit code. Raises StgaError where there is none."""
-    from ..stga_addon.handover import write_head
+    from ..stga_addon.handover import FOLDER, write_head
 
     python = training_python(bpy.context)
     with TemporaryDirectory() as folder:
-        module = ["stga_addon"]
+        environment = task.environment(os.environ)
         if head is not None:
             write_head(Path(folder), head, played)
-            module = ["stga_addon.handover", folder]
+            environment[FOLDER] = folder
         try:
-            return subprocess.call([python, "-m", *module, *arguments], env=task.environment(os.environ))
+            return subprocess.call([python, "-m", "stga_addon", *arguments], env=environment)
         except OSError as error:
             raise StgaError(f"{python}: cannot be started as a Python interpreter ({error.strerror})") from error
 

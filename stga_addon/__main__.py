@@ -1,11 +1,18 @@
-"""`python -m stga_addon`, which any Python may be asked to run: it says so where it cannot."""
+"""`python -m stga_addon`, which any Python may be asked to run: it says so where it cannot.
 
+With STGA_HEAD set, the command is about the head that `handover` wrote into that folder.
+"""
+
+import os
 import sys
+from pathlib import Path
 
 try:
     from .cli import main
+    from .handover import FOLDER, read_head
 except ModuleNotFoundError as error:
     print(f"stga: {sys.executable} lacks the package '{error.name}'", file=sys.stderr)
     raise SystemExit(2) from None
 
-raise SystemExit(main())
+folder = os.environ.get(FOLDER)
+raise SystemExit(main(head=read_head(Path(folder)) if folder else None))

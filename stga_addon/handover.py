@@ -1,9 +1,5 @@
-"""The head of an open .blend file as a folder, for a command about it that runs in another Python than Blender's.
+"""The head of an open .blend file as a folder, for a command about it that runs in another Python than Blender's."""
 
-`python -m stga_addon.handover FOLDER ARGUMENTS…` is `stga ARGUMENTS…` about the head that FOLDER holds.
-"""
-
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +7,11 @@ import numpy as np
 
 from .capture.model import Capture
 from .capture.open import open_capture
-from .cli import OpenHead, main
+from .cli import OpenHead
 from .files import read_json, read_npz, write_json, write_npz
 
+FOLDER = "STGA_HEAD"
+"""The environment variable that names the folder."""
 HEAD, SELECTION, PLAYED = "head.json", "selection.npz", "played.npz"
 
 
@@ -50,7 +48,3 @@ def read_head(folder: Path) -> OpenHead:
 
 def _by_timestep(path: Path) -> dict[int, np.ndarray]:
     return {int(name): array for name, array in read_npz(path).items()}
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[2:], read_head(Path(sys.argv[1]))))
