@@ -44,7 +44,7 @@ def compile_kernels() -> None:
 
 
 def _second_process() -> "subprocess.Popen[bytes] | None":
-    """A process that compiles for `_second_half`; None where the cache has that, or another process could not fill it."""
+    """A process that runs `_second_half`; None where the cache has that, or another process could not fill it."""
     cached = any(Path(CACHE).glob("*/image_loss.image_loss-*.nbi"))
     # As part of an extension the package has another name and another cache.
     if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
