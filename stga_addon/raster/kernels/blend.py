@@ -76,8 +76,11 @@ def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
 
 
 @part_jit
-def _find_rows(count, batch):
-    """Which rows of each half of the tile a batch's splats reach: whole vectors, so pairs of rows."""
+def _find_rows(count, batch, low, high, low_right, high_right):
+    """Which rows of each half of the tile a batch's splats reach: whole vectors, so pairs of rows.
+
+    low, high: first and past-the-last row of the left half that may be drawn on; low_right, high_right: of the right.
+    """
     two, rows, width = np.float32(2.0), np.float32(TILE), np.float32(HALF)
     for q in range(np.uint64(count)):
         ellipse = outline(
@@ -85,9 +88,24 @@ def _find_rows(count, batch):
             batch[AT_PRECISION_Y + q], batch[AT_EXTENT_Y + q],
         )  # fmt: skip
         first, past = rows_within(ellipse, np.float32(0.0), width, rows)
-        batch[AT_FIRST + q], batch[AT_PAST + q] = two * np.floor(first / two), two * np.ceil(past / two)
+        batch[AT_FIRST + q] = max(low, two * np.floor(first / two))
+        batch[AT_PAST + q] = min(high, two * np.ceil(past / two))
         first, past = rows_within(ellipse, width, width, rows)
-        batch[AT_FIRST_RIGHT + q], batch[AT_PAST_RIGHT + q] = two * np.floor(first / two), two * np.ceil(past / two)
+        batch[AT_FIRST_RIGHT + q] = max(low_right, two * np.floor(first / two))
+        batch[AT_PAST_RIGHT + q] = min(high_right, two * np.ceil(past / two))
+
+
+@part_jit
+def _rows_alive(s, half):
+    """First and past-the-last row of a half of the tile that is not behind something opaque, in steps of a quarter."""
+    quarter, upper, lower = np.uint64(HALF_PIXELS // 2), np.float32(0.0), np.float32(0.0)
+    begin = ALIVE + np.uint64(half * HALF_PIXELS)
+    for p in range(quarter):
+        upper += s[begin + p]
+        lower += s[begin + quarter + p]
+    middle = np.float32(TILE // 2)
+    first = np.float32(0.0) if upper > np.float32(0.0) else middle
+    return first, np.float32(TILE) if lower > np.float32(0.0) else middle
 
 
 @part_jit
@@ -125,16 +143,15 @@ def blend_forward(
             s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
         begin, end = start[tile], start[tile + 1]
         for batch_begin in range(begin, end, BATCH):
-            alive = np.float32(0.0)
-            for p in range(np.uint64(PIXELS)):
-                alive += s[ALIVE + p]
-            if alive == np.float32(0.0):
+            low, high = _rows_alive(s, 0)
+            low_right, high_right = _rows_alive(s, 1)
+            if low == high and low_right == high_right:
                 break
             count = min(BATCH, end - batch_begin)
             _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
             for q in range(np.uint64(count)):
                 batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
-            _find_rows(count, batch)
+            _find_rows(count, batch, low, high, low_right, high_right)
             for q in range(np.uint64(count)):
                 j = np.uint64(batch_begin) + q
                 pair_rows[j, 0], pair_rows[j, 1] = batch[AT_FIRST + q], batch[AT_PAST + q]
@@ -148,6 +165,8 @@ def blend_forward(
                 for half in range(2):
                     first, past = half * HALF_PIXELS, half * HALF_PIXELS
                     first, past = first + pair_rows[j, 2 * half] * HALF, past + pair_rows[j, 2 * half + 1] * HALF
+                    if past <= first:
+                        continue
                     for p in range(np.uint64(first), np.uint64(past)):
                         dy = s[Y + p] - mean_y
                         dx = s[X + p] - mean_x - shear * dy
