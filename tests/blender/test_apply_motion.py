@@ -1,6 +1,7 @@
 """Apply Motion as a script calls it, and what leaves Blender again."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -120,6 +121,17 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     bpy.ops.stga.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
     for timestep in own.timesteps:
         np.testing.assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+
+
+def test_tooltips_say_whose_motion(extension):
+    """Catches two buttons that do different things and explain themselves alike, or an empty tooltip."""
+    operator = extension.operators.apply_motion.ApplyMotion
+    refined_tracking = operator.description(bpy.context, SimpleNamespace(own_offsets=True))
+    assert "training refined" in refined_tracking
+    assert operator.description(bpy.context, SimpleNamespace(own_offsets=False)) == ""  # Blender shows the operator's own
+    own = bpy.ops.stga.apply_motion.get_rna_type().description
+    assert "another person's" in own
+    assert "refined" not in own
 
 
 def test_undo(scene):
