@@ -128,7 +128,8 @@ def test_tooltips_say_whose_motion(extension):
     operator = extension.operators.apply_motion.ApplyMotion
     refined_tracking = operator.description(bpy.context, SimpleNamespace(own_offsets=True))
     assert "training refined" in refined_tracking
-    assert operator.description(bpy.context, SimpleNamespace(own_offsets=False)) == ""  # Blender shows the operator's own
+    # Where this is empty, Blender shows the operator's own.
+    assert operator.description(bpy.context, SimpleNamespace(own_offsets=False)) == ""
     own = bpy.ops.stga.apply_motion.get_rna_type().description
     assert "another person's" in own
     assert "refined" not in own
