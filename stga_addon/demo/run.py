@@ -91,13 +91,14 @@ def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save, reopen, and return how far (metres) a splat is from where numpy puts it, at worst."""
-    from ..scene.file import current_scene, go_to_frame, object_named, open_file, save_file
+    from ..scene.file import current_scene, go_to_frame, look_through_camera, object_named, open_file, save_file
     from ..scene.splats import evaluated_splats, hide, show_avatar
 
     shown = show_avatar(avatar, head)
     hide(head, current_scene())
     name = shown.name
     go_to_frame(capture.timesteps[0])
+    look_through_camera()
     save_file(path)
     open_file(path)
     worst = 0.0

@@ -44,3 +44,6 @@ def test_the_blend_file_opens_with_head_groups_and_splats(tmp_path):
     assert heads[0].hide_get(), "the head covers its splats"
     assert [group for group in heads[0].vertex_groups if group.name.startswith("stga_")]
     assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == SMALL.cameras
+    views = [area.spaces.active for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"]
+    assert views
+    assert {view.region_3d.view_perspective for view in views} == {"CAMERA"}, "the head is a dot on Blender's grid"
