@@ -9,10 +9,16 @@ from pathlib import Path
 
 try:
     from .cli import main
+    from .errors import StgaError
     from .handover import FOLDER, read_head
 except ModuleNotFoundError as error:
     print(f"stga: {sys.executable} lacks the package '{error.name}'", file=sys.stderr)
     raise SystemExit(2) from None
 
 folder = os.environ.get(FOLDER)
-raise SystemExit(main(head=read_head(Path(folder)) if folder else None))
+try:
+    head = read_head(Path(folder)) if folder else None
+except StgaError as error:
+    print(f"stga: {error}", file=sys.stderr)
+    raise SystemExit(2) from None
+raise SystemExit(main(head=head))

@@ -1,5 +1,6 @@
 """The training job: what is written down, what is refused, and that a worker trains what the same process would."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from stga_addon import job, task
 from stga_addon.cli import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
+from stga_addon.handover import FOLDER
 from stga_addon.job import Job, describe, folder_of, read_job, work, write_job
 from stga_addon.task import State
 from stga_addon.training.settings import make_settings
@@ -205,6 +207,16 @@ def test_an_interpreter_without_anything_is_named(tmp_path, capture):
     assert process.wait(60) == 2
     seen = task.look(folder_of(tmp_path / "run"), process)
     assert seen.status.error == f"the worker ended with exit status 2: stga: {python} lacks the package 'numpy'"
+
+
+def test_a_head_that_is_not_there_is_a_sentence(tmp_path):
+    """Catches a traceback where a command is to be about a head whose folder has gone."""
+    environment = {**os.environ, FOLDER: str(tmp_path / "gone")}
+    command = [sys.executable, "-m", "stga_addon", "info"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"stga: {tmp_path / 'gone' / 'head.json'}: cannot be read")
+    assert done.stderr.count("\n") == 1
 
 
 def _made(folder: Path) -> Path:
