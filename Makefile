@@ -26,7 +26,7 @@ fuzz: .venv/ready
 	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} $(BIN)/python -m pytest tests/fuzz tests/numerics/test_generated.py
 
 extension: .venv/ready
-	$(BIN)/python -m stga_addon.package --out dist
+	$(BIN)/python -m stga_addon.development.package --out dist
 
 .venv/ready: pyproject.toml
 	$(PYTHON) -m venv .venv

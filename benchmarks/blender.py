@@ -19,13 +19,13 @@ import trimesh
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.model import Capture
-from stga_addon.demo.head import synthetic_flame
+from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh
+from stga_addon.scene.display.splats import show_avatar
 from stga_addon.scene.file import go_to_frame, new_file
-from stga_addon.scene.groups import read_selection, write_selection
-from stga_addon.scene.head import import_head
-from stga_addon.scene.splats import show_avatar
+from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.vertex_groups import read_selection, write_selection
 
 
 def moving_ball(folder: Path, timesteps: int, subdivisions: int) -> Capture:

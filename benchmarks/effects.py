@@ -29,16 +29,16 @@ from PIL import Image
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.development.benchmark.statistics import Spread, spread_of
+from stga_addon.effects.decide import decide_effects
 from stga_addon.effects.facts import Facts
-from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import EFFECTS
-from stga_addon.report.results import Spread, spread_of
-from stga_addon.training.evaluations import read_metrics
-from stga_addon.training.folder import Run
-from stga_addon.training.metrics import measure
-from stga_addon.training.run import train
+from stga_addon.training.evaluate.metrics import measure
+from stga_addon.training.optimize.tracking import refined
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
-from stga_addon.training.tracking import refined
 
 LEFT_TO_AUTO = ("selection",)
 DIFFERING = ("full", "static", "one-camera")
@@ -115,7 +115,7 @@ def trained(
     capture: Capture, flame: Path | None, iterations: int, seed: int, choices: Choices
 ) -> tuple[dict[str, float], float, str]:
     """PSNR by split, milliseconds of an iteration, and the effects that were on."""
-    settings, plan = plan_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
+    settings, plan = decide_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
@@ -217,7 +217,7 @@ def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
     row("capture", "effect", "decided", "on against off, val", "test", "ms")
     row(*["---"] * 6)
     for name, capture in opened.items():
-        _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
+        _, plan = decide_effects(capture, make_settings(iterations=options.iterations, effects={}))
         decided = {decision.effect: f"{'on' if decision.on else 'off'}: {decision.reason}" for decision in plan}
         for effect in options.switch:
             variants = {choice: {effect: choice} for choice in ("on", "off")}

@@ -25,19 +25,19 @@ from stga_addon.avatar.embedding import face_areas, face_frames
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.demo.head import synthetic_head
-from stga_addon.raster.kernels.bins import PARTS, count_pairs, depth_order, fill_pairs, lay_out
-from stga_addon.raster.kernels.blend import blend_backward, blend_forward
-from stga_addon.raster.kernels.project import project_backward, project_forward
-from stga_addon.raster.kernels.threads import threads
-from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_forward
-from stga_addon.training import adam
-from stga_addon.training.device import choose_device, make_step
-from stga_addon.training.frames import FrameStore
-from stga_addon.training.losses import image_gradient, whole_image
+from stga_addon.development.demo.head import synthetic_head
+from stga_addon.raster.cpu.blend import blend_backward, blend_forward
+from stga_addon.raster.cpu.project import project_backward, project_forward
+from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, camera_frames, render_forward
+from stga_addon.raster.cpu.threads import threads
+from stga_addon.raster.cpu.tiles import PARTS, count_pairs, depth_order, fill_pairs, lay_out
+from stga_addon.training.optimize import adam
+from stga_addon.training.optimize.backend import Backend, Batch
+from stga_addon.training.optimize.device import choose_device, make_backend
+from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.losses import image_gradient, whole_image
+from stga_addon.training.optimize.state import new_state
 from stga_addon.training.settings import make_settings
-from stga_addon.training.state import new_state
-from stga_addon.training.step import Batch, Step
 
 RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
 
@@ -74,7 +74,7 @@ def _splats(count: int, size: np.ndarray, rng: np.random.Generator) -> Splats:
         opacity=(rng.normal(size=count) + 1).astype(np.float32),
         sh=(rng.normal(size=(count, 16, 3)) * 0.1).astype(np.float32),
         face=face,
-        loose=np.zeros(count, bool),
+        unbound=np.zeros(count, bool),
     )
 
 
@@ -107,7 +107,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     n, camera = len(splats), seen.camera
     pixels, background = camera.width * camera.height, np.ones(3, np.float32)
     tiles_x, tiles_y = -(-camera.width // 16), -(-camera.height // 16)
-    state, scratch = new_state(splats), Scratch()
+    state, scratch = new_state(splats), BufferPool()
     arrays, face = state.arrays(), state.face.numpy()
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     r = render_forward(arrays, face, seen, 3, background, scratch=scratch)
@@ -169,11 +169,11 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
 
 def device_step(
     device: str, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
-) -> tuple[Step, Batch]:
+) -> tuple[Backend, Batch]:
     """A whole iteration on a device, from the posed mesh's frames on, and the global batch to give it."""
     lengths = np.sqrt(2 * face_areas(mesh, faces)).astype(np.float32)
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
-    step = make_step(device, make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats))
+    step = make_backend(device, make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats))
     view = View(0, 0, camera, "benchmark", Path())
     return step, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
 
@@ -185,7 +185,7 @@ def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: floa
     return away <= np.quantile(away[splats.face], share)
 
 
-def queued_ms(step: Step, batch: Batch, repeats: int) -> float:
+def queued_ms(step: Backend, batch: Batch, repeats: int) -> float:
     """Mean wall time in milliseconds of iterations that follow each other without waiting, after five of them."""
     import warp
 
@@ -198,7 +198,7 @@ def queued_ms(step: Step, batch: Batch, repeats: int) -> float:
     return 1e3 * (perf_counter() - begin) / repeats
 
 
-def kernel_times(step: Step, batch: Batch, repeats: int) -> dict[str, float]:
+def kernel_times(step: Backend, batch: Batch, repeats: int) -> dict[str, float]:
     """kernel, copy or fill -> mean milliseconds of an iteration, longest first."""
     import warp
 

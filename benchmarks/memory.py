@@ -24,13 +24,13 @@ RUN = """
 import sys
 from pathlib import Path
 from stga_addon.capture.open import open_capture
-from stga_addon.training.folder import Run
-from stga_addon.training.metrics import peak_memory_mb
-from stga_addon.training.run import train
+from stga_addon.training.run.folder import Run
+from stga_addon.training.evaluate.metrics import peak_memory_mb
+from stga_addon.training.run.loop import train
 from stga_addon.training.settings import make_settings
 root, iterations = Path(sys.argv[1]), int(sys.argv[2])
 capture = open_capture(root)
-settings = make_settings(iterations=iterations, lattice=1, seeds=False)
+settings = make_settings(iterations=iterations, lattice=1, hull_points=False)
 train(capture, root / "run", Run(root, None, "vhap", settings))
 print(peak_memory_mb())
 """

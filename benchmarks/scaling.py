@@ -17,8 +17,8 @@ import numpy as np
 from iteration import demo_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
-from stga_addon.raster.kernels.threads import set_threads, threads
-from stga_addon.raster.render import Parameters, camera_frames, render_forward
+from stga_addon.raster.cpu.rasterize import Parameters, camera_frames, render_forward
+from stga_addon.raster.cpu.threads import set_threads, threads
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -20,16 +20,16 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.flame_capture import with_sequence
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.effects.decide import decide_effects
 from stga_addon.effects.facts import Facts
-from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import tracking
 from stga_addon.flame.forward import FlameFrame
-from stga_addon.training.evaluations import read_metrics
-from stga_addon.training.folder import Run
-from stga_addon.training.metrics import measure
-from stga_addon.training.run import train
+from stga_addon.training.evaluate.metrics import measure
+from stga_addon.training.optimize.tracking import JOINTS, PLACE, numbers_of, refined, with_numbers
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
-from stga_addon.training.tracking import JOINTS, PLACE, numbers_of, refined, with_numbers
 
 COEFFICIENT, RADIAN, METRE = 0.15, 0.0175, 0.002
 
@@ -60,7 +60,7 @@ def millimetres(capture: Capture, true: Capture) -> float:
 
 def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tuple[Capture, Mapping[str, float], float]:
     """The capture as it was refined, the PSNR by split, and the seconds of an iteration."""
-    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
+    settings, plan = decide_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         shown, last = refined(capture, Path(folder)), read_metrics(Path(folder))[-1]

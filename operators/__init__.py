@@ -4,17 +4,17 @@ from typing import Any
 
 import bpy
 
-from . import ids, plan, watch
+from . import analyze, ids, monitor
+from .analyze import PlanEffects
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
+from .environment import CancelRuntime, MakeRuntime, TestRuntime
 from .export import Export
+from .failure_report import CopyReport
 from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
-from .plan import PlanEffects
-from .report import CopyReport
-from .runtime import CancelRuntime, MakeRuntime, TestRuntime
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
 from .train import CancelTraining, DismissTraining, Train
@@ -59,12 +59,12 @@ def register() -> None:
     register_classes(CLASSES)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
-    watch.register()
+    monitor.register()
 
 
 def unregister() -> None:
-    watch.unregister()
-    plan.stop()
+    monitor.unregister()
+    analyze.stop()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     unregister_classes(CLASSES)

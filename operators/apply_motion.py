@@ -11,7 +11,7 @@ from ..stga_addon.flame.motion import PARTS, retimed, strengthened
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.motion import apply_motion, performed_motion
+from ..stga_addon.scene.rig.motion import apply_motion, performed_motion
 from . import ids
 from .common import capture_of, file_path, flame_model_path, flame_of, head_of, is_head, needs_rig, reporting
 

@@ -11,29 +11,32 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..stga_addon import task
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
-from ..stga_addon.runtime import missing_here
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import evaluated_vertices
-from ..stga_addon.scene.groups import painted_selection
-from ..stga_addon.scene.motion import performed_motion, played
+from ..stga_addon.scene.rig.motion import performed_motion, played
+from ..stga_addon.scene.vertex_groups import painted_selection
+from ..stga_addon.worker import process
+from ..stga_addon.worker.environment import missing_here
 from . import ids
-from .common import file_path, is_head, settings
-from .runtime import training_python
+from .common import file_path, is_head, scene_settings
+from .environment import training_python
 
 IN_BLENDER = ("select", "export", "demo")
 """Commands that need none of the packages which Blender's Python may lack, or need Blender itself."""
 
 if TYPE_CHECKING:
-    from ..stga_addon.cli import OpenHead
+    from ..stga_addon.jobs.delegate import OpenHead
 
 _commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from ..stga_addon.cli import main, parser  # only here: enabling the extension loads nothing that a command needs
+    from ..stga_addon.cli.parser import (  # only here: enabling the extension loads nothing that a command needs
+        main,
+        parser,
+    )
 
     try:
         head = _open_head()
@@ -47,12 +50,12 @@ def _run(arguments: list[str]) -> int:
 
 
 def _open_head() -> "OpenHead | None":
-    from ..stga_addon.cli import OpenHead
+    from ..stga_addon.jobs.delegate import OpenHead
 
-    head = settings(bpy.context).head
+    head = scene_settings(bpy.context).head
     if not is_head(head):
         return None
-    model, avatar = head.get(tags.FLAME_MODEL), settings(bpy.context).avatar
+    model, avatar = head.get(tags.FLAME_MODEL), scene_settings(bpy.context).avatar
     return OpenHead(
         capture=Path(head[tags.CAPTURE]),
         flame=Path(model) if model else None,
@@ -65,11 +68,11 @@ def _open_head() -> "OpenHead | None":
 
 def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
     """Let the training runtime carry out the command; returns its exit code. Raises StgaError where there is none."""
-    from ..stga_addon.handover import FOLDER, write_head
+    from ..stga_addon.jobs.delegate import FOLDER, write_head
 
     python = training_python(bpy.context)
     with TemporaryDirectory() as folder:
-        environment = task.environment(os.environ)
+        environment = process.environment(os.environ)
         if head is not None:
             write_head(Path(folder), head, played)
             environment[FOLDER] = folder

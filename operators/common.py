@@ -12,7 +12,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.rig import rig_of
+from ..stga_addon.scene.rig.flame_rig import rig_of
 from . import ids
 
 
@@ -29,8 +29,8 @@ def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], s
     return guarded
 
 
-def settings(context: Any) -> Any:
-    """The scene's property group (`ui.properties.Settings`)."""
+def scene_settings(context: Any) -> Any:
+    """The scene's property group (`ui.properties.SceneSettings`)."""
     return getattr(context.scene, ids.SETTINGS)
 
 
@@ -47,7 +47,7 @@ def package() -> str:
 
 def head_of(context: Any) -> Any:
     """The head the steps work on. Raises StgaError where the scene has none."""
-    head = settings(context).head
+    head = scene_settings(context).head
     if not is_head(head):
         raise StgaError("no head in the scene: import a capture first")
     return head
@@ -60,7 +60,7 @@ def is_head(thing: Any) -> bool:
 
 def needs_head(operator: Any, context: Any) -> bool:
     """Poll: whether a capture was imported; says what to do where not."""
-    if is_head(settings(context).head):
+    if is_head(scene_settings(context).head):
         return True
     operator.poll_message_set("Import a capture first")
     return False
@@ -70,7 +70,7 @@ def needs_own_head(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head that can be changed here; says what to do where not."""
     if not needs_head(operator, context):
         return False
-    head = settings(context).head
+    head = scene_settings(context).head
     if head.library is None and head.data.library is None:
         return True
     operator.poll_message_set("The head is linked from another file: open that file, or make the head local")
@@ -82,7 +82,7 @@ def needs_rig(operator: Any, context: Any) -> bool:
     if not needs_own_head(operator, context):
         return False
     try:
-        rig_of(settings(context).head)
+        rig_of(scene_settings(context).head)
     except StgaError as error:
         operator.poll_message_set(str(error))
         return False

@@ -9,10 +9,10 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
 from ..stga_addon.avatar.ply import write_ply
 from ..stga_addon.scene.compat import PATH_OPTIONS, evaluated_vertices
-from ..stga_addon.scene.motion import performed_motion, played
-from ..stga_addon.scene.splats import check_head
+from ..stga_addon.scene.display.splats import check_head
+from ..stga_addon.scene.rig.motion import performed_motion, played
 from . import ids
-from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, settings
+from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
 
 
 class Export(bpy.types.Operator):
@@ -57,7 +57,7 @@ class Export(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
         path = file_path(self.filepath, "export")
-        source = file_path(self.avatar or settings(context).avatar, "avatar")
+        source = file_path(self.avatar or scene_settings(context).avatar, "avatar")
         avatar = read_avatar(source)
         check_head(avatar, head)
         if self.format == "gaussian-avatars":

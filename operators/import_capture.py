@@ -10,10 +10,10 @@ from ..stga_addon.capture.open import open_capture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import configure_scene, import_cameras
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.head import import_head
 from ..stga_addon.scene.hierarchy import capture_root, leave_edit_mode
+from ..stga_addon.scene.rig.head import import_head
 from . import ids
-from .common import file_path, flame_model_path, flame_property, reporting, settings
+from .common import file_path, flame_model_path, flame_property, reporting, scene_settings
 
 
 class ImportCapture(bpy.types.Operator):
@@ -86,7 +86,7 @@ def bring_in(
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(model or "")
     head[tags.PRINCIPAL_POINT] = principal_point
-    settings(context).head = head
+    scene_settings(context).head = head
     _show_first_frame(context.scene, capture)
     _select_only(context, head)
     _frame_in_viewports(context, head)

@@ -7,9 +7,9 @@ import bpy
 
 from ..stga_addon.avatar.ply import read_ply
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.splats import show_world_splats
+from ..stga_addon.scene.display.splats import show_world_splats
 from . import ids
-from .common import file_path, reporting, settings
+from .common import file_path, reporting, scene_settings
 
 # Rotation about x in degrees that turns the file's up axis to Blender's.
 _TURN = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
@@ -46,6 +46,6 @@ class ImportPly(bpy.types.Operator):
         splats = read_ply(path)
         shown = show_world_splats(splats, path.stem)
         shown.rotation_euler = (radians(_TURN[self.up]), 0.0, 0.0)
-        settings(context).splats = shown
+        scene_settings(context).splats = shown
         self.report({"INFO"}, f"{len(splats)} splats")
         return {"FINISHED"}

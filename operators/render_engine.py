@@ -2,8 +2,8 @@
 
 import bpy
 
-from ..stga_addon.scene import engine
-from .runtime import training_python
+from ..stga_addon.scene.render import engine
+from .environment import training_python
 
 
 def register() -> None:

@@ -9,12 +9,12 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.groups import painted_regions, read_selection, splats_per_face, write_selection
-from ..stga_addon.scene.heat import hide_heat, is_heat_shown, show_heat
+from ..stga_addon.scene.display.heat_map import hide_heat, is_heat_shown, show_heat
+from ..stga_addon.scene.vertex_groups import painted_regions, read_selection, splats_per_face, write_selection
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
-from ..stga_addon.training.settings import Settings
+from ..stga_addon.training.settings import TrainingSettings
 from . import ids
-from .common import capture_of, head_of, needs_head, needs_own_head, reporting, settings
+from .common import capture_of, head_of, needs_head, needs_own_head, reporting, scene_settings
 
 
 class Select(bpy.types.Operator):
@@ -127,7 +127,7 @@ class HeatMap(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        head, splats = head_of(context), settings(context).splats
+        head, splats = head_of(context), scene_settings(context).splats
         if self.show:
             share = _shares(head)
             if not share.any():
@@ -175,9 +175,9 @@ def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
 
 def _count(context: Any, head: Any) -> None:
     """Fill the panel's table."""
-    chosen, splats = settings(context), settings(context).splats
+    chosen, splats = scene_settings(context), scene_settings(context).splats
     per_face = splats_per_face(splats, head)
-    every = (Settings.lattice + 1) * (Settings.lattice + 2) // 2  # at the start of a training
+    every = (TrainingSettings.lattice + 1) * (TrainingSettings.lattice + 2) // 2  # at the start of a training
     chosen.selected_frames.clear()
     for timestep, selected in read_selection(head).items():
         row = chosen.selected_frames.add()

@@ -6,10 +6,10 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.materials import TRANSPARENT_BOUNCES, view_transform_hint
-from ..stga_addon.scene.splats import Prepared, hide, show_avatar
+from ..stga_addon.scene.display.materials import TRANSPARENT_BOUNCES, view_transform_hint
+from ..stga_addon.scene.display.splats import Prepared, hide, show_avatar
 from . import ids
-from .common import file_path, head_of, needs_head, reporting, settings
+from .common import file_path, head_of, needs_head, reporting, scene_settings
 
 
 class ShowAvatar(bpy.types.Operator):
@@ -44,7 +44,7 @@ class ShowAvatar(bpy.types.Operator):
         path, head = file_path(self.filepath, "avatar"), head_of(context)
         avatar = read_avatar(path)
         show(context.scene, avatar, head, f"{head.name} {path.stem}", self.hide_head)
-        settings(context).avatar = self.filepath
+        scene_settings(context).avatar = self.filepath
         if self.hide_head and head.library is not None:
             self.report({"WARNING"}, f"{head.name}: is linked, and covers the splats in renders; hide it in its file")
         hint = view_transform_hint(context.scene)

@@ -7,18 +7,18 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon import task
 from ..stga_addon.errors import StgaError
-from ..stga_addon.job import Job, arguments, folder_of, work, write_job
-from ..stga_addon.runtime import missing_here
+from ..stga_addon.jobs.training_job import TrainingJob, arguments, folder_of, work, write_job
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.groups import painted_selection
-from ..stga_addon.training.plan import parse_choices
+from ..stga_addon.scene.vertex_groups import painted_selection
+from ..stga_addon.training.effect_plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
-from . import ids, watch
-from .common import file_path, head_of, needs_head, reporting, settings
-from .runtime import training_python
+from ..stga_addon.worker import process as task
+from ..stga_addon.worker.environment import missing_here
+from . import ids, monitor
+from .common import file_path, head_of, needs_head, reporting, scene_settings
+from .environment import training_python
 
 
 def strategy_property() -> Any:
@@ -88,7 +88,7 @@ class Train(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         if not needs_head(cls, context):
             return False
-        if watch.snapshot_of(context.scene).state.is_alive:
+        if monitor.snapshot_of(context.scene).state.is_alive:
             cls.poll_message_set("Training is under way; cancel it first")
             return False
         return True
@@ -102,21 +102,21 @@ class Train(bpy.types.Operator):
         python = "" if here else training_python(context, self.python)
         write_job(run, self._job(head), painted_selection(head))
         if here:
-            watch.set_job(context.scene, run)
+            monitor.set_job(context.scene, run)
             avatar = _work_here(context, run)
         else:
             process = task.start(folder_of(run), python, arguments(run))
-            watch.set_job(context.scene, run)
-            watch.started(folder_of(run), process)
+            monitor.set_job(context.scene, run)
+            monitor.started(folder_of(run), process)
             if not waits:
                 return {"FINISHED"}
             avatar = _wait(run, process)
-        settings(context).avatar = str(avatar)
-        settings(context).job_ended = True
+        scene_settings(context).avatar = str(avatar)
+        scene_settings(context).job_ended = True
         self.report({"INFO"}, f"Trained {avatar}")
         return {"FINISHED"}
 
-    def _job(self, head: Any) -> Job:
+    def _job(self, head: Any) -> TrainingJob:
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
         chosen = None
         if not self.resume:
@@ -126,7 +126,7 @@ class Train(bpy.types.Operator):
         capture, model = Path(head[tags.CAPTURE]), head.get(tags.FLAME_MODEL)
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected that of the capture, which the head came from")
-        return Job(capture, Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap"), chosen)
+        return TrainingJob(capture, Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap"), chosen)
 
 
 class CancelTraining(bpy.types.Operator):
@@ -138,16 +138,16 @@ class CancelTraining(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if watch.snapshot_of(context.scene).state.is_alive:
+        if monitor.snapshot_of(context.scene).state.is_alive:
             return True
         cls.poll_message_set("Nothing is being trained")
         return False
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = folder_of(watch.run_of(context.scene))
+        folder = folder_of(monitor.run_of(context.scene))
         task.ask_to_stop(folder)
-        watch.follow(folder)
+        monitor.follow(folder)
         return {"FINISHED"}
 
 
@@ -160,20 +160,20 @@ class DismissTraining(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if watch.run_of(context.scene) is None:
+        if monitor.run_of(context.scene) is None:
             cls.poll_message_set("There is nothing to dismiss")
             return False
-        if watch.snapshot_of(context.scene).state.is_alive:
+        if monitor.snapshot_of(context.scene).state.is_alive:
             cls.poll_message_set("Training is under way; cancel it first")
             return False
         return True
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = folder_of(watch.run_of(context.scene))
+        folder = folder_of(monitor.run_of(context.scene))
         task.forget(folder)
-        watch.forget(folder)
-        watch.set_job(context.scene, None)
+        monitor.forget(folder)
+        monitor.set_job(context.scene, None)
         return {"FINISHED"}
 
 
@@ -195,7 +195,7 @@ def _wait(run: Path, process: "subprocess.Popen[bytes]") -> Path:
     """Wait for the worker. Raises StgaError with its sentence where it failed; the traceback goes to the terminal."""
     process.wait()
     last = task.look(folder_of(run), process)
-    if last.state.is_mishap:
+    if last.state.failed:
         print(task.account(folder_of(run), last), file=sys.stderr)
         raise StgaError(last.status.error)
     return run / "avatar.npz"

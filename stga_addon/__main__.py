@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 try:
-    from .cli import main
+    from .cli.parser import main
     from .errors import StgaError
-    from .handover import FOLDER, read_head
+    from .jobs.delegate import FOLDER, read_head
 except ModuleNotFoundError as error:
     print(f"stga: {sys.executable} lacks the package '{error.name}'", file=sys.stderr)
     raise SystemExit(2) from None

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.curve import SIZE, curve_picture
-from ..stga_addon.training.evaluations import METRICS, read_metrics
+from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 
 SCALE = 8.0
 """Side of the picture in the panel, in heights of a button."""

@@ -5,20 +5,20 @@ from typing import Any, ClassVar
 import bpy
 
 from ..operators import ids
-from ..operators.common import settings
-from ..operators.plan import is_looking
-from .step import Step
+from ..operators.analyze import is_looking
+from ..operators.common import scene_settings
+from .sidebar import SidebarPanel
 from .text import draw_text
 
 
-class EffectsPanel(Step, bpy.types.Panel):
+class EffectsPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_effects"
     bl_label = "Effects"
     bl_parent_id = "STGA_PT_train"
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, settings(context)
+        layout, chosen = self.layout, scene_settings(context)
         looking = is_looking(context.scene)
         layout.operator(ids.PLAN_EFFECTS, text="Looking…" if looking else "Look at Capture", icon="VIEWZOOM")
         if chosen.plan_error:

@@ -5,19 +5,19 @@ from typing import Any, ClassVar
 import bpy
 
 from ..operators import ids
-from ..operators.common import is_head, settings
-from ..stga_addon.scene.rig import EXPRESSION_KEY, IDENTITY_KEY
-from .step import Step
+from ..operators.common import is_head, scene_settings
+from ..stga_addon.scene.rig.flame_rig import EXPRESSION_KEY, IDENTITY_KEY
+from .sidebar import SidebarPanel
 
 FIRST_SLIDERS = 10  # the components are sorted by how much they change
 
 
-class MotionPanel(Step, bpy.types.Panel):
+class MotionPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_motion"
     bl_label = "5 Motion"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, settings(context)
+        layout, chosen = self.layout, scene_settings(context)
         layout.operator(ids.APPLY_MOTION, text="Apply Motion from File", icon="IMPORT").source = ""
         row = layout.row(align=True)
         row.prop(chosen, "motion_source")
@@ -27,7 +27,7 @@ class MotionPanel(Step, bpy.types.Panel):
         apply.source = chosen.motion_source.name if chosen.motion_source else ""
 
 
-class _Sliders(Step):
+class _Sliders(SidebarPanel):
     bl_parent_id = MotionPanel.bl_idname
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
     start = ""
@@ -55,7 +55,7 @@ class IdentityPanel(_Sliders, bpy.types.Panel):
 
 
 def _sliders(context: Any, start: str) -> list[Any]:
-    head = settings(context).head
+    head = scene_settings(context).head
     if not is_head(head) or head.data.shape_keys is None:
         return []
     return [key for key in head.data.shape_keys.key_blocks if key.name.startswith(start)]

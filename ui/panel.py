@@ -5,17 +5,18 @@ from typing import Any
 import bpy
 
 from ..operators import ids
-from ..operators.common import is_head, register_classes, settings, unregister_classes
+from ..operators.common import is_head, register_classes, scene_settings, unregister_classes
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene import nodes, tags
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
-from ..stga_addon.scene.materials import few_bounces_hint, view_transform_hint
-from ..stga_addon.scene.splats import input_identifier, splat_modifier
+from ..stga_addon.scene.display import nodes
+from ..stga_addon.scene.display.materials import few_bounces_hint, view_transform_hint
+from ..stga_addon.scene.display.splats import input_identifier, splat_modifier
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
 from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
-from .step import Step
+from .sidebar import SidebarPanel
 from .train_panel import TrainPanel
 
 DISPLAY_INPUTS = (
@@ -29,12 +30,12 @@ DISPLAY_INPUTS = (
 )
 
 
-class CapturePanel(Step, bpy.types.Panel):
+class CapturePanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_capture"
     bl_label = "1 Capture"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, settings(context)
+        layout, chosen = self.layout, scene_settings(context)
         layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
         row = layout.row(align=True)
         row.operator(ids.IMPORT_MOTION, text="FLAME Motion", icon="ARMATURE_DATA")
@@ -46,12 +47,12 @@ class CapturePanel(Step, bpy.types.Panel):
             )
 
 
-class ShowPanel(Step, bpy.types.Panel):
+class ShowPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_show"
     bl_label = "4 Show"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, settings(context)
+        layout, chosen = self.layout, scene_settings(context)
         layout.prop(chosen, "avatar")
         layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = chosen.avatar
         layout.operator(ids.EXPORT, icon="EXPORT").avatar = chosen.avatar

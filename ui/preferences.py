@@ -4,13 +4,13 @@ from typing import Any
 
 import bpy
 
-from ..operators import ids, watch
+from ..operators import ids, monitor
 from ..operators.common import register_classes, unregister_classes
-from ..operators.runtime import runtime_folder
-from ..stga_addon.runtime import made_python, task_folder
+from ..operators.environment import runtime_folder
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.task import State
-from .mishap import draw_mishap
+from ..stga_addon.worker.environment import made_python, task_folder
+from ..stga_addon.worker.process import State
+from .failure import draw_failure
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -37,7 +37,7 @@ class Preferences(bpy.types.AddonPreferences):
 
 def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
     folder = task_folder(runtime_folder())
-    now = watch.snapshot(folder)
+    now = monitor.snapshot(folder)
     box.label(text="Training Runtime")
     row = box.split(factor=0.8, align=True)
     row.prop(stored, "runtime_python")
@@ -51,9 +51,9 @@ def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
         row.operator(ids.CANCEL_RUNTIME, text="", icon="CANCEL")
         box.label(text=now.status.remark)
         return
-    if now.state.is_mishap:
+    if now.state.failed:
         box.label(text="Failed", icon="ERROR")
-        draw_mishap(box, context, now.status.error, now.tail, folder)
+        draw_failure(box, context, now.status.error, now.tail, folder)
     elif now.state == State.FINISHED:
         box.label(text=now.status.message, icon="CHECKMARK")
     box.operator(ids.MAKE_RUNTIME, text="Make Runtime…", icon="IMPORT")

@@ -36,7 +36,7 @@ def _take_minutes(chosen: Any, context: Any) -> None:
         chosen.minutes = seconds / 60
 
 
-class Effect(bpy.types.PropertyGroup):
+class EffectRow(bpy.types.PropertyGroup):
     """A line of the plan; filled by `operators.plan`. Its `name` is the effect's."""
 
     choice: bpy.props.EnumProperty(
@@ -53,7 +53,7 @@ class Effect(bpy.types.PropertyGroup):
     cost: bpy.props.StringProperty(name="Cost")
 
 
-class Settings(bpy.types.PropertyGroup):
+class SceneSettings(bpy.types.PropertyGroup):
     """One per scene; operators read what the scene works on, the panel hands the rest to them as arguments."""
 
     # The module bpy 4.2 crashes when its Python ends where a property has a poll or update function; Blender does not.
@@ -83,7 +83,7 @@ class Settings(bpy.types.PropertyGroup):
     strategy: strategy_property()
     preset: preset_property(update=_take_minutes)
     preset_seconds: bpy.props.StringProperty(options={"HIDDEN"})  # JSON: preset -> what `operators.plan` was told
-    effects: bpy.props.CollectionProperty(type=Effect)
+    effects: bpy.props.CollectionProperty(type=EffectRow)
     plan_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the capture could not be looked at
     live_preview: bpy.props.BoolProperty(
         name="Live Preview", description="Refresh the splats every few seconds while they train", default=True
@@ -99,10 +99,10 @@ class Settings(bpy.types.PropertyGroup):
 
 
 def register() -> None:
-    register_classes((SelectedFrame, Effect, Settings))
-    setattr(bpy.types.Scene, ids.SETTINGS, bpy.props.PointerProperty(type=Settings))
+    register_classes((SelectedFrame, EffectRow, SceneSettings))
+    setattr(bpy.types.Scene, ids.SETTINGS, bpy.props.PointerProperty(type=SceneSettings))
 
 
 def unregister() -> None:
     delattr(bpy.types.Scene, ids.SETTINGS)
-    unregister_classes((SelectedFrame, Effect, Settings))
+    unregister_classes((SelectedFrame, EffectRow, SceneSettings))

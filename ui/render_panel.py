@@ -4,9 +4,9 @@ from typing import Any
 
 import bpy
 
-from ..operators.runtime import has_runtime
-from ..stga_addon.raster.painter import missing
-from ..stga_addon.scene.engine import ENGINE
+from ..operators.environment import has_runtime
+from ..stga_addon.raster.render_client import missing
+from ..stga_addon.scene.render.engine import ENGINE
 
 
 class RenderPanel(bpy.types.Panel):

@@ -5,11 +5,11 @@ from typing import Any
 import bpy
 
 from ..operators import ids
-from ..operators.common import is_head, settings
+from ..operators.common import is_head, scene_settings
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.heat import is_heat_shown
-from .step import Step
+from ..stga_addon.scene.display.heat_map import is_heat_shown
+from .sidebar import SidebarPanel
 
 
 class SelectedFrames(bpy.types.UIList):
@@ -28,12 +28,12 @@ class SelectedFrames(bpy.types.UIList):
         row.label(icon="PLAY" if item.frame == context.scene.frame_current else "BLANK1")
 
 
-class SelectPanel(Step, bpy.types.Panel):
+class SelectPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_select"
     bl_label = "2 Select"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, settings(context)
+        layout, chosen = self.layout, scene_settings(context)
         layout.operator(ids.SELECT, icon="GROUP_VERTEX")
         if not is_head(chosen.head):
             return

@@ -5,29 +5,29 @@ from typing import Any
 
 import bpy
 
-from ..operators import ids, watch
-from ..operators.common import package, settings
-from ..operators.plan import chosen_effects
-from ..operators.runtime import has_runtime
-from ..stga_addon.job import describe, folder_of
+from ..operators import ids, monitor
+from ..operators.analyze import chosen_effects
+from ..operators.common import package, scene_settings
+from ..operators.environment import has_runtime
+from ..stga_addon.jobs.training_job import describe, folder_of
 from ..stga_addon.scene import tags
-from ..stga_addon.task import Snapshot, State
-from ..stga_addon.training.forecast import clock
-from ..stga_addon.training.plan import TRACKING
+from ..stga_addon.training.effect_plan import TRACKING
+from ..stga_addon.training.evaluate.forecast import clock
+from ..stga_addon.worker.process import Snapshot, State
 from .curve import draw_curve
-from .mishap import draw_mishap
+from .failure import draw_failure
 from .properties import seconds_of_presets
-from .step import Step
+from .sidebar import SidebarPanel
 from .text import draw_text
 
 
-class TrainPanel(Step, bpy.types.Panel):
+class TrainPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_train"
     bl_label = "3 Train"
 
     def draw(self, context: Any) -> None:
-        run = watch.run_of(context.scene)
-        now = watch.snapshot_of(context.scene)
+        run = monitor.run_of(context.scene)
+        now = monitor.snapshot_of(context.scene)
         if now.state.is_alive:
             _draw_progress(self.layout, context, run, now)
             return
@@ -37,7 +37,7 @@ class TrainPanel(Step, bpy.types.Panel):
 
 
 def _draw_choices(layout: Any, context: Any) -> None:
-    chosen = settings(context)
+    chosen = scene_settings(context)
     layout.prop(chosen, "run_folder", text="Folder")
     layout.prop(chosen, "preset")
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
@@ -65,8 +65,8 @@ def _draw_progress(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
     for line in (*describe(status.figures), status.remark):
         draw_text(column, context, line)
     draw_curve(layout, run)
-    layout.prop(settings(context), "live_preview")
-    layout.prop(settings(context), "show_result")
+    layout.prop(scene_settings(context), "live_preview")
+    layout.prop(scene_settings(context), "show_result")
     layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
 
 
@@ -75,10 +75,10 @@ def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
     row = box.row()
     if now.state == State.NONE:
         row.label(text="The run is gone", icon="ERROR")
-        draw_mishap(box, context, f"{run}: is not there; was it moved? Choose its folder and press Resume", (), None)
-    elif now.state.is_mishap:
+        draw_failure(box, context, f"{run}: is not there; was it moved? Choose its folder and press Resume", (), None)
+    elif now.state.failed:
         row.label(text="Training failed", icon="ERROR")
-        draw_mishap(box, context, now.status.error, now.tail, folder_of(run))
+        draw_failure(box, context, now.status.error, now.tail, folder_of(run))
     else:
         done = {State.FINISHED: "Trained", State.CANCELLED: "Cancelled, avatar kept"}[now.state]
         row.label(text=done, icon="CHECKMARK")
@@ -92,7 +92,7 @@ def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
 
 def _draw_refined(layout: Any, context: Any, path: Path) -> None:
     """The splats were trained on other meshes than the imported ones, which a click exchanges."""
-    head = settings(context).head
+    head = scene_settings(context).head
     column = layout.column()
     column.operator_context = "EXEC_DEFAULT"  # without a file dialog
     column.enabled = head is not None

@@ -81,7 +81,7 @@ def face_frames(
     return FaceFrames(origin, rotation, scale, deformed)
 
 
-def frame_pull(
+def frame_backward(
     vertices: np.ndarray,
     faces: np.ndarray,
     frames: FaceFrames,

@@ -107,7 +107,7 @@ _SPLAT_FIELDS: dict[str, tuple[str, tuple[int, ...]]] = {
     "opacity": ("float32", ()),
     "sh": ("float32", (-1, 3)),
     "face": ("int32", ()),
-    "loose": ("bool", ()),
+    "unbound": ("bool", ()),
     "strain_color": ("float32", (-1, 3)),
 }
 

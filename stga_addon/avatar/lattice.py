@@ -47,7 +47,7 @@ def lattice_splats(
         opacity=np.full(count, opacity_logit, np.float32),
         sh=np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32),
         face=np.repeat(np.arange(len(faces), dtype=np.int32), len(weights)),
-        loose=np.zeros(count, bool),
+        unbound=np.zeros(count, bool),
     )
 
 

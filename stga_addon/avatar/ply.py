@@ -85,7 +85,7 @@ def splats_from_columns(path: Path, vertices: np.ndarray) -> Splats:
         opacity=stack_columns(path, vertices, ["opacity"])[:, 0],
         sh=sh,
         face=np.zeros(count, np.int32),
-        loose=np.zeros(count, bool),
+        unbound=np.zeros(count, bool),
     )
 
 

@@ -20,7 +20,7 @@ class Splats:
     opacity    (N,) logit
     sh         (N, K, 3) spherical harmonics, K = (degree + 1)²; colour = 0.5 + Y·sh, clamped at 0
     face       (N,) int32 triangle that the splat is bound to; 0 for a world-space set
-    loose      (N,) bool: stands for something outside the mesh (hair, shoulders), so limits that tie a splat
+    unbound      (N,) bool: stands for something outside the mesh (hair, shoulders), so limits that tie a splat
                to its triangle do not apply
     strain_color  (N, S, 3) colour per unit of its triangle's strain (`avatar.strain`), S = 3, or 0 where colours do
                not depend on deformation; nothing given means 0
@@ -32,7 +32,7 @@ class Splats:
     opacity: np.ndarray
     sh: np.ndarray
     face: np.ndarray
-    loose: np.ndarray
+    unbound: np.ndarray
     strain_color: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:

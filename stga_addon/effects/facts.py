@@ -10,7 +10,7 @@ from ..flame.forward import FlameFrame
 from ..flame.sequence import turns
 from ..flame.teeth import LOWER_LIP, TEETH_VERTICES, TEMPLATE_VERTICES, UPPER_LIP
 from ..selection import select_capture
-from ..training.settings import Settings
+from ..training.settings import TrainingSettings
 from .evidence import CameraColors, Evidence, calm, camera_evidence, fit_cameras, linear_evidence
 from .samples import Samples, take_samples
 
@@ -25,7 +25,7 @@ LARGEST = 4.0
 class Facts:
     """A capture with training views, and the settings it is to be trained with."""
 
-    def __init__(self, capture: Capture, settings: Settings, device: str = "cpu") -> None:
+    def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:
         """device: one of `choose_device`."""
         self.capture, self.settings, self.device = capture, settings, device
         self.views = capture.views["train"]

@@ -59,7 +59,7 @@ class Effect:
     """An effect: its name, what it costs while it is on, its rule, and the settings that switch it.
 
     look     its rule; None where the capture has nothing that the effect could apply to
-    on, off  what it sets of `Settings`
+    on, off  what it sets of `TrainingSettings`
     """
 
     name: str
@@ -118,11 +118,11 @@ def background(facts: Facts) -> Verdict:
     return Verdict(True, f"masks everywhere, and one colour behind the head ({red}, {green}, {blue})", changes=changes)
 
 
-def seeds(facts: Facts) -> Verdict:
+def hull_points(facts: Facts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "one camera cannot tell how far away something beside the mesh is", only=True)
     if np.isnan(facts.beside):
-        return Verdict(facts.settings.seeds, "without masks, how much lies beside the mesh is not known")
+        return Verdict(facts.settings.hull_points, "without masks, how much lies beside the mesh is not known")
     return Verdict(facts.beside > BESIDE, f"{facts.beside:.1%} of the foreground lies beside the mesh")
 
 
@@ -204,10 +204,16 @@ EFFECTS = (
         "background",
         "a pass over the image in every iteration",
         background,
-        on={"any_background": True},
-        off={"any_background": False},
+        on={"random_background": True},
+        off={"random_background": False},
     ),
-    Effect("seeds", "a splat for every 4 mm beside the mesh", seeds, on={"seeds": True}, off={"seeds": False}),
+    Effect(
+        "hull-points",
+        "a splat for every 4 mm beside the mesh",
+        hull_points,
+        on={"hull_points": True},
+        off={"hull_points": False},
+    ),
     Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_every": 0}),
     Effect(
         "selection",

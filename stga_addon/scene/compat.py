@@ -30,7 +30,7 @@ def action_curves(owner: Any) -> Any:
         return action.fcurves
     if animation.action_slot is None:
         animation.action_slot = action.slots.new(id_type=owner.id_type, name=owner.name)
-    layer = action.layers[0] if action.layers else action.layers.new("Layer")
+    layer = action.layers[0] if action.layers else action.layers.new("PosedSplats")
     strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
     return strip.channelbag(animation.action_slot, ensure=True).fcurves
 

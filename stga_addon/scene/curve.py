@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..training.forecast import clock, curve_of
+from ..training.evaluate.forecast import clock, curve_of
 
 SIZE = 256
 """Pixels of a side: Blender's icons are square."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ..capture.model import View
-from .settings import Rates, Settings
+from .settings import Rates, TrainingSettings
 
 
 def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:
@@ -34,7 +34,7 @@ def _epoch(views: Sequence[View], per_visit: int, seed: int, epoch: int) -> list
     return [view for n in rng.permutation(len(visits)) for view in visits[n]]
 
 
-def trains_globally(settings: Settings, iteration: int, visit: int, progress: float) -> bool:
+def trains_globally(settings: TrainingSettings, iteration: int, visit: int, progress: float) -> bool:
     """Whether this iteration trains all splats; `visit` counts frame visits, `progress` is the share of budget."""
     if settings.strategy != "selective" or progress < settings.warm_up:
         return True
@@ -42,7 +42,7 @@ def trains_globally(settings: Settings, iteration: int, visit: int, progress: fl
     return count % (settings.global_every + 1) == settings.global_every
 
 
-def sh_degree(settings: Settings, progress: float) -> int:
+def sh_degree(settings: TrainingSettings, progress: float) -> int:
     """Degree of spherical harmonics in use at a share of the budget."""
     return min(settings.sh_degree, sum(progress >= step for step in settings.sh_steps))
 

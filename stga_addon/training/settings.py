@@ -9,7 +9,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import StgaError
 from ..selection import SelectionOptions
-from .plan import CHOICES
+from .effect_plan import CHOICES
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
 SCHEDULES = ("default", "paper")
@@ -36,13 +36,13 @@ class Rates:
 
 
 @dataclass(frozen=True)
-class Settings:
+class TrainingSettings:
     """One training run.
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
                    ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training
                    with that method's binding, losses and rates
-    schedule       "paper" took the paper's letter wherever `PAPER` differs from the defaults
+    schedule       "paper" took the paper's letter wherever `PAPER_SETTINGS` differs from the defaults
     seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two
     seed           fixes the order of views and every random choice
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA, embedding)
@@ -61,11 +61,11 @@ class Settings:
                    All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
                    for "gaussian_avatars"
     sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
-    seeds          add hull seeds for what the mesh does not cover
+    hull_points    add hull points for what the mesh does not cover
     density_every  iterations between density control, 0 never; it works during `density_span` of the budget
     growth         most splats that density control may add, as a share of the initial number
     background     colour behind the head in the capture's images, and behind transparent ones
-    any_background  where there are masks, put another random colour behind the head in every iteration, so that
+    random_background  where there are masks, put another random colour behind the head in every iteration, so that
                    splats in the background's colour cannot hide in it and alpha becomes right
     scale, coarse_span   size of the images trained on, as a share of the captured ones; during the first
                    `coarse_span` of the budget half of that
@@ -106,12 +106,12 @@ class Settings:
     stray_to: float = 1.0
     sh_degree: int = 3
     sh_steps: tuple[float, ...] = (0.3, 0.5, 0.7)
-    seeds: bool = True
+    hull_points: bool = True
     density_every: int = 200
     density_span: tuple[float, float] = (0.1, 0.6)
     growth: float = 0.25
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    any_background: bool = True
+    random_background: bool = True
     scale: float = 1.0
     coarse_span: float = 0.0
     target_psnr: float | None = None
@@ -125,7 +125,7 @@ class Settings:
     effects: Mapping[str, str] | None = None
 
 
-PAPER = {
+PAPER_SETTINGS = {
     "views_per_visit": 0,
     "global_every": 20,
     "warm_up": 0.0,
@@ -134,8 +134,8 @@ PAPER = {
     "stray_to": 0.0,
     "averaging": 1.0,
     "lattice": 4,
-    "seeds": False,
-    "any_background": False,
+    "hull_points": False,
+    "random_background": False,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
 """The paper's letter, where it differs from the defaults, which are what measured best (docs/results.md)."""
@@ -150,8 +150,8 @@ GAUSSIAN_AVATARS = {
     "distance_weight": 0.01,
     "stray_every": 0,
     "averaging": 1.0,
-    "seeds": False,
-    "any_background": False,
+    "hull_points": False,
+    "random_background": False,
     "growth": 8.0,
 }
 """GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and released settings)."""
@@ -184,14 +184,14 @@ PRESETS = {
 
 def make_settings(
     strategy: str | None = None, schedule: str = "default", preset: str | None = None, **changes: Any
-) -> Settings:
-    """Settings of a strategy, schedule and preset with `changes` on top.
+) -> TrainingSettings:
+    """TrainingSettings of a strategy, schedule and preset with `changes` on top.
 
     Without a strategy, the paper's schedule trains selectively and the default one by the default strategy.
     Raises StgaError naming an impossible value.
     """
     if strategy is None:
-        strategy = "selective" if schedule == "paper" else Settings.strategy
+        strategy = "selective" if schedule == "paper" else TrainingSettings.strategy
     if strategy not in STRATEGIES:
         raise StgaError(f"--strategy: '{strategy}' is not one of {', '.join(STRATEGIES)}")
     if schedule not in SCHEDULES:
@@ -202,10 +202,10 @@ def make_settings(
     if preset is not None:
         base.update(PRESETS[preset].changes)
     if schedule == "paper":
-        base.update(PAPER)
+        base.update(PAPER_SETTINGS)
     if strategy == "gaussian-avatars":
         base.update(GAUSSIAN_AVATARS)
-    settings = Settings(**{**base, "strategy": strategy, "schedule": schedule, **changes})
+    settings = TrainingSettings(**{**base, "strategy": strategy, "schedule": schedule, **changes})
     if (settings.seconds is None) == (settings.iterations is None):
         raise StgaError("give a budget in wall time (--budget) or in iterations (--iterations), one of the two")
     if not (settings.seconds or settings.iterations or 0) > 0:
@@ -221,20 +221,20 @@ def make_settings(
     return settings
 
 
-def to_json(settings: Settings) -> dict[str, Any]:
+def to_json(settings: TrainingSettings) -> dict[str, Any]:
     """Plain values, for the run folder and the avatar file; `from_json` reads them back."""
     return dataclasses.asdict(settings)
 
 
-def from_json(values: dict[str, Any]) -> Settings:
-    """Settings from `to_json`. Raises TypeError or KeyError where a field is unknown or missing."""
+def from_json(values: dict[str, Any]) -> TrainingSettings:
+    """TrainingSettings from `to_json`. Raises TypeError or KeyError where a field is unknown or missing."""
     values = dict(values)
     values["selection"] = SelectionOptions(**{**values["selection"], "regions": tuple(values["selection"]["regions"])})
     values["rates"] = Rates(**values["rates"])
     for name in ("sh_steps", "density_span", "background"):
         values[name] = tuple(values[name])
     values["exposure"] = tuple(tuple(float(number) for number in row) for row in values.get("exposure", ()))
-    settings = Settings(**values)
+    settings = TrainingSettings(**values)
     if settings.effects is not None and not set(settings.effects.values()) <= set(CHOICES):
         raise TypeError(f"effects is {settings.effects!r}")
     for part in (settings, settings.selection, settings.rates):

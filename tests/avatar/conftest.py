@@ -20,7 +20,7 @@ def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Spla
         opacity=normal(count),
         sh=normal(count, (sh_degree + 1) ** 2, 3),
         face=rng.integers(0, faces, count).astype(np.int32),
-        loose=rng.random(count) < 0.3,
+        unbound=rng.random(count) < 0.3,
     )
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.errors import StgaError
 
-SPLAT_FIELDS = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "loose")
+SPLAT_FIELDS = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound")
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -64,7 +64,7 @@ BROKEN = {
     "sh is": lambda a: with_splats(a, sh=a.splats.sh[:, :, 0]),
     "face refers": lambda a: with_splats(a, face=spoiled(a.splats.face, 30)),
     "face is int64": lambda a: with_splats(a, face=a.splats.face.astype(np.int64)),
-    "loose": lambda a: with_splats(a, loose=a.splats.loose.astype(np.uint8)),
+    "unbound": lambda a: with_splats(a, unbound=a.splats.unbound.astype(np.uint8)),
     "region 'mouth'": lambda a: replace(a, regions={"mouth": np.zeros(30, np.int8)}),
     "background": lambda a: replace(a, background=(1.0, 1.0)),
 }

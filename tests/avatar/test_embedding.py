@@ -74,7 +74,7 @@ def test_splats_follow_a_rigid_motion_and_a_scaling(convention):
     np.testing.assert_allclose(after.log_scale, before.log_scale + np.log(size), atol=2e-6)
     expected = (turn * scipy_rotation(before.rotation)).as_matrix()
     np.testing.assert_allclose(scipy_rotation(after.rotation).as_matrix(), expected, atol=2e-6)
-    for name in ("opacity", "sh", "loose"):
+    for name in ("opacity", "sh", "unbound"):
         np.testing.assert_array_equal(getattr(after, name), getattr(splats, name))
 
 

@@ -59,7 +59,7 @@ def sequence() -> FlameSequence:
 def avatar_on(sequence: FlameSequence, convention: str) -> Avatar:
     neutral, faces = neutral_mesh(sequence).astype(np.float32), sequence.model.faces
     splats = random_splats(6, 50, len(faces), sh_degree=3)
-    return Avatar(replace(splats, loose=np.zeros(50, bool)), convention, neutral, faces)
+    return Avatar(replace(splats, unbound=np.zeros(50, bool)), convention, neutral, faces)
 
 
 def test_ply_has_exactly_the_layouts_properties(tmp_path, sequence):
@@ -109,7 +109,7 @@ def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
     write_gaussian_avatars(tmp_path, avatar, sequence)
     splats = read_gaussian_avatars(tmp_path / "point_cloud.ply")
     motion = read_motion(tmp_path / "flame_param.npz", sequence.model)
-    for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "loose"):
+    for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
         np.testing.assert_array_equal(getattr(splats, name), getattr(avatar.splats, name), err_msg=name)
         assert getattr(splats, name).dtype == getattr(avatar.splats, name).dtype
     for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):

@@ -74,7 +74,7 @@ def test_starts_grey_and_half_transparent():
     assert splats.sh.shape[1:] == (9, 3)
     assert not splats.sh.any()
     assert not splats.opacity.any()
-    assert not splats.loose.any()
+    assert not splats.unbound.any()
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

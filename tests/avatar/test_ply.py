@@ -20,7 +20,7 @@ FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthChe
 
 def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
     splats = random_splats(0, count, 1, sh_degree)
-    return replace(splats, loose=np.zeros(count, bool))
+    return replace(splats, unbound=np.zeros(count, bool))
 
 
 def by_hand(kind: str, properties: dict[str, str], rows: list[dict[str, float]], before: str = "") -> bytes:
@@ -48,7 +48,7 @@ def numbered_rows(names: list[str]) -> list[dict[str, float]]:
 
 
 def assert_same(splats: Splats, expected: Splats) -> None:
-    for name in (*ARRAYS, "face", "loose"):
+    for name in (*ARRAYS, "face", "unbound"):
         have, want = getattr(splats, name), getattr(expected, name)
         assert have.dtype == want.dtype, name
         np.testing.assert_array_equal(have, want, err_msg=name)

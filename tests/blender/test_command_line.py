@@ -16,7 +16,7 @@ from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.groups import read_selection  # noqa: E402
+from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_render_of_the_open_head(stga, bare, tmp_path):
 
 def test_no_runtime_is_one_sentence(stga, extension, folder, monkeypatch, capsys):
     """Catches a traceback, or success, where nothing can train."""
-    for module in (extension.operators.command_line, extension.operators.runtime.runtime):
+    for module in (extension.operators.command_line, extension.operators.environment.runtime):
         monkeypatch.setattr(module, "missing_here", lambda: ["torch"])
     assert stga("train", folder, "--out", folder / "run") == 2
     assert "training needs a runtime" in capsys.readouterr().err

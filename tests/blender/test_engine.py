@@ -1,4 +1,4 @@
-"""The render engine against `draw_avatar`, through files that Blender writes."""
+"""The render engine against `render_avatar`, through files that Blender writes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +15,12 @@ from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E40
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.raster.draw import draw_avatar, draw_splats  # noqa: E402
-from stga_addon.raster.kernels.project import _basis  # noqa: E402
-from stga_addon.scene import engine, nodes  # noqa: E402
+from stga_addon.raster.cpu.project import _basis  # noqa: E402
+from stga_addon.raster.render import render_avatar, render_splats  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.splats import set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.display import nodes  # noqa: E402
+from stga_addon.scene.display.splats import set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.render import engine  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
 from .test_splats import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
@@ -119,7 +120,7 @@ def test_same_pixels_as_render(convention, background, tmp_path):
     avatar = textured(avatar_of(convention), -6 if convention == "stga" else -1)
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
-    expected = draw_avatar(avatar, evaluated_vertices(head), camera, (background,) * 3)
+    expected = render_avatar(avatar, evaluated_vertices(head), camera, (background,) * 3)
     assert np.abs(expected - background).max(0).mean() > 0.1, "nothing to compare"
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < SAME
 
@@ -141,7 +142,7 @@ def test_cameras_are_blenders(changes, portrait, tmp_path):
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
     camera = expected_camera(camera_at(45.0, **changes), shown, width, height)
-    expected = draw_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
+    expected = render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
     assert expected.max() > 0.3
     assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME
 
@@ -174,7 +175,7 @@ def test_world_colour_lies_behind(tmp_path):
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
     behind = 1.055 * np.array([0.2, 0.05, 0.1]) ** (1 / 2.4) - 0.055
-    expected = draw_avatar(avatar, evaluated_vertices(head), camera, tuple(behind))
+    expected = render_avatar(avatar, evaluated_vertices(head), camera, tuple(behind))
     passes = render(tmp_path)
     assert passes["A"].min() == 1
     assert np.abs(displayed(passes, 0.0) - expected).max() < SAME
@@ -242,7 +243,7 @@ def test_objects_are_sorted_together(tmp_path):
     spaces = [np.eye(4), np.array(place, np.float64)]
     reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
     view = expected_camera(camera, bpy.data.objects["still"])
-    expected = draw_splats(reference, view, (0.0,) * 3)
+    expected = render_splats(reference, view, (0.0,) * 3)
     assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME
 
 
@@ -260,7 +261,7 @@ def _merged(scans, spaces, eye):
             _basis(2, x, y, z, row)
         color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / 0.28209479177387814
         parts.append(replace(world, sh=color[:, None].astype(np.float32)))
-    names = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "loose", "strain_color")
+    names = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound", "strain_color")
     return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
@@ -288,7 +289,7 @@ def test_strain_colours_and_antialiasing_reach_the_picture(tmp_path):
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
     plain = replace(avatar, splats=replace(avatar.splats, strain_color=None), antialiased=False)
-    expected, without = (draw_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3) for a in (avatar, plain))
+    expected, without = (render_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3) for a in (avatar, plain))
     assert np.abs(expected - without).max() > 0.05
     assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < SAME
 
@@ -314,14 +315,14 @@ def test_display_settings_count(tmp_path):
     }
     for name, (value, default, splats) in cases.items():
         set_input(shown, name, value)
-        expected = draw_avatar(replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3)
+        expected = render_avatar(replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3)
         assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME, name
         set_input(shown, name, default)
     set_input(shown, nodes.SHOW_SELECTION, True)
     grey = displayed(render(tmp_path), 0.0)
     assert (
         np.ptp(grey, axis=0).mean()
-        < np.ptp(draw_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3), axis=0).mean()
+        < np.ptp(render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3), axis=0).mean()
     )
 
 

@@ -7,8 +7,8 @@ bpy = pytest.importorskip("bpy")
 
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.groups import closure, read_selection, write_selection  # noqa: E402
-from stga_addon.scene.head import import_head  # noqa: E402
+from stga_addon.scene.rig.head import import_head  # noqa: E402
+from stga_addon.scene.vertex_groups import closure, read_selection, write_selection  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 

@@ -21,7 +21,7 @@ from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 

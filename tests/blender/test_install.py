@@ -16,8 +16,8 @@ from stga_addon import __version__
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
+from stga_addon.development.package import WHEELS, build_zip, extension_files, fetch_wheels, read_manifest
 from stga_addon.errors import StgaError
-from stga_addon.package import WHEELS, build_zip, extension_files, fetch_wheels, read_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -14,9 +14,9 @@ from stga_addon.flame.motion import PARTS, retimed  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh  # noqa: E402
 from stga_addon.scene import compat  # noqa: E402
 from stga_addon.scene.compat import SLOTTED_ACTIONS, evaluated_vertices  # noqa: E402
-from stga_addon.scene.head import import_head  # noqa: E402
-from stga_addon.scene.motion import apply_motion, performed_motion  # noqa: E402
-from stga_addon.scene.rig import rig_of  # noqa: E402
+from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.scene.rig.head import import_head  # noqa: E402
+from stga_addon.scene.rig.motion import apply_motion, performed_motion  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 

@@ -17,10 +17,10 @@ from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene import nodes  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.groups import closure, read_selection  # noqa: E402
-from stga_addon.scene.splats import evaluated_splats, set_input  # noqa: E402
+from stga_addon.scene.display import nodes  # noqa: E402
+from stga_addon.scene.display.splats import evaluated_splats, set_input  # noqa: E402
+from stga_addon.scene.vertex_groups import closure, read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 
 OPERATORS = (
@@ -239,7 +239,7 @@ def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
 
 def test_more_bounces_where_cycles_needs_them(extension):
     """Catches a hint that shows where nothing has to be done, and a button that lowers what somebody raised."""
-    materials = extension.stga_addon.scene.materials
+    materials = extension.stga_addon.scene.display.materials
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.transparent_max_bounces = 8

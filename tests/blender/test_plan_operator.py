@@ -8,7 +8,7 @@ bpy = pytest.importorskip("bpy")
 
 from capture.factory import write_mesh_capture  # noqa: E402
 
-from stga_addon.training.folder import read_run  # noqa: E402
+from stga_addon.training.run.folder import read_run  # noqa: E402
 from stga_addon.training.settings import PRESETS  # noqa: E402
 
 
@@ -33,7 +33,7 @@ def test_the_plan_reaches_the_run(chosen, extension, tmp_path):
     assert bpy.ops.stga.plan_effects() == {"FINISHED"}
     rows = {row.name: row for row in chosen.effects}
     assert (rows["strain-color"].on, rows["strain-color"].choice) == (True, "on")
-    effects = " ".join(extension.operators.plan.chosen_effects(SimpleNamespace(effects=chosen.effects)))
+    effects = " ".join(extension.operators.analyze.chosen_effects(SimpleNamespace(effects=chosen.effects)))
     assert effects == "strain-color=on"
     seconds = json.loads(chosen.preset_seconds)
     assert list(seconds) == list(PRESETS)

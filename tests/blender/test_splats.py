@@ -12,12 +12,12 @@ from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world  # no
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene import nodes  # noqa: E402
 from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.materials import DISPLAY_COLOR, EXTENT, OPACITY  # noqa: E402
-from stga_addon.scene.node_colors import SH  # noqa: E402
-from stga_addon.scene.node_display import ELLIPSOIDS, QUADS  # noqa: E402
-from stga_addon.scene.splats import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.display import nodes  # noqa: E402
+from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT, OPACITY  # noqa: E402
+from stga_addon.scene.display.node_colors import SH  # noqa: E402
+from stga_addon.scene.display.node_display import ELLIPSOIDS, QUADS  # noqa: E402
+from stga_addon.scene.display.splats import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
 
 FRAMES = (1, 5, 9)
 
@@ -49,7 +49,7 @@ def random_splats(faces: int, count: int, degree: int = 1, extent: float = 0.01)
         opacity=rng.normal(0, 2, count).astype(np.float32),
         sh=rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)).astype(np.float32),
         face=rng.integers(0, faces, count).astype(np.int32),
-        loose=np.zeros(count, bool),
+        unbound=np.zeros(count, bool),
     )
 
 
@@ -192,7 +192,7 @@ def test_constant_colours_are_scene_linear():
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colours_follow_the_active_camera(degree):
     """Catches harmonics of another order or sign, and directions in the world's instead of the splats' own space."""
-    kernels = pytest.importorskip("stga_addon.raster.kernels.project")
+    kernels = pytest.importorskip("stga_addon.raster.cpu.project")
     avatar = avatar_of("stga", 400)
     sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))

@@ -15,7 +15,7 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.files import read_npz, write_json  # noqa: E402
-from stga_addon.scene.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
 
@@ -33,11 +33,15 @@ def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's job: the test says what it does."""
     from contextlib import ExitStack
 
-    task, job, watch = (extension.stga_addon.task, extension.stga_addon.job, extension.operators.watch)
+    task, job, watch = (
+        extension.stga_addon.worker.process,
+        extension.stga_addon.jobs.training_job,
+        extension.operators.monitor,
+    )
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-        job.write_job(run, job.Job(tmp_path / "capture", None, "vhap", settings))
+        job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
         watch.set_job(bpy.context.scene, run)
         teller = stack.enter_context(task.telling(job.folder_of(run)))
         teller.tell(0.25, "training")
@@ -92,7 +96,7 @@ def test_a_worker_trains_the_same(head, tmp_path):
 
 def test_without_a_runtime_training_says_what_to_do(extension, head, tmp_path, monkeypatch):
     """Catches a traceback about imports where a sentence should say which Python lacks what."""
-    monkeypatch.setattr(extension.stga_addon.runtime, "find_spec", lambda name: None)
+    monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)
     monkeypatch.setattr(extension.operators.train, "missing_here", lambda: ["torch"])
     expected = r"^Error: training needs a runtime.*Blender's own Python \(.*\) lacks torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
@@ -144,7 +148,7 @@ def test_a_living_worker_is_not_disturbed(worker):
 
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
     """Catches a new object for each preview, display settings that are lost, and splats whose number may not change."""
-    watch, scene = extension.operators.watch, bpy.context.scene
+    watch, scene = extension.operators.monitor, bpy.context.scene
     preview = worker.folder / "preview.npz"
     write_ball_avatar(preview)
     tick_until(watch, lambda: scene.stga.splats is not None)
@@ -175,7 +179,7 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
 @pytest.mark.parametrize("wanted", [True, False])
 def test_the_end_reaches_the_scene_once(extension, worker, wanted):
     """Catches a result that is not shown, shown although it is not wanted, or shown again at every reopening."""
-    watch, scene = extension.operators.watch, bpy.context.scene
+    watch, scene = extension.operators.monitor, bpy.context.scene
     scene.stga.show_result = wanted
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
@@ -191,7 +195,7 @@ def test_the_end_reaches_the_scene_once(extension, worker, wanted):
 
 def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     """Catches a job that a saved file forgets: its worker goes on while Blender is closed, and may end meanwhile."""
-    watch = extension.operators.watch
+    watch = extension.operators.monitor
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     assert watch.tick() is None
@@ -208,7 +212,7 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
 
 def test_a_blend_that_moved(extension, worker, tmp_path):
     """Catches a job that is lost when file and run move together, and silence when the file moves alone."""
-    watch, scene = extension.operators.watch, bpy.context.scene
+    watch, scene = extension.operators.monitor, bpy.context.scene
     worker.leave()
     scene.stga.run_folder, scene.stga.show_result = "//run", False
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
@@ -226,7 +230,7 @@ def test_a_blend_that_moved(extension, worker, tmp_path):
 
 def test_undo_does_not_lose_the_worker(extension, worker):
     """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
-    watch, scene = extension.operators.watch, bpy.context.scene
+    watch, scene = extension.operators.monitor, bpy.context.scene
     watch.tick()
     scene.stga.job = ""
     assert watch.tick() is not None
@@ -235,11 +239,11 @@ def test_undo_does_not_lose_the_worker(extension, worker):
 
 def test_a_worker_that_died(extension, worker):
     """Catches a progress bar that stands still for ever, and a report that says less than is known."""
-    watch = extension.operators.watch
+    watch = extension.operators.monitor
     (worker.folder / "worker.log").write_text("Killed\n")
     write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
     last = watch.snapshot_of(bpy.context.scene)
-    assert last.state.is_mishap
+    assert last.state.failed
     assert last.tail == ("Killed",)
     assert watch.tick() is None
 
@@ -262,7 +266,7 @@ def test_a_file_that_was_made_without_the_panel(extension, tmp_path):
 @pytest.mark.slow
 def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
     """Catches a runtime that a script cannot make or test, and a network used although Blender is offline."""
-    monkeypatch.setattr(extension.operators.runtime, "runtime_folder", lambda create=False: tmp_path / "runtime")
+    monkeypatch.setattr(extension.operators.environment, "runtime_folder", lambda create=False: tmp_path / "runtime")
     python = str(tmp_path / "python")
     with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
         bpy.ops.stga.test_runtime(python=python)

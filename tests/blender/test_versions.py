@@ -22,11 +22,11 @@ from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.ply import read_ply
 from stga_addon.capture.open import open_capture
+from stga_addon.development.package import ROOT, build_zip, fetch_wheels
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import read_motion
-from stga_addon.package import ROOT, build_zip, fetch_wheels
-from stga_addon.runtime import missing_here
+from stga_addon.worker.environment import missing_here
 
 # bpy that the tests themselves run in, and others: (version, the variable with the path of a Python that has it)
 RUNTIME = "" if missing_here() else sys.executable

@@ -11,9 +11,9 @@ pytest.importorskip("bpy")
 
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
-from stga_addon.scene import viewport
-from stga_addon.scene.view import camera_of, viewport_camera
-from stga_addon.scene.viewport import Sketcher, Wish
+from stga_addon.scene.render import viewport
+from stga_addon.scene.render.camera import camera_of, viewport_camera
+from stga_addon.scene.render.viewport import Sketcher, Wish
 
 CAMERA = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, np.eye(4))
 

@@ -9,22 +9,23 @@ import pytest
 from training.heads import write_head
 
 from stga_addon.capture.images import read_view
-from stga_addon.effects.plan import plan_effects
+from stga_addon.effects.decide import decide_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
-from stga_addon.training import cpu_step, frames, run, trainer
-from stga_addon.training.exposure import even_exposure
-from stga_addon.training.folder import Run, read_checkpoint
+from stga_addon.training.optimize import cpu_backend, frames, trainer
+from stga_addon.training.optimize.exposure import even_exposure
+from stga_addon.training.optimize.trainer import initial_splats
+from stga_addon.training.run import loop
+from stga_addon.training.run.folder import Run, read_checkpoint
 from stga_addon.training.settings import make_settings
-from stga_addon.training.trainer import initial_splats
 
 from .test_rules import unlike_cameras
 
 # What each effect calls, by where the call is made from.
 CALLS = {
-    "background": (cpu_step, "change_background"),
-    "seeds": (trainer, "hull_seeds"),
+    "background": (cpu_backend, "change_background"),
+    "hull-points": (trainer, "hull_points"),
     "density": (trainer, "control_density"),
-    "selection": (run, "select_capture"),
+    "selection": (loop, "select_capture"),
     "strain-color": (frames, "strain_basis"),
 }
 ITERATIONS = 12
@@ -34,13 +35,13 @@ def train(capture, folder, monkeypatch, choice):
     """Train with all effects on or off; how often each was called, and the checkpoint."""
     names = dict.fromkeys((*CALLS, "view-color", "antialiasing"), choice)
     wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up=0.0)
-    settings, plan = plan_effects(capture, wanted)
+    settings, plan = decide_effects(capture, wanted)
     if settings.density_every:
         settings = replace(settings, density_every=2, density_span=(0.0, 1.0))
     calls: Counter[str] = Counter()
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
-    run.train(capture, folder, Run(capture.root, None, "vhap", settings, plan))
+    loop.train(capture, folder, Run(capture.root, None, "vhap", settings, plan))
     return calls, read_checkpoint(folder).state.splats()
 
 
@@ -74,18 +75,18 @@ def test_on_calls_all(painted, tmp_path, monkeypatch):
 def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
     """Catches parameters that are read, differentiated or written where nobody asked for it, or not where one did."""
     capture, _ = write_head(tmp_path / "head")
-    settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
+    settings, _ = decide_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
     calls: Counter[str] = Counter()
-    for module, name in ((trainer, "track"), (cpu_step, "frame_pull"), (run, "write_tracking")):
+    for module, name in ((trainer, "track"), (cpu_backend, "frame_backward"), (loop, "write_tracking")):
         monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
-    run.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
+    loop.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
     if choice == "off":
         assert calls == {}
         assert read_checkpoint(tmp_path / "run").tracking is None
         assert not (tmp_path / "run/tracking.npz").exists()
     else:
         assert calls["track"] == 1
-        assert calls["frame_pull"] == ITERATIONS - 2  # none in the first 15 %
+        assert calls["frame_backward"] == ITERATIONS - 2  # none in the first 15 %
         assert calls["write_tracking"] > 0
 
 
@@ -121,7 +122,7 @@ def test_no_splats_on_teeth(painted):
     flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
     toothed = replace(capture, faces=faces, neutral=np.concatenate([capture.neutral, rows]), flame=flame)
     for kept in (True, False):
-        splats = initial_splats(toothed, make_settings(iterations=1, seeds=False, teeth=kept))
+        splats = initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
         on_teeth = (splats.face >= len(capture.faces)).sum()
         assert on_teeth == (6 * TEETH_FACES if kept else 0)
         assert len(splats) - on_teeth == 6 * len(capture.faces)
@@ -130,5 +131,5 @@ def test_no_splats_on_teeth(painted):
 @pytest.mark.parametrize("choice", ["on", "off"])
 def test_antialiasing_reaches_the_kernels(painted, choice):
     """Catches an effect that is decided and then forgotten."""
-    settings, _ = plan_effects(painted(), make_settings(iterations=1, effects={"antialiasing": choice}))
+    settings, _ = decide_effects(painted(), make_settings(iterations=1, effects={"antialiasing": choice}))
     assert settings.antialiased == (choice == "on")

@@ -6,12 +6,12 @@ import pytest
 from capture import factory
 
 from stga_addon.capture.open import open_capture
-from stga_addon.cli import main
-from stga_addon.effects import plan as planning
-from stga_addon.effects.plan import decide
+from stga_addon.cli.parser import main
+from stga_addon.effects import decide as planning
+from stga_addon.effects.decide import decide
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
-from stga_addon.training.folder import Run, read_run, write_run
+from stga_addon.training.run.folder import Run, read_run, write_run
 from stga_addon.training.settings import make_settings
 
 
@@ -23,7 +23,7 @@ def root(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(root, tmp_path_factory):
     out = tmp_path_factory.mktemp("effects") / "run"
-    choices = ["--effect", "strain-color=on", "--effect", "seeds=off"]
+    choices = ["--effect", "strain-color=on", "--effect", "hull-points=off"]
     assert main(["train", str(root), "--out", str(out), "--iterations", "4", *choices]) == 0
     return out
 
@@ -33,14 +33,14 @@ def test_the_run_keeps_its_plan(trained):
     run = read_run(trained)
     plan = {decision.effect: decision for decision in run.plan}
     assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == ("on", True, True)
-    assert (plan["seeds"].choice, plan["seeds"].on, run.settings.seeds) == ("off", False, False)
+    assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == ("off", False, False)
     assert plan["exposure"].choice == "auto"
-    assert run.settings.effects == {"strain-color": "on", "seeds": "off"}
+    assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
 
 
 def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr(planning, "plan_effects", None)
+    monkeypatch.setattr(planning, "decide_effects", None)
     before = read_run(trained)
     train = ["train", str(root), "--out", str(trained), "--resume"]
     assert main([*train, "--effect", "strain-color=on"]) == 0

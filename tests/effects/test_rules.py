@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from stga_addon.effects import rules
+from stga_addon.effects.decide import decide_effects
 from stga_addon.effects.evidence import calm, fit_cameras
 from stga_addon.effects.facts import Facts
-from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.samples import MOST_VIEWS, sample_views, take_samples
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
-from stga_addon.training.plan import EFFECTS, parse_choices
-from stga_addon.training.settings import Settings, make_settings
+from stga_addon.training.effect_plan import EFFECTS, parse_choices
+from stga_addon.training.settings import TrainingSettings, make_settings
 
 from .scenes import gloss, wrinkles
 
@@ -22,7 +22,7 @@ from .scenes import gloss, wrinkles
 def planned(capture, **choices):
     """effect -> decision, and the settings that follow."""
     names = {name.replace("_", "-"): choice for name, choice in choices.items()}
-    settings, plan = plan_effects(capture, make_settings(iterations=1, effects=names))
+    settings, plan = decide_effects(capture, make_settings(iterations=1, effects=names))
     return {decision.effect: decision for decision in plan}, settings
 
 
@@ -34,7 +34,7 @@ def test_plain(painted):
     """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colours is there."""
     plan, settings = planned(painted())
     assert on(plan) == {"antialiasing", "background", "density"}
-    assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.seeds) == (0, False, (), False)
+    assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
 
 
 def test_colour_that_follows_strain(painted):
@@ -49,7 +49,7 @@ def test_colour_that_follows_the_view(painted):
     """Catches gloss that is not seen, or is taken for the cameras' exposure."""
     plan, settings = planned(painted(paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density", "view-color"}
-    assert settings.sh_degree == Settings.sh_degree
+    assert settings.sh_degree == TrainingSettings.sh_degree
 
 
 def unlike_cameras():
@@ -75,7 +75,7 @@ def test_one_camera(painted):
     """Catches effects that one camera cannot tell anything about."""
     plan, settings = planned(painted(cameras=1, paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density"}
-    for name in ("view-color", "exposure", "seeds"):
+    for name in ("view-color", "exposure", "hull-points"):
         with pytest.raises(StgaError, match=f"--effect {name}=on: cannot be, because one camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
     assert settings.sh_steps == ()
@@ -98,7 +98,7 @@ def test_background(painted):
     assert settings.background == (0.0, 0.0, 0.0)
     plan, settings = planned(painted(masks=False))
     assert not plan["background"].on
-    assert not settings.any_background
+    assert not settings.random_background
     with pytest.raises(StgaError, match="background=on: cannot be, because not every image has a mask"):
         planned(painted(masks=False), background="on")
 
@@ -116,8 +116,8 @@ def test_something_beside_the_mesh(painted):
     capture = painted()
     low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]  # the ball's top is cut off
     plan, settings = planned(replace(capture, faces=low))
-    assert plan["seeds"].on
-    assert settings.seeds
+    assert plan["hull-points"].on
+    assert settings.hull_points
 
 
 def test_different_pixels(painted):
@@ -136,18 +136,18 @@ def test_different_pixels(painted):
 
 def test_many_splats_a_pixel(painted):
     """Catches density control where the first splats are already finer than the images."""
-    settings, plan = plan_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
+    settings, plan = decide_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
     assert not next(decision.on for decision in plan if decision.effect == "density")
     assert settings.density_every == 0
 
 
 def test_selection_follows_the_strategy(painted):
     """Catches a strategy that was asked for and is dropped, or one that was not and is taken."""
-    settings, _ = plan_effects(painted(), make_settings("selective", iterations=1, effects={}))
+    settings, _ = decide_effects(painted(), make_settings("selective", iterations=1, effects={}))
     assert settings.strategy == "selective"
     _, settings = planned(painted(), selection="on")
     assert settings.strategy == "selective"
-    settings, plan = plan_effects(
+    settings, plan = decide_effects(
         painted(timesteps=1, deformed=0.0), make_settings("selective", iterations=1, effects={})
     )
     assert settings.strategy == "global"
@@ -229,7 +229,7 @@ def test_what_a_mesh_sequence_has_not(painted):
 def test_overrides(painted):
     """Catches a choice that does not reach the settings, or whose reason is lost."""
     plan, settings = planned(painted(), strain_color="on", view_color="on", background="off", density="off")
-    assert (settings.strain_color, settings.sh_degree, settings.any_background) == (True, 3, False)
+    assert (settings.strain_color, settings.sh_degree, settings.random_background) == (True, 3, False)
     assert settings.density_every == 0
     assert plan["strain-color"].choice == "on"
     assert "as asked" in str(plan["strain-color"])
@@ -239,7 +239,7 @@ def test_overrides(painted):
 def test_names():
     """Catches an effect that the command line does not know, or knows in vain."""
     assert tuple(effect.name for effect in rules.EFFECTS) == EFFECTS
-    assert parse_choices(["jaw=off", "seeds=on"]) == {"jaw": "off", "seeds": "on"}
+    assert parse_choices(["jaw=off", "hull-points=on"]) == {"jaw": "off", "hull-points": "on"}
     for wrong in ("jaws=on", "jaw", "jaw=maybe"):
         with pytest.raises(StgaError, match=f"'{wrong}' is not NAME=on"):
             parse_choices([wrong])

@@ -39,7 +39,7 @@ from stga_addon.errors import StgaError
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
-from stga_addon.training import folder as run_folder
+from stga_addon.training.run import folder as run_folder
 
 from .conftest import SECONDS
 

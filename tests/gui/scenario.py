@@ -22,9 +22,9 @@ STEP_S, PATIENCE_S = 0.1, 180.0
 seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-watch = sys.modules[f"{extension}.operators.watch"]
-runtime_folder = sys.modules[f"{extension}.operators.runtime"].runtime_folder
-task_folder = sys.modules[f"{extension}.stga_addon.runtime"].task_folder
+watch = sys.modules[f"{extension}.operators.monitor"]
+runtime_folder = sys.modules[f"{extension}.operators.environment"].runtime_folder
+task_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].task_folder
 
 
 def timed(name: str, action: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from capture.factory import write_mesh_capture
 
-from stga_addon.package import build_zip
-from stga_addon.task import ask_to_stop
+from stga_addon.development.package import build_zip
+from stga_addon.worker.process import ask_to_stop
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))

@@ -10,8 +10,8 @@ from raster.test_kernels import embed
 from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.autograd import render
-from stga_addon.raster.render import Parameters, camera_frames, render_forward
+from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.rasterize import Parameters, camera_frames, render_forward
 
 from .scenes import (
     NAMES,

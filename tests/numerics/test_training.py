@@ -7,11 +7,11 @@ from training.test_losses import reference as loss_reference
 from training.toys import bits, random_splats
 
 from stga_addon.avatar.embedding import WORLD
-from stga_addon.raster.kernels.rows import distance_limit, scale_limit
-from stga_addon.raster.render import Parameters, camera_frames, render_backward, render_forward
-from stga_addon.training import adam
-from stga_addon.training.losses import REACH, image_gradient, tile_rectangles, whole_image
-from stga_addon.training.state import new_state
+from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit
+from stga_addon.raster.cpu.rasterize import Parameters, camera_frames, render_backward, render_forward
+from stga_addon.training.optimize import adam
+from stga_addon.training.optimize.losses import REACH, image_gradient, tile_rectangles, whole_image
+from stga_addon.training.optimize.state import new_state
 
 from .scenes import NAMES, facing, random_cotangents
 
@@ -80,23 +80,23 @@ def test_loss_never_runs_away(kind: str, value: float) -> None:
 def test_limits_where_every_norm_is_zero() -> None:
     """Catches 0/0 in the gradients of |x| at the origin and of a norm of nothing but zeros."""
     count = 4
-    rows, face, loose = np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.zeros(count, bool)
+    rows, face, unbound = np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.zeros(count, bool)
     for limit in (0.0, 1.0):
         gradient = np.zeros((count, 3), np.float32)
-        norm = distance_limit(rows, np.zeros((count, 3), np.float32), face, loose, np.float32([limit]), 0.1, gradient)
+        norm = distance_limit(rows, np.zeros((count, 3), np.float32), face, unbound, np.float32([limit]), 0.1, gradient)
         assert norm == 0
         assert not gradient.any()
         flat = np.full((count, 3), -200, np.float32)  # scales of e^−200 are zero in float32
-        assert scale_limit(rows, flat, face, loose, np.float32([limit]), 0.1, gradient) == 0
+        assert scale_limit(rows, flat, face, unbound, np.float32([limit]), 0.1, gradient) == 0
         assert not gradient.any()
 
 
 def test_limit_of_one_enormous_splat() -> None:
     """Catches squares that overflow: the other rows' gradients must stay what the formula says."""
     log_scale = np.log(np.float32([[1, 1, 1], [2, 2, 2], [1e15, 1, 1]]))
-    rows, face, loose = np.arange(3, dtype=np.int32), np.zeros(3, np.int32), np.zeros(3, bool)
+    rows, face, unbound = np.arange(3, dtype=np.int32), np.zeros(3, np.int32), np.zeros(3, bool)
     gradient = np.zeros((3, 3), np.float32)
-    norm = scale_limit(rows, log_scale, face, loose, np.float32([0.5]), 1.0, gradient)
+    norm = scale_limit(rows, log_scale, face, unbound, np.float32([0.5]), 1.0, gradient)
     scale = np.exp(log_scale.astype(np.float64))
     expected = np.linalg.norm(scale - 0.5)
     assert norm == pytest.approx(expected, rel=1e-6)

@@ -14,8 +14,8 @@ import hashlib
 import numpy as np
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.capture.camera import Camera
-from stga_addon.raster.render import Parameters, camera_frames, render_backward, render_forward
-from stga_addon.training.losses import image_gradient, whole_image
+from stga_addon.raster.cpu.rasterize import Parameters, camera_frames, render_backward, render_forward
+from stga_addon.training.optimize.losses import image_gradient, whole_image
 rng = np.random.default_rng(0)
 n, pose = 300, np.eye(4)
 pose[2, 3] = 4

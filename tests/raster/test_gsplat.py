@@ -6,8 +6,8 @@ import torch
 
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.autograd import render
-from stga_addon.raster.render import Parameters
+from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.rasterize import Parameters
 
 TOLERANCE = 2e-5  # gsplat computes in float32
 

@@ -11,9 +11,9 @@ from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.autograd import render
-from stga_addon.raster.kernels.threads import set_threads, threads
-from stga_addon.raster.render import Parameters, Scratch, camera_frames, render_backward, render_forward
+from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, camera_frames, render_backward, render_forward
+from stga_addon.raster.cpu.threads import set_threads, threads
 
 NAMES = Parameters._fields[:5]
 # Kernels compute in float32 with a polynomial exp; a pixel sums up to a hundred terms below 1.
@@ -190,7 +190,7 @@ def test_embedded_splats_render_and_train_in_their_frames(convention):
     assert_gradients_agree(gradients, expected)
 
 
-def raw_gradients(scene: Scene, fill: float = 0.0, scratch: Scratch | None = None, **options):
+def raw_gradients(scene: Scene, fill: float = 0.0, scratch: BufferPool | None = None, **options):
     """Forward and backward through the array door: rendering, gradients whose untouched rows keep `fill`, and rows.
 
     background, focus and reach are `render_forward`'s. The cotangents are of colour and alpha.
@@ -300,7 +300,7 @@ def test_gradients_are_overwritten():
 
 def test_reused_buffers_change_nothing():
     """Catches results that depend on what an earlier, larger or smaller, rendering left in the buffers."""
-    scratch = Scratch()
+    scratch = BufferPool()
     for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
         scene = SCENES[name]
         expected, wanted, rows, screen = raw_gradients(scene)

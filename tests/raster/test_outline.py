@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stga_addon.raster.kernels.outline import outline, rows_within
+from stga_addon.raster.cpu.outline import outline, rows_within
 
 
 def splats(kind: str, count: int = 400) -> np.ndarray:

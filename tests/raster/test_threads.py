@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("numba")
 
-from stga_addon.raster.kernels import jit
-from stga_addon.raster.kernels.threads import parallel, set_threads, threads
+from stga_addon.raster.cpu import jit
+from stga_addon.raster.cpu.threads import parallel, set_threads, threads
 
 from .test_kernels import SCENES, kernel_gradients, random_cotangents
 

@@ -29,16 +29,16 @@ from raster.test_kernels import (
 )
 from stga_addon.avatar.embedding import CONVENTIONS, WORLD, face_frames
 from stga_addon.avatar.strain import strain_basis
-from stga_addon.raster import autograd as cpu
 from stga_addon.raster import reference
-from stga_addon.raster.kernels.image_loss import REACH, change_background
-from stga_addon.raster.kernels.rows import adam_rows
-from stga_addon.raster.render import Parameters, camera_frames
-from stga_addon.raster.warp import blend, embed, image_loss, rows, trial
-from stga_addon.raster.warp.autograd import render, shared
-from stga_addon.raster.warp.render import DeviceFrames, Rasteriser, lens_of
-from stga_addon.training.adam import BETA1, BETA2, EPSILON
-from stga_addon.training.losses import image_gradient, tile_rectangles, whole_image
+from stga_addon.raster.cpu import autograd as cpu
+from stga_addon.raster.cpu.image_loss import REACH, change_background
+from stga_addon.raster.cpu.optimizer import adam_rows
+from stga_addon.raster.cpu.rasterize import Parameters, camera_frames
+from stga_addon.raster.gpu import blend, embed, image_loss, optimizer, trial
+from stga_addon.raster.gpu.autograd import render, shared
+from stga_addon.raster.gpu.rasterize import DeviceFrames, Rasteriser, lens_of
+from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
+from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
 
 DEVICE = "cpu"
 MODULES = trial.MODULES
@@ -258,7 +258,7 @@ def test_what_does_not_fit_is_not_drawn_and_told(monkeypatch: pytest.MonkeyPatch
     """Catches pairs that are dropped in silence, written past the buffers' end, or gradients of half a rendering."""
     scene = SCENES["plain"]
     expected = Raw(scene).forward().image.numpy().copy()
-    monkeypatch.setattr("stga_addon.raster.warp.render.FIRST_CAPACITY", 10)
+    monkeypatch.setattr("stga_addon.raster.gpu.rasterize.FIRST_CAPACITY", 10)
     raw = Raw(scene)
     rendering = raw.forward(wait=False)
     assert not rendering.image.numpy().any()
@@ -342,9 +342,9 @@ def test_adam_is_the_other_back_ends_and_keeps_broken_rows() -> None:
     counts, correct = wp.array(steps, device=DEVICE), wp.zeros(7, wp.vec3, device=DEVICE)
     marks = wp.array(wanted, device=DEVICE)
     logarithms = np.log(np.float64(BETA1)), np.log(np.float64(BETA2))
-    wp.launch(rows.count_steps, 7, [marks, *logarithms, 0.05, counts, correct], device=DEVICE)
+    wp.launch(optimizer.count_steps, 7, [marks, *logarithms, 0.05, counts, correct], device=DEVICE)
     wp.launch(
-        rows.adam, (7, 6), [marks, correct, *device, 0.1, 0.01, 3, *(float(b) for b in (BETA1, BETA2, EPSILON))],
+        optimizer.adam, (7, 6), [marks, correct, *device, 0.1, 0.01, 3, *(float(b) for b in (BETA1, BETA2, EPSILON))],
         device=DEVICE,
     )  # fmt: skip
     listed = np.flatnonzero(wanted).astype(np.int32)
@@ -421,5 +421,5 @@ def test_kernels_compile_for_a_gpu(module, tmp_path: Path) -> None:
     assert "local_depot" not in text, "a per-thread array that is not in registers"
     if module is blend:
         assert "shfl.sync" in text
-    if module not in (embed, rows):
+    if module not in (embed, optimizer):
         assert "fma.rn.f64" not in text, "double precision"

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stga_addon.raster.warp import blend
+from stga_addon.raster.gpu import blend
 
 THREADS, LANES = 64, 32
 """A block of the backward kernel is two warps."""

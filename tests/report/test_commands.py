@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 from capture import factory
 
-from stga_addon.cli import main
-from stga_addon.report import calibration
-from stga_addon.training.folder import read_run
+from stga_addon.cli.parser import main
+from stga_addon.report import preset_timing
+from stga_addon.training.run.folder import read_run
 
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every preset takes a millisecond an iteration."""
-    monkeypatch.setattr(calibration, "seconds_per_iteration", lambda *_: 0.001)
+    monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_: 0.001)
 
 
 def test_plan(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,13 +30,13 @@ def test_what_is_timed_is_what_will_train(
 ) -> None:
     """Catches a GPU that is given the minutes of the CPU."""
     timed: list[str] = []
-    monkeypatch.setattr(calibration, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
+    monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
     device = ["--device", "warp-cpu"]
     assert main(["plan", str(toy_root), *device]) == 0
     assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
     made = []
-    monkeypatch.setattr("stga_addon.training.run.train", lambda *call: made.append(call[-1]) or tmp_path)
-    monkeypatch.setattr("stga_addon.report.summary.conclude", lambda folder: [])
+    monkeypatch.setattr("stga_addon.training.run.loop.train", lambda *call: made.append(call[-1]) or tmp_path)
+    monkeypatch.setattr("stga_addon.report.run_summary.conclude", lambda folder: [])
     assert main(["train", str(toy_root), "--preset", "draft", "--out", str(tmp_path), *device]) == 0
     assert timed == ["warp-cpu"] * 7
     assert made == ["warp-cpu"]

@@ -16,9 +16,9 @@ from training.toys import quick_settings
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
-from stga_addon.training import folder as run_folder
-from stga_addon.training import run as run_module
-from stga_addon.training.folder import Run
+from stga_addon.training.run import folder as run_folder
+from stga_addon.training.run import loop as run_module
+from stga_addon.training.run.folder import Run
 
 ITERATIONS = 24
 FULL_AT = 8  # the next step writes a checkpoint and no avatar

@@ -28,11 +28,11 @@ from training.toys import quick_settings
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
-from stga_addon.training import folder as run_folder
-from stga_addon.training import run as run_module
-from stga_addon.training.folder import Run
-from stga_addon.training.state import tensors_of
-from stga_addon.training.warm import compile_kernels
+from stga_addon.training.optimize.precompile import precompile_kernels
+from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.run import folder as run_folder
+from stga_addon.training.run import loop as run_module
+from stga_addon.training.run.folder import Run
 
 ITERATIONS = 250
 INTERVAL = 6.0  # a step takes one second of the clock below
@@ -111,7 +111,7 @@ def same_bits(out: Path, expected: Path) -> bool:
 def main(root: Path, kills: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     driver = Driver(root)
-    compile_kernels()
+    precompile_kernels()
     whole = root / "whole"
     os.waitpid(driver.spawn(whole, False), 0)
     delays = random.Random(5)

@@ -16,9 +16,9 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
-from stga_addon.training import run as run_module
-from stga_addon.training.folder import Run, append_metrics, locked, read_checkpoint
-from stga_addon.training.run import Progress, train
+from stga_addon.training.run import loop as run_module
+from stga_addon.training.run.folder import Run, append_metrics, locked, read_checkpoint
+from stga_addon.training.run.loop import Progress, train
 
 from .disk_driver import FULL_AT, ITERATIONS
 
@@ -112,7 +112,7 @@ CROWD = """
 import os, sys, time
 from pathlib import Path
 from stga_addon.errors import StgaError
-from stga_addon.training.folder import locked
+from stga_addon.training.run.folder import locked
 folder = Path(sys.argv[1])
 children = []
 for n in range(8):

@@ -38,7 +38,7 @@ from stga_addon.files import read_json, read_npz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
-from stga_addon.training import folder as run_folder
+from stga_addon.training.run import folder as run_folder
 
 from .limits import behaves
 

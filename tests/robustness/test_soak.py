@@ -13,9 +13,9 @@ from training.toys import bits, quick_settings
 from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.raster.kernels.threads import set_threads, threads
-from stga_addon.training.trainer import Trainer
-from stga_addon.training.warm import compile_kernels
+from stga_addon.raster.cpu.threads import set_threads, threads
+from stga_addon.training.optimize.precompile import precompile_kernels
+from stga_addon.training.optimize.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 ITERATIONS = int(os.environ.get("STGA_SOAK", 3000))
@@ -103,7 +103,7 @@ def _mark(trainer: Trainer, found: Soak) -> None:
 
 @pytest.fixture(scope="module")
 def long(capture: Capture) -> Soak:
-    compile_kernels()
+    precompile_kernels()
     return soak(capture, ITERATIONS, on=2)
 
 

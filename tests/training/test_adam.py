@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stga_addon.training import adam
-from stga_addon.training.state import TrainState, new_state
+from stga_addon.training.optimize import adam
+from stga_addon.training.optimize.state import TrainState, new_state
 
 from .toys import bits, random_splats, random_state
 

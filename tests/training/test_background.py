@@ -5,9 +5,9 @@ import pytest
 
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.model import Capture
-from stga_addon.raster.kernels.image_loss import change_background
+from stga_addon.raster.cpu.image_loss import change_background
+from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.schedule import view_order
-from stga_addon.training.trainer import Trainer
 
 from .toys import quick_settings
 
@@ -26,9 +26,9 @@ def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
     assert np.abs(out - expected).max() <= 1.01
 
 
-def transmittance_error(capture: Capture, any_background: bool) -> float:
+def transmittance_error(capture: Capture, random_background: bool) -> float:
     """Mean square of alpha − mask on the held-out views, after a short training on a white head before white."""
-    trainer = Trainer(capture, quick_settings("global", lattice=1, any_background=any_background), {})
+    trainer = Trainer(capture, quick_settings("global", lattice=1, random_background=random_background), {})
     for n, view in zip(range(150), view_order(capture.views["train"], 1, 0), strict=False):
         trainer.step(view, np.full_like(read_image(view), 255), n / 150, read_mask(view))
     errors = []
@@ -42,15 +42,15 @@ def transmittance_error(capture: Capture, any_background: bool) -> float:
 
 def test_alpha_becomes_the_mask(toy: Capture) -> None:
     """Catches splats whose opacity no image can tell, because they have the background's colour: a white fringe."""
-    assert transmittance_error(toy, any_background=True) < 0.6 * transmittance_error(toy, any_background=False)
+    assert transmittance_error(toy, random_background=True) < 0.6 * transmittance_error(toy, random_background=False)
 
 
 def test_without_a_mask_the_background_stays(toy: Capture) -> None:
     """Catches a random background behind images whose own background cannot be taken away."""
     view = toy.views["train"][0]
     states = []
-    for any_background in (True, False):
-        trainer = Trainer(toy, quick_settings("global", any_background=any_background), {})
+    for random_background in (True, False):
+        trainer = Trainer(toy, quick_settings("global", random_background=random_background), {})
         trainer.step(view, read_image(view), 0.0)
         states.append(trainer.state.splats().sh)
     np.testing.assert_array_equal(*states)

@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
-from stga_addon.raster.autograd import render
-from stga_addon.raster.render import Parameters
-from stga_addon.training.density import FAINT, control_density
-from stga_addon.training.state import TrainState, keep_rows, new_state, tensors_of
+from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.training.optimize.density import FAINT, control_density
+from stga_addon.training.optimize.state import TrainState, keep_rows, new_state, tensors_of
 
 from .toys import bits, random_state
 
@@ -22,10 +22,10 @@ def busy_state(pulled: list[int]) -> TrainState:
     """Forty splats on six triangles, of which the listed ones are pulled at, the first hardest."""
     state = random_state(COUNT, FACES)
     state.face[:] = torch.arange(COUNT) % FACES
-    state.pull.zero_()
-    state.seen.fill_(2.0)
+    state.screen_gradient.zero_()
+    state.gradient_count.fill_(2.0)
     for strength, row in enumerate(reversed(pulled), 1):
-        state.pull[row] = float(strength)
+        state.screen_gradient[row] = float(strength)
     return state
 
 
@@ -43,9 +43,9 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
     survivors = np.setdiff1d(np.arange(COUNT), pulled)
     assert len(new) == COUNT + 3
     for name, old in before.items():
-        if name not in ("pull", "seen"):
+        if name not in ("screen_gradient", "gradient_count"):
             np.testing.assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
-    parents = np.tile(pulled, 2)  # in the order of their pull
+    parents = np.tile(pulled, 2)  # in the order of their screen_gradient
     for name, tensor in tensors_of(new).items():
         if name.startswith("first"):
             assert not tensor[COUNT - 3 :].any()
@@ -53,8 +53,8 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
             np.testing.assert_array_equal(after[name][COUNT - 3 :], before[name][parents], err_msg=name)
     for value, average in zip(new.parameters, new.average, strict=True):
         assert torch.equal(value[COUNT - 3 :], average[COUNT - 3 :])
-    assert not new.pull.any()
-    assert not new.seen.any()
+    assert not new.screen_gradient.any()
+    assert not new.gradient_count.any()
     assert {len(t) for t in tensors_of(new).values()} == {COUNT + 3}
 
 
@@ -67,7 +67,7 @@ def test_children_stand_on_either_side_along_the_longest_axis() -> None:
     for n, row in enumerate(pulled):
         pair = children.rows(np.array([n, n + 4]))
         assert (pair.face == parents.face[row]).all()
-        assert (pair.loose == parents.loose[row]).all()
+        assert (pair.unbound == parents.unbound[row]).all()
         np.testing.assert_allclose(pair.xyz.mean(0), parents.xyz[row], atol=1e-6)
         longest = int(np.argmax(parents.log_scale[row]))
         axis = Rotation.from_quat(np.roll(parents.rotation[row], -1)).as_matrix()[:, longest]
@@ -91,7 +91,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
         opacity=np.array([np.log(opacity / (1 - opacity))], np.float32),
         sh=np.zeros((1, 1, 3), np.float32),
         face=np.zeros(1, np.int32),
-        loose=np.zeros(1, bool),
+        unbound=np.zeros(1, bool),
     )
     pose = np.eye(4)
     pose[2, 3] = 4.0
@@ -102,7 +102,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
 
     state = new_state(splats)
     parent = cover(state)
-    state.pull[0], state.seen[0] = 1.0, 1.0
+    state.screen_gradient[0], state.gradient_count[0] = 1.0, 1.0
     split = control_density(state, 10, 1.0, np.random.default_rng(0))
     assert len(split) == 2
     children = cover(split)
@@ -132,8 +132,8 @@ def test_room_and_share_bound_the_growth(room: int, share: float, split: int) ->
 def test_the_pull_is_a_mean() -> None:
     """Catches splats that are split because many cameras see them, not because they are wrong."""
     state = busy_state([])
-    state.pull[5], state.seen[5] = 10.0, 100.0
-    state.pull[6], state.seen[6] = 5.0, 1.0
+    state.screen_gradient[5], state.gradient_count[5] = 10.0, 100.0
+    state.screen_gradient[6], state.gradient_count[6] = 5.0, 1.0
     new = control(state, room=1)
     left = {tuple(p) for p in new.splats().xyz.tolist()}
     assert tuple(state.parameters.xyz[6].tolist()) not in left
@@ -141,25 +141,25 @@ def test_the_pull_is_a_mean() -> None:
 
 
 def test_faint_splats_go_but_no_triangles_last_one() -> None:
-    """Catches bald triangles, which nothing would ever fill again; loose splats do not count as a triangle's own."""
+    """Catches bald triangles, which nothing would ever fill again; unbound splats do not count as a triangle's own."""
     state = busy_state([])
-    state.loose[:] = torch.arange(COUNT) % 7 == 3
+    state.unbound[:] = torch.arange(COUNT) % 7 == 3
     state.parameters.opacity[:] = torch.where(torch.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1)
     state.parameters.opacity[(state.face == 2)] = FAINT_LOGIT - 1
     state.parameters.opacity[14] = FAINT_LOGIT - 0.5  # the most opaque of triangle 2
     state.parameters.opacity[38] = 3.0
-    assert state.loose[38]
+    assert state.unbound[38]
     assert state.face[38] == 2
     assert state.face[14] == 2
-    assert not state.loose[14]
+    assert not state.unbound[14]
     new = control(state)
-    bound = new.face[~new.loose]
+    bound = new.face[~new.unbound]
     assert set(bound.tolist()) == set(range(FACES))
     assert int((bound == 2).sum()) == 1
-    assert new.parameters.opacity[(new.face == 2) & ~new.loose].tolist() == pytest.approx([FAINT_LOGIT - 0.5])
+    assert new.parameters.opacity[(new.face == 2) & ~new.unbound].tolist() == pytest.approx([FAINT_LOGIT - 0.5])
     others = new.face != 2
     assert (new.parameters.opacity[others] > FAINT_LOGIT).all()
-    assert (new.parameters.opacity[new.loose & others] > FAINT_LOGIT).all()
+    assert (new.parameters.opacity[new.unbound & others] > FAINT_LOGIT).all()
     assert int(others.sum()) == sum(n >= 30 and n % FACES != 2 for n in range(COUNT))
 
 
@@ -167,9 +167,9 @@ def test_one_splat_a_triangle_survives_even_when_all_are_faint_and_pulled_at() -
     """Catches pruning and splitting that together empty a triangle."""
     state = busy_state(list(range(0, COUNT, 2)))
     state.parameters.opacity[:] = -20.0
-    state.loose[:] = torch.arange(COUNT) % 7 == 0
+    state.unbound[:] = torch.arange(COUNT) % 7 == 0
     new = control(state)
-    assert set(new.face[~new.loose].tolist()) == set(range(FACES))
+    assert set(new.face[~new.unbound].tolist()) == set(range(FACES))
     assert all(torch.isfinite(t).all() for t in new.parameters)
 
 

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.raster.warp import trial
-from stga_addon.training import device as device_module
-from stga_addon.training.device import LEAST_FREE, choose_device
+from stga_addon.raster.gpu import trial
+from stga_addon.training.optimize import device as device_module
+from stga_addon.training.optimize.device import LEAST_FREE, choose_device
 
 warp = pytest.importorskip("warp")
 
@@ -75,7 +75,7 @@ def test_what_is_wrong_is_said_and_only_auto_falls_back(gpu: Gpu, monkeypatch: p
 def test_warp_is_imported_only_where_it_works() -> None:
     """Catches a run on the CPU that needs warp-lang, or waits for it to start."""
     script = (
-        "import sys; from stga_addon.training import run, trainer, device; device.choose_device('cpu'); "
-        "sys.exit('warp' in sys.modules)"
+        "import sys; from stga_addon.training.optimize import device; from stga_addon.training.run import loop; "
+        "device.choose_device('cpu'); sys.exit('warp' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.training import folder
-from stga_addon.training.folder import Checkpoint, Run
+from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.run import folder
+from stga_addon.training.run.folder import Checkpoint, Run
 from stga_addon.training.settings import STRATEGIES, make_settings
-from stga_addon.training.state import tensors_of
 
 from .toys import random_state
 
@@ -196,7 +196,7 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         assert (target / "run.lock").exists()  # the refused one must not take the lock away
     assert not (target / "run.lock").exists()
     hold = (
-        "import sys; from pathlib import Path; from stga_addon.training.folder import locked\n"
+        "import sys; from pathlib import Path; from stga_addon.training.run.folder import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", hold, str(target)]

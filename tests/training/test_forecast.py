@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stga_addon.training.forecast import (
+from stga_addon.training.evaluate.forecast import (
     FEWEST,
     Forecast,
     clock,

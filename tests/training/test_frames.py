@@ -7,7 +7,7 @@ import pytest
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.model import Capture
-from stga_addon.training.frames import KEPT, FrameStore
+from stga_addon.training.optimize.frames import KEPT, FrameStore
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])

@@ -12,11 +12,11 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.training import run as run_module
-from stga_addon.training.folder import Run, read_checkpoint, read_metrics
-from stga_addon.training.forecast import hits
-from stga_addon.training.metrics import Quality
-from stga_addon.training.run import EVALUATION_SHARE, Progress, train
+from stga_addon.training.evaluate.forecast import hits
+from stga_addon.training.evaluate.metrics import Quality
+from stga_addon.training.run import loop as run_module
+from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
+from stga_addon.training.run.loop import EVALUATION_SHARE, Progress, train
 
 from .toys import quick_settings
 
@@ -28,7 +28,7 @@ def run_of(capture: Capture, **changes: Any) -> Run:
 
 
 def scores(values: Iterator[float]) -> Evaluate:
-    return lambda draw, sights, perceptual: Quality(next(values), 0.5)
+    return lambda draw, evaluation_views, perceptual: Quality(next(values), 0.5)
 
 
 class Clock:
@@ -80,7 +80,7 @@ def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock
     assert [line["iteration"] for line in lines if "forecast" in line] == [80, 100, 120, 140, 160, 180]
     hit, checked = hits(lines)
     assert 0 < hit <= checked == 6
-    assert any("another" in progress.outlook for progress in told)
+    assert any("another" in progress.forecast_text for progress in told)
 
 
 def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,9 +99,9 @@ def test_a_target_out_of_sight_is_said_while_training(toy: Capture, tmp_path: Pa
     """Catches a person who waits to the end to learn that it was in vain."""
     told: list[str] = []
     run = run_of(toy, iterations=40, target_psnr=60.0)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.outlook)))
-    assert any("60 dB is not in sight" in outlook for outlook in told)
-    assert not any(outlook.startswith(";") for outlook in told)  # near the end there is nothing else to say
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.forecast_text)))
+    assert any("60 dB is out of reach" in forecast_text for forecast_text in told)
+    assert not any(forecast_text.startswith(";") for forecast_text in told)  # near the end there is nothing else to say
     assert read_checkpoint(tmp_path).iteration == 40
 
 
@@ -121,10 +121,12 @@ def test_a_run_that_no_longer_improves(
     monkeypatch.setattr(run_module, "evaluate", scores(falling))
     told: list[str] = []
     run = run_of(toy, iterations=None, seconds=200.0, stop_when_flat=stop)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.outlook)))
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.forecast_text)))
     assert (read_checkpoint(tmp_path).iteration < 200) == stop
     if not stop:
-        assert any(re.fullmatch(r"no gain since \d+ s: more time no longer helps", outlook) for outlook in told)
+        assert any(
+            re.fullmatch(r"no gain since \d+ s: more time no longer helps", forecast_text) for forecast_text in told
+        )
 
 
 def test_images_grow_where_settings_say_so(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stga_addon.raster.kernels.rows import distance_limit, scale_limit
-from stga_addon.training.trainer import reset_strays
+from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit
+from stga_addon.training.optimize.trainer import reset_strays
 
 from .toys import bits, random_splats, random_state
 
@@ -24,7 +24,7 @@ def scene(request: pytest.FixtureRequest):
 
 def expected(values: np.ndarray, size, splats, rows, limit) -> tuple[float, np.ndarray]:
     x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    bound = rows[~splats.loose[rows]]
+    bound = rows[~splats.unbound[rows]]
     of = torch.tensor(limit[splats.face[bound]], dtype=torch.float64)
     excess = torch.relu(size(x)[bound] - of.reshape(-1, *[1] * (size(x).dim() - 1)))
     norm = excess.norm()
@@ -33,30 +33,30 @@ def expected(values: np.ndarray, size, splats, rows, limit) -> tuple[float, np.n
 
 
 def test_scale_limit(scene) -> None:
-    """Catches a gradient that forgets the exponential or the norm, reaches unlisted or loose rows, or overwrites."""
+    """Catches a gradient that forgets the exponential or the norm, reaches unlisted or unbound rows, or overwrites."""
     splats, rows, limit = scene
     limit = limit * np.float32(np.exp(-5))
     norm, gradient = expected(splats.log_scale, torch.exp, splats, rows, limit)
     assert norm > 0
     out = np.full((50, 3), 0.25, np.float32)
-    found = scale_limit(rows, splats.log_scale, splats.face, splats.loose, limit, WEIGHT, out)
+    found = scale_limit(rows, splats.log_scale, splats.face, splats.unbound, limit, WEIGHT, out)
     assert found == pytest.approx(norm, rel=1e-5)
     np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-7)
-    untouched = splats.loose | ~np.isin(np.arange(50), rows)
+    untouched = splats.unbound | ~np.isin(np.arange(50), rows)
     np.testing.assert_array_equal(out[untouched], 0.25)
 
 
 def test_distance_limit(scene) -> None:
-    """Catches a gradient along the wrong axis or of the squared norm, and loose splats pulled towards the mesh."""
+    """Catches a gradient along the wrong axis or of the squared norm, and unbound splats pulled towards the mesh."""
     splats, rows, limit = scene
     limit = limit * np.float32(0.015)
     norm, gradient = expected(splats.xyz, lambda x: x.norm(dim=1), splats, rows, limit)
     assert norm > 0
     out = np.full((50, 3), 0.25, np.float32)
-    found = distance_limit(rows, splats.xyz, splats.face, splats.loose, limit, WEIGHT, out)
+    found = distance_limit(rows, splats.xyz, splats.face, splats.unbound, limit, WEIGHT, out)
     assert found == pytest.approx(norm, rel=1e-5)
     np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-6)
-    untouched = splats.loose | ~np.isin(np.arange(50), rows)
+    untouched = splats.unbound | ~np.isin(np.arange(50), rows)
     np.testing.assert_array_equal(out[untouched], 0.25)
 
 
@@ -68,15 +68,15 @@ def test_within_the_limits_nothing_happens(kernel) -> None:
     out = np.full((8, 3), 0.25, np.float32)
     values = splats.log_scale if kernel is scale_limit else splats.xyz
     rows, limit = np.arange(8, dtype=np.int32), np.full(FACES, 10, np.float32)
-    assert kernel(rows, values, splats.face, splats.loose, limit, WEIGHT, out) == 0
+    assert kernel(rows, values, splats.face, splats.unbound, limit, WEIGHT, out) == 0
     np.testing.assert_array_equal(out, 0.25)
 
 
 @pytest.mark.parametrize("to", [0.0, 0.5, 1.0])
 def test_stray_resets(to: float) -> None:
-    """Catches a limit of another triangle, loose splats pulled home, and momentum that throws a splat out again."""
+    """Catches a limit of another triangle, unbound splats pulled home, and momentum that throws a splat out again."""
     state = random_state(60, FACES)
-    state.loose[:] = torch.arange(60) % 4 == 0
+    state.unbound[:] = torch.arange(60) % 4 == 0
     limit = np.array([0.005, 0.012, 0.02, 0.03, 10.0], np.float32)
     xyz, face = state.parameters.xyz.numpy().copy(), state.face.numpy()
     far = [bool(np.hypot(np.hypot(*p[:2]), p[2]) > limit[f]) for p, f in zip(xyz.astype(float), face, strict=True)]

@@ -14,13 +14,13 @@ from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.errors import StgaError
-from stga_addon.training import lpips
-from stga_addon.training.evaluations import read_metrics
-from stga_addon.training.folder import Run
-from stga_addon.training.lpips import read_network
-from stga_addon.training.metrics import evaluate
-from stga_addon.training.run import train
-from stga_addon.training.watch import Sight
+from stga_addon.training.evaluate import lpips
+from stga_addon.training.evaluate.evaluation_views import EvaluationView
+from stga_addon.training.evaluate.lpips import read_network
+from stga_addon.training.evaluate.metrics import evaluate
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 
 from .toys import quick_settings
 
@@ -110,23 +110,27 @@ def test_is_measured_where_weights_are_named(tmp_path: Path, monkeypatch: pytest
     assert quality.lpips == pytest.approx(read_network(path).distance(image, stored), rel=1e-6)
     assert "lpips" not in evaluate(lambda view: image, [sight_of(tmp_path, target)]).as_json()
 
-    sight = sight_of(tmp_path, target)
+    evaluation_view = sight_of(tmp_path, target)
     where = np.zeros((47, 68), bool)
     where[10:30, 10:40] = True
     partly = np.where(where, image, stored)
-    of_region = evaluate(lambda view: image, [Sight(sight.view, sight.target, {"mask": where})], perceptual=True)
+    of_region = evaluate(
+        lambda view: image,
+        [EvaluationView(evaluation_view.view, evaluation_view.target, {"mask": where})],
+        perceptual=True,
+    )
     assert of_region.as_json()["lpips_mask"] == pytest.approx(read_network(path).distance(partly, stored), rel=1e-6)
 
     small, other = pair(30, 68)
     assert evaluate(lambda view: small, [sight_of(tmp_path, other)], perceptual=True).lpips is None
 
 
-def sight_of(root: Path, target: np.ndarray) -> Sight:
+def sight_of(root: Path, target: np.ndarray) -> EvaluationView:
     picture = np.round(255 * target.transpose(1, 2, 0)).astype(np.uint8)
     Image.fromarray(picture).save(root / "target.png")
     camera = Camera(picture.shape[1], picture.shape[0], 50.0, 50.0, 12.0, 15.0, np.eye(4))
     view = View(0, 0, camera, "target.png", root / "target.png")
-    return Sight(view, read_image(view))
+    return EvaluationView(view, read_image(view))
 
 
 def without(weights: dict[str, Any], *path: str) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import View
-from stga_addon.training.metrics import Quality, evaluate, peak_memory_mb, psnr
-from stga_addon.training.watch import Sight
+from stga_addon.training.evaluate.evaluation_views import EvaluationView
+from stga_addon.training.evaluate.metrics import Quality, evaluate, peak_memory_mb, psnr
 
 HEIGHT, WIDTH = 31, 24
 
@@ -33,8 +33,8 @@ def reference_ssim(image: np.ndarray, target: np.ndarray, where: np.ndarray | No
     return float(np.mean(values if where is None else values[where]))
 
 
-def sights_of(views: list[View]) -> list[Sight]:
-    return [Sight(view, read_image(view)) for view in views]
+def sights_of(views: list[View]) -> list[EvaluationView]:
+    return [EvaluationView(view, read_image(view)) for view in views]
 
 
 def write_views(root: Path, count: int) -> list[View]:
@@ -83,10 +83,13 @@ def test_regions_are_measured_by_themselves(tmp_path: Path) -> None:
     inside = np.clip(target / 255 + rng.normal(0, 0.1, target.shape), 0, 1)
     good = np.where(where[..., None], inside, target / 255)
     bad = np.where(where[..., None], inside, rng.random(target.shape))
-    sights = [Sight(views[0], target, {"mask": where}), Sight(views[1], read_image(views[1]))]
+    evaluation_views = [
+        EvaluationView(views[0], target, {"mask": where}),
+        EvaluationView(views[1], read_image(views[1])),
+    ]
     for image in (good, bad):
         drawn = np.moveaxis(image, 2, 0).astype(np.float32)
-        quality = evaluate(lambda view, drawn=drawn: drawn, sights)  # type: ignore[misc]
+        quality = evaluate(lambda view, drawn=drawn: drawn, evaluation_views)  # type: ignore[misc]
         region = quality.regions["mask"]
         error = ((inside - target / 255) ** 2)[where]
         assert region.psnr == pytest.approx(-10 * np.log10(error.mean()), abs=1e-3)
@@ -114,8 +117,8 @@ def test_peak_memory_never_falls() -> None:
 def test_lpips_is_left_out_where_its_weights_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a crash, or a made-up number, without weights."""
     monkeypatch.delenv("STGA_LPIPS", raising=False)
-    sights = sights_of(write_views(tmp_path, 1))
-    quality = evaluate(lambda view: np.zeros((3, HEIGHT, WIDTH), np.float32), sights, perceptual=True)
+    evaluation_views = sights_of(write_views(tmp_path, 1))
+    quality = evaluate(lambda view: np.zeros((3, HEIGHT, WIDTH), np.float32), evaluation_views, perceptual=True)
     assert quality.lpips is None
     assert set(quality.as_json()) == {"psnr", "ssim"}
     assert Quality(30.0, 0.9, 0.1).as_json() == {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1}

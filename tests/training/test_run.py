@@ -13,12 +13,12 @@ import pytest
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.training import run as run_module
-from stga_addon.training.folder import Run, read_checkpoint, read_metrics, read_run, read_selection
-from stga_addon.training.metrics import Quality
-from stga_addon.training.run import Progress, train
+from stga_addon.training.evaluate.metrics import Quality
+from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.run import loop as run_module
+from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics, read_run, read_selection
+from stga_addon.training.run.loop import Progress, train
 from stga_addon.training.settings import STRATEGIES
-from stga_addon.training.state import tensors_of
 
 from .toys import quick_settings
 

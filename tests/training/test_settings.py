@@ -1,4 +1,4 @@
-"""Settings survive their trip through JSON and refuse what cannot be."""
+"""TrainingSettings survive their trip through JSON and refuse what cannot be."""
 
 import dataclasses
 import json
@@ -8,7 +8,15 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.selection import SelectionOptions
-from stga_addon.training.settings import SCHEDULES, STRATEGIES, Rates, Settings, from_json, make_settings, to_json
+from stga_addon.training.settings import (
+    SCHEDULES,
+    STRATEGIES,
+    Rates,
+    TrainingSettings,
+    from_json,
+    make_settings,
+    to_json,
+)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -32,7 +40,7 @@ def test_nested_settings_round_trip() -> None:
 def test_unknown_or_missing_fields(change: dict[str, Any]) -> None:
     """Catches a misspelt field that is dropped in silence."""
     with pytest.raises((TypeError, KeyError)):
-        from_json({**to_json(Settings(iterations=5)), **change})
+        from_json({**to_json(TrainingSettings(iterations=5)), **change})
 
 
 @pytest.mark.parametrize(
@@ -58,7 +66,7 @@ def test_the_papers_letter() -> None:
     """Catches a schedule that does not reach the settings: the figures are the paper's own."""
     paper = make_settings(schedule="paper", iterations=5)
     assert (paper.global_every, paper.global_unit, paper.warm_up) == (20, "iteration", 0.0)
-    assert (paper.lattice, paper.views_per_visit, paper.seeds) == (4, 0, False)
+    assert (paper.lattice, paper.views_per_visit, paper.hull_points) == (4, 0, False)
     assert (paper.scale_limit, paper.stray_limit, paper.selection.threshold) == (1.0, 1.0, 0.01)
     changed = make_settings(schedule="paper", iterations=5, lattice=2)
     assert changed == dataclasses.replace(paper, lattice=2)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stga_addon.training.state import join, keep_rows, new_state, state_of, tensors_of
+from stga_addon.training.optimize.state import join, keep_rows, new_state, state_of, tensors_of
 
 from .toys import random_splats, random_state
 
@@ -14,7 +14,15 @@ def test_flat_names_round_trip() -> None:
     state = random_state(9, 5)
     flat = tensors_of(state)
     assert len(flat) == 5 * 6 + 5
-    some = {"parameters/xyz", "average/sh", "gradients/sh", "first/opacity", "second/rotation", "steps", "pull"}
+    some = {
+        "parameters/xyz",
+        "average/sh",
+        "gradients/sh",
+        "first/opacity",
+        "second/rotation",
+        "steps",
+        "screen_gradient",
+    }
     assert some <= set(flat)
     again = tensors_of(state_of(flat))
     assert list(again) == list(flat)

@@ -10,22 +10,22 @@ import pytest
 import torch
 from PIL import Image
 
-from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_pull
+from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
 from stga_addon.capture.images import read_image, read_view
 from stga_addon.capture.model import Capture
-from stga_addon.cli import main
+from stga_addon.cli.parser import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.sequence import read_motion, sequence_mesh
-from stga_addon.raster.render import Parameters
-from stga_addon.training.cpu_step import CpuStep
-from stga_addon.training.evaluations import read_metrics
-from stga_addon.training.folder import Run, read_checkpoint, read_run
-from stga_addon.training.metrics import psnr
-from stga_addon.training.run import train
+from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.training.evaluate.metrics import psnr
+from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.tracking import Tracking, frame_gradient, refined, track
+from stga_addon.training.optimize.trainer import Trainer
+from stga_addon.training.run.folder import Run, read_checkpoint, read_run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.schedule import view_order
-from stga_addon.training.tracking import Tracking, frame_gradient, refined, track
-from stga_addon.training.trainer import Trainer
 
 from .heads import TIMESTEPS, write_head
 from .toys import quick_settings
@@ -116,7 +116,7 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
     gradients = torch.autograd.grad(loss(), leaves)
     splats, asked = (Parameters(*(t.detach().numpy() for t in ts), None, None) for ts in (leaves, gradients))
     parts = frame_gradient(splats, face, asked, np.arange(len(face)), frames())
-    found = tracking.gradient(3, frame_pull(tracking.mesh(3), capture.faces, frames(), *parts))
+    found = tracking.gradient(3, frame_backward(tracking.mesh(3), capture.faces, frames(), *parts))
     expected = differences(tracking, 3, lambda: loss().item(), 1e-6)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
@@ -130,7 +130,7 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     """
     trainer, capture = finished, finished.capture
     step, tracking = trainer._step, trainer.tracking
-    assert isinstance(step, CpuStep)
+    assert isinstance(step, CpuBackend)
     assert tracking is not None
     view = next(view for view in capture.views["train"] if view.timestep == 3)
     target, face = read_image(view), trainer.state.face.numpy()
@@ -150,7 +150,7 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     rows, _ = differentiate(1.0)
     gradients, frames = Parameters(*(tensor.numpy() for tensor in trainer.state.gradients)), trainer.frames.of(3)
     asked = frame_gradient(trainer.state.arrays(), face, gradients, rows, frames)
-    found = tracking.gradient(3, frame_pull(trainer.frames.mesh(3), capture.faces, frames, *asked))
+    found = tracking.gradient(3, frame_backward(trainer.frames.mesh(3), capture.faces, frames, *asked))
     tracking.tracked = before
     assert slope > 0
     assert 0.7 < found @ away / slope < 1.2

@@ -15,11 +15,11 @@ from PIL import Image
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
-from stga_addon.training.cpu_step import CpuStep
-from stga_addon.training.metrics import psnr
+from stga_addon.training.evaluate.metrics import psnr
+from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.trainer import Trainer, face_lengths, initial_splats
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import STRATEGIES
-from stga_addon.training.trainer import Trainer, face_lengths, initial_splats
 
 from .toys import bits, quick_settings
 
@@ -37,8 +37,8 @@ def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) 
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
 
 
-def cpu_step(trainer: Trainer) -> CpuStep:
-    assert isinstance(trainer._step, CpuStep)
+def cpu_step(trainer: Trainer) -> CpuBackend:
+    assert isinstance(trainer._step, CpuBackend)
     return trainer._step
 
 
@@ -95,7 +95,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     step = cpu_step(trainer)
     rows, screen, loss = step._differentiate(view, target, WHITE, degree, None)
     full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
-    pull, wanted = screen.copy(), rows[focus[rows]].copy()
+    screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
     for buffer in step._scratch._buffers.values():
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
@@ -110,7 +110,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
         difference = np.abs(tensor.numpy()[rows] - full[name][rows]).max(initial=0)
         assert difference <= 1e-6 * np.abs(full[name][rows]).max(initial=0), name
         np.testing.assert_array_equal(tensor.numpy()[others], 7.0)
-    np.testing.assert_allclose(screen[rows], pull[rows], rtol=1e-5)
+    np.testing.assert_allclose(screen[rows], screen_gradient[rows], rtol=1e-5)
 
 
 def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
@@ -176,7 +176,7 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     image, counts = read_image(view), []
     face = trainer.state.face.numpy()
     trainer.state.parameters.xyz[7] = 1.0
-    assert not trainer.state.loose[7]
+    assert not trainer.state.unbound[7]
     for n in range(10):
         if n == 4:
             assert float(trainer.state.parameters.xyz[trainer.state.face == int(face[7])].norm(dim=1).max()) > 0.9
@@ -195,7 +195,7 @@ def test_pull_is_gathered_by_global_iterations_only(toy: Capture) -> None:
     view = view_of(toy, 1)
     for expected in (0, 0, 1, 1, 1, 2):
         trainer.step(view, read_image(view), 0.5)
-        assert trainer.state.seen.max() == expected
+        assert trainer.state.gradient_count.max() == expected
 
 
 def test_initial_splats_with_hull_seeds(tmp_path: Path) -> None:
@@ -206,19 +206,19 @@ def test_initial_splats_with_hull_seeds(tmp_path: Path) -> None:
     for path in (tmp_path / "hairy" / "fg_masks").iterdir():
         Image.fromarray(mask.astype(np.uint8) * 255).save(path)
     bare = initial_splats(hairy, quick_settings(lattice=2))
-    full = initial_splats(hairy, quick_settings(lattice=2, seeds=True))
+    full = initial_splats(hairy, quick_settings(lattice=2, hull_points=True))
     assert len(bare) == 6 * len(hairy.faces)
-    assert not bare.loose.any()
+    assert not bare.unbound.any()
     assert len(full) > len(bare) + 100
-    assert full.loose[len(bare) :].all()
+    assert full.unbound[len(bare) :].all()
     for name, value in vars(bare).items():
         np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
 
 
 def test_nothing_beside_the_mesh_gives_no_seeds(toy: Capture) -> None:
     """Catches the hull's phantom volumes behind the head, which few cameras on one side cannot contradict."""
-    full = initial_splats(toy, quick_settings(lattice=2, seeds=True))
-    assert not full.loose.any()
+    full = initial_splats(toy, quick_settings(lattice=2, hull_points=True))
+    assert not full.unbound.any()
 
 
 def test_draw_shows_the_average(toy: Capture) -> None:

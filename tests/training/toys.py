@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from stga_addon.avatar.splats import Splats
-from stga_addon.training.settings import Settings, make_settings
-from stga_addon.training.state import TrainState, new_state, tensors_of
+from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
+from stga_addon.training.settings import TrainingSettings, make_settings
 
 
 def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Splats:
@@ -19,7 +19,7 @@ def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Spl
         opacity=rng.normal(size=count).astype(np.float32),
         sh=rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
         face=rng.integers(0, faces, count).astype(np.int32),
-        loose=rng.random(count) < 0.3,
+        unbound=rng.random(count) < 0.3,
         strain_color=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
     )
 
@@ -32,14 +32,14 @@ def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> Trai
         for tensor in part:
             tensor.copy_(torch.rand(tensor.shape, generator=generator))
     state.steps += torch.arange(1, count + 1, dtype=torch.int32)
-    state.pull += torch.rand(count, generator=generator)
-    state.seen += torch.arange(1, count + 1)
+    state.screen_gradient += torch.rand(count, generator=generator)
+    state.gradient_count += torch.arange(1, count + 1)
     return state
 
 
-def quick_settings(strategy: str = "selective", **changes: Any) -> Settings:
+def quick_settings(strategy: str = "selective", **changes: Any) -> TrainingSettings:
     """Without hull seeds, which have tests of their own."""
-    return make_settings(strategy, **{"iterations": 100, "seeds": False, **changes})
+    return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
 
 
 def bits(state: TrainState) -> dict[str, np.ndarray]:

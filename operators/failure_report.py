@@ -1,0 +1,33 @@
+"""What went wrong, for somebody who is to find out why."""
+
+import platform
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon import __version__
+from ..stga_addon.jobs.training_job import folder_of
+from ..stga_addon.worker import process
+from . import ids, monitor
+from .common import file_path, reporting
+
+
+class CopyReport(bpy.types.Operator):
+    """Copy the message, the traceback and the log of a worker to the clipboard"""
+
+    bl_idname = ids.COPY_REPORT
+    bl_label = "Copy Report"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    directory: bpy.props.StringProperty(
+        name="Folder", description="The worker's folder; empty: that of the scene's training", subtype="DIR_PATH"
+    )
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        run = monitor.run_of(context.scene)
+        folder = file_path(self.directory, "folder") if self.directory or run is None else folder_of(run)
+        versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
+        context.window_manager.clipboard = f"{versions}\n{process.account(folder, monitor.snapshot(folder))}"
+        self.report({"INFO"}, "Copied to the clipboard")
+        return {"FINISHED"}

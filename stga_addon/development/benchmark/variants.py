@@ -1,0 +1,59 @@
+"""What a benchmark compares: strategies and presets, or one knob at a time."""
+
+from typing import Any
+
+from ...errors import StgaError
+from ...selection import SelectionOptions
+from ...training.settings import PRESETS, STRATEGIES, TrainingSettings, make_settings
+
+Changes = dict[str, Any]
+"""Arguments of `make_settings`."""
+
+STANDARD = "standard"
+"""The variant that the others are compared with."""
+
+MAIN: dict[str, Changes] = {
+    **{preset: {"preset": preset} for preset in PRESETS},
+    **{strategy: {"strategy": strategy} for strategy in STRATEGIES if strategy != "global"},
+    "paper": {"schedule": "paper"},
+}
+"""Presets (all of them train globally) and the other strategies."""
+
+KNOBS: dict[str, Changes] = {
+    STANDARD: {},
+    "scale-0.5": {"scale": 0.5},
+    "coarse-30%": {"coarse_span": 0.3},
+    "splats-3": {"lattice": 1},
+    "splats-10": {"lattice": 3},
+    "splats-15": {"lattice": 4},
+    "sh-0": {"sh_degree": 0, "sh_steps": ()},
+    "sh-1": {"sh_degree": 1, "sh_steps": (0.3,)},
+    "no-dssim": {"ssim_weight": 0.0},
+    "no-density": {"density_every": 0},
+    "density-x2": {"growth": 0.5, "density_every": 100},
+    "no-strays": {"stray_every": 0},
+    "frame-batches": {"views_per_visit": 0},
+    "selective": {"strategy": "selective"},
+    "selective-every-2": {"strategy": "selective", "global_every": 2},
+    "selective-every-20": {"strategy": "selective", "global_every": 20},
+    "selective-warm-30%": {"strategy": "selective", "warm_up": 0.3},
+    "selective-1mm": {"strategy": "selective", "selection": SelectionOptions(threshold=0.001)},
+    "selective-5mm": {"strategy": "selective", "selection": SelectionOptions(threshold=0.005)},
+}
+"""One setting changed at a time: resolution, splats a triangle, degree of colour, loss, density control, stray
+resets, order of views, and for selective training the period of global iterations, its beginning and the threshold."""
+
+
+def settings_of(changes: Changes, seconds: float) -> TrainingSettings:
+    """Settings as `stga train` makes them: effects are left to be decided, but for a method that is fixed by its
+    letter."""
+    fixed = changes.get("schedule") == "paper" or changes.get("strategy") == "gaussian-avatars"
+    return make_settings(**{"seconds": seconds, "effects": None if fixed else {}, **changes})
+
+
+def chosen(variants: dict[str, Changes], only: list[str] | None) -> dict[str, Changes]:
+    """The variants named in `only`, in the order of the table; all without it. Raises StgaError for unknown names."""
+    unknown = sorted(set(only or ()) - set(variants))
+    if unknown:
+        raise StgaError(f"--only: '{unknown[0]}' is not one of {', '.join(variants)}")
+    return {name: changes for name, changes in variants.items() if only is None or name in only}

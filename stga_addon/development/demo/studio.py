@@ -1,0 +1,209 @@
+"""A photo studio in Blender: path-traced pictures of a moving mesh from calibrated cameras."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...capture.camera import Camera
+
+SENSOR_MM = 36.0
+# Soft boxes around the sitter: azimuth and elevation in degrees (0, 0 is straight ahead), watts.
+SOFT_BOXES = ((-50, 32, 8.0), (48, 36, 6.0), (0, -20, 2.0))
+BOX_DISTANCE, BOX_SIZE = 1.2, 0.6  # metres
+AMBIENT = 0.5
+
+
+@dataclass(frozen=True)
+class Sitter:
+    """What stands in the studio.
+
+    faces (F, 3); rest (V, 3) positions the skin's fine texture is attached to; tint (V, 3) linear RGB;
+    roughness and grain (V,): grain is how much fine texture shows, 0 to 1.
+    """
+
+    faces: np.ndarray
+    rest: np.ndarray
+    tint: np.ndarray
+    roughness: np.ndarray
+    grain: np.ndarray
+
+
+def photograph(
+    sitter: Sitter,
+    poses: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    keep: Callable[[int, int, np.ndarray], None],
+    samples: int,
+    seed: int = 0,
+) -> None:
+    """Path-trace every pose (V, 3) from every camera, one after the other.
+
+    `keep(pose, camera, rgba)` gets each picture: (H, W, 4) uint8, sRGB, straight alpha. Works in a scene of its own
+    with Cycles on the CPU and leaves the open file as it was. All cameras share one size.
+    """
+    with _studio(sitter, samples, seed) as (scene, head, camera), TemporaryDirectory() as folder:
+        for index, vertices in enumerate(poses):
+            head.data.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
+            head.data.update()
+            for number, view in enumerate(cameras):
+                place_camera(scene, camera, view)
+                keep(index, number, _render(scene, Path(folder) / "view.png"))
+
+
+def place_camera(scene: bpy.types.Scene, camera: bpy.types.Object, view: Camera) -> None:
+    """Give a Blender camera and the scene's image the intrinsics and pose of `view` (pixels must be square)."""
+    scene.render.resolution_x, scene.render.resolution_y = view.width, view.height
+    camera.data.sensor_fit, camera.data.sensor_width = "HORIZONTAL", SENSOR_MM
+    camera.data.lens = SENSOR_MM * view.fl_x / view.width
+    # Shifts are in image widths and move the frame, so the principal point goes the other way.
+    camera.data.shift_x = (view.width / 2 - view.cx) / view.width
+    camera.data.shift_y = (view.cy - view.height / 2) / view.width
+    camera.matrix_world = Matrix(view.camera_to_world_gl.tolist())
+
+
+def _render(scene: bpy.types.Scene, path: Path) -> np.ndarray:
+    from PIL import Image
+
+    scene.render.filepath = str(path)
+    with _silent():
+        bpy.ops.render.render(write_still=True, scene=scene.name)
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGBA")).copy()
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Blender announces every saved picture on the process's standard output, in between our own progress bar."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextmanager
+def _studio(
+    sitter: Sitter, samples: int, seed: int
+) -> Iterator[tuple[bpy.types.Scene, bpy.types.Object, bpy.types.Object]]:
+    """A scene with the sitter and a camera; everything made for it is gone when the block ends."""
+    kinds = ("scenes", "worlds", "lights", "cameras", "meshes", "materials", "objects")
+    before = {kind: set(getattr(bpy.data, kind)) for kind in kinds}
+    try:
+        scene = _scene(samples, seed)
+        for azimuth, elevation, watts in SOFT_BOXES:
+            _soft_box(scene, azimuth, elevation, watts)
+        head = _head(scene, sitter)
+        camera = bpy.data.objects.new("studio camera", bpy.data.cameras.new("studio camera"))
+        scene.collection.objects.link(camera)
+        scene.camera = camera
+        yield scene, head, camera
+    finally:
+        for kind in kinds:
+            blocks = getattr(bpy.data, kind)
+            for block in set(blocks) - before[kind]:
+                blocks.remove(block)
+
+
+def _scene(samples: int, seed: int) -> bpy.types.Scene:
+    scene = bpy.data.scenes.new("studio")
+    scene.render.engine = "CYCLES"
+    scene.cycles.device = "CPU"
+    scene.cycles.samples, scene.cycles.seed = samples, seed
+    scene.cycles.use_denoising = True
+    scene.cycles.max_bounces = 3
+    scene.render.use_persistent_data = True
+    scene.render.film_transparent = True
+    scene.render.resolution_percentage = 100
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.view_settings.view_transform = "Standard"
+    world = bpy.data.worlds.new("studio")
+    if world.node_tree is None:  # Blender 4: a new world has no tree
+        world.use_nodes = True
+    background = world.node_tree.nodes["Background"]
+    background.inputs["Color"].default_value = (1, 1, 1, 1)
+    background.inputs["Strength"].default_value = AMBIENT
+    scene.world = world
+    return scene
+
+
+def _soft_box(scene: bpy.types.Scene, azimuth: float, elevation: float, watts: float) -> None:
+    light = bpy.data.lights.new("soft box", "AREA")
+    light.energy, light.size = watts, BOX_SIZE
+    box = bpy.data.objects.new("soft box", light)
+    scene.collection.objects.link(box)
+    # A light shines along its own -z: turn +z to look from the sitter at the box, then step back along it.
+    turn = Matrix.Rotation(np.radians(azimuth), 4, "Y") @ Matrix.Rotation(np.radians(-elevation), 4, "X")
+    box.matrix_world = turn @ Matrix.Translation((0, 0, BOX_DISTANCE))
+
+
+def _head(scene: bpy.types.Scene, sitter: Sitter) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new("sitter")
+    mesh.from_pydata(sitter.rest.tolist(), [], sitter.faces.tolist())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(sitter.faces), bool))
+    for name, kind, key, values in (
+        ("rest", "FLOAT_VECTOR", "vector", sitter.rest),
+        ("tint", "FLOAT_VECTOR", "vector", sitter.tint),
+        ("roughness", "FLOAT", "value", sitter.roughness),
+        ("grain", "FLOAT", "value", sitter.grain),
+    ):
+        attribute = mesh.attributes.new(name, kind, "POINT")
+        attribute.data.foreach_set(key, np.ascontiguousarray(values, np.float32).ravel())
+    mesh.materials.append(_surface())
+    head = bpy.data.objects.new("sitter", mesh)
+    scene.collection.objects.link(head)
+    return head
+
+
+def _surface() -> bpy.types.Material:
+    """Tint times fine noise, and pores as bumps, both fixed to the rest position and faded by `grain`."""
+    material = bpy.data.materials.new("sitter")
+    if material.node_tree is None:  # Blender 4: a new material has no tree
+        material.use_nodes = True
+    nodes, link = material.node_tree.nodes, material.node_tree.links.new
+    surface = nodes["Principled BSDF"]
+
+    def attribute(name: str) -> bpy.types.Node:
+        node = nodes.new("ShaderNodeAttribute")
+        node.attribute_name = name
+        return node
+
+    rest, grain = attribute("rest"), attribute("grain")
+    mottle = nodes.new("ShaderNodeTexNoise")
+    mottle.inputs["Scale"].default_value, mottle.inputs["Detail"].default_value = 260.0, 4.0
+    link(rest.outputs["Vector"], mottle.inputs["Vector"])
+    shade = nodes.new("ShaderNodeMapRange")
+    shade.inputs["From Min"].default_value, shade.inputs["From Max"].default_value = 0.3, 0.7
+    shade.inputs["To Min"].default_value, shade.inputs["To Max"].default_value = 0.88, 1.12
+    link(mottle.outputs["Fac"], shade.inputs["Value"])
+    tinted = nodes.new("ShaderNodeVectorMath")
+    tinted.operation = "SCALE"
+    link(attribute("tint").outputs["Vector"], tinted.inputs[0])
+    amount = nodes.new("ShaderNodeMix")
+    amount.inputs["A"].default_value = 1.0
+    link(grain.outputs["Fac"], amount.inputs["Factor"])
+    link(shade.outputs["Result"], amount.inputs["B"])
+    link(amount.outputs["Result"], tinted.inputs["Scale"])
+    link(tinted.outputs["Vector"], surface.inputs["Base Color"])
+    link(attribute("roughness").outputs["Fac"], surface.inputs["Roughness"])
+
+    pores = nodes.new("ShaderNodeTexNoise")
+    pores.inputs["Scale"].default_value, pores.inputs["Detail"].default_value = 700.0, 3.0
+    link(rest.outputs["Vector"], pores.inputs["Vector"])
+    bump = nodes.new("ShaderNodeBump")
+    bump.inputs["Distance"].default_value = 0.0006
+    link(pores.outputs["Fac"], bump.inputs["Height"])
+    link(grain.outputs["Fac"], bump.inputs["Strength"])
+    link(bump.outputs["Normal"], surface.inputs["Normal"])
+    return material

@@ -1,0 +1,66 @@
+"""From a capture to the effects of a run, and from there to its settings."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from ..capture.model import Capture
+from ..errors import StgaError
+from ..training.effect_plan import EffectDecision
+from ..training.settings import TrainingSettings
+from .facts import Facts
+from .rules import EFFECTS, Effect, Verdict
+
+if TYPE_CHECKING:
+    from ..training.run.folder import Run
+
+
+def decide(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
+    """The run with its effects decided, once, before it begins; one whose settings ask for none is left as it is.
+
+    device: what it is to be trained on, one of `choose_device`.
+    Raises StgaError for a choice that cannot work on this capture.
+    """
+    if run.settings.effects is None or run.plan or not capture.views.get("train"):
+        return run
+    settings, plan = decide_effects(capture, run.settings, device)
+    return replace(run, settings=settings, plan=plan)
+
+
+def decide_effects(
+    capture: Capture, settings: TrainingSettings, device: str = "cpu"
+) -> tuple[TrainingSettings, tuple[EffectDecision, ...]]:
+    """Look at a capture with training views for a few seconds; returns the settings that follow, and why.
+
+    Raises StgaError where an image cannot be read, or for a choice in `settings.effects` that cannot work.
+    """
+    facts, choices = Facts(capture, settings, device), settings.effects or {}
+    changes: dict[str, object] = {}
+    plan = []
+    for effect in EFFECTS:
+        choice, verdict = choices.get(effect.name, "auto"), effect.look(facts)
+        if verdict is None:
+            if choice == "on":
+                raise StgaError(f"--effect {effect.name}=on: {capture.root} has none: {_needs(effect)}")
+            continue
+        on = _decided(effect, choice, verdict)
+        changes.update({**effect.on, **verdict.changes} if on else effect.off)
+        plan.append(EffectDecision(effect.name, choice, on, verdict.reason, effect.cost))
+    return replace(settings, **changes), tuple(plan)  # type: ignore[arg-type]
+
+
+def _decided(effect: Effect, choice: str, verdict: Verdict) -> bool:
+    if choice == "auto":
+        return verdict.on
+    if verdict.only and (choice == "on") != verdict.on:
+        raise StgaError(f"--effect {effect.name}={choice}: cannot be, because {verdict.reason}")
+    return choice == "on"
+
+
+def _needs(effect: Effect) -> str:
+    return "its mesh has no rows of teeth" if effect.name == "teeth" else "it has no parameters of FLAME"
+
+
+def describe_effects(plan: Sequence[EffectDecision]) -> list[tuple[str, str]]:
+    """(effect, what was decided and why) lines."""
+    return [(decision.effect, str(decision)) for decision in plan]

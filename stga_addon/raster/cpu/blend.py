@@ -1,0 +1,288 @@
+"""Alpha blending of the splats of each 16×16 tile, forward and backward.
+
+A pixel takes splats front to back and stops before the one whose transmittance would be ≤ 1e-4. The forward
+stores each pixel's last contributing pair and the backward obeys it, so transmittance never underflows behind
+many opaque splats.
+"""
+
+import numpy as np
+
+from . import inline_jit, jit, part_jit
+from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PIXELS, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
+from .outline import outline, rows_within
+from .threads import parallel
+
+ALPHA_MAX = np.float32(0.999)
+ALPHA_MIN = np.float32(1 / 255)
+STOP = np.float32(1e-4)
+LOG2E = np.float32(1.4426950408889634)
+
+# A tile is two halves, eight pixels wide, stored one after the other row by row: a vector of sixteen pixels holds two
+# short rows, and where a splat only grazes one half, little of that half is computed.
+HALF = TILE // 2
+HALF_PIXELS = PIXELS // 2
+
+# Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
+# around in Python, and the test for it keeps LLVM from vectorising (12 times slower).
+ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, WEIGHT, PULL = (np.uint64(n * PIXELS) for n in range(1, 10))
+BEHIND, V_RED, V_GREEN, V_BLUE = ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE
+STATE = 10 * PIXELS
+
+# A tile's splats are copied a batch at a time: memory is asked for many of them at once instead of one after the other,
+# and the rows that they reach are computed in vectors. Column c of splat q lies at c·BATCH + q of a flat array.
+BATCH = 32
+(AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN, AT_BLUE, AT_EXTENT_Y,
+ AT_FIRST, AT_PAST, AT_FIRST_RIGHT, AT_PAST_RIGHT) = (np.uint64(n * BATCH) for n in range(14))  # fmt: skip
+COLUMNS = 14 * BATCH
+
+
+@inline_jit
+def _exp2(x):
+    """2^x for x ≤ 0 to 2e-7 relative: exponent bits by shift, the fraction by a degree-5 polynomial."""
+    x = max(x, np.float32(-120.0))
+    whole = np.floor(x)
+    f = x - whole
+    p = np.float32(1.8775767e-3)
+    p = p * f + np.float32(8.9893397e-3)
+    p = p * f + np.float32(5.5826318e-2)
+    p = p * f + np.float32(2.4015361e-1)
+    p = p * f + np.float32(6.9315308e-1)
+    p = p * f + np.float32(9.9999994e-1)
+    return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@part_jit
+def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
+    """Copy the projected splats of `count` pairs from `first` on; centres relative to the tile's corner (x0, y0)."""
+    for q in range(np.uint64(count)):
+        i = np.uint64(pair_splat[np.uint64(first) + q])
+        batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q] = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
+        batch[AT_PRECISION_X + q], batch[AT_SHEAR + q] = projected[i, PRECISION_X], projected[i, SHEAR]
+        batch[AT_PRECISION_Y + q], batch[AT_OPACITY + q] = projected[i, PRECISION_Y], projected[i, OPACITY]
+        batch[AT_RED + q], batch[AT_GREEN + q] = projected[i, RED], projected[i, GREEN]
+        batch[AT_BLUE + q] = projected[i, BLUE]
+
+
+@part_jit
+def _find_rows(count, batch, low, high, low_right, high_right):
+    """Which rows of each half of the tile a batch's splats reach: whole vectors, so pairs of rows.
+
+    low, high: first and past-the-last row of the left half that may be drawn on; low_right, high_right: of the right.
+    """
+    two, rows, width = np.float32(2.0), np.float32(TILE), np.float32(HALF)
+    for q in range(np.uint64(count)):
+        ellipse = outline(
+            batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_PRECISION_X + q], batch[AT_SHEAR + q],
+            batch[AT_PRECISION_Y + q], batch[AT_EXTENT_Y + q],
+        )  # fmt: skip
+        first, past = rows_within(ellipse, np.float32(0.0), width, rows)
+        batch[AT_FIRST + q] = max(low, two * np.floor(first / two))
+        batch[AT_PAST + q] = min(high, two * np.ceil(past / two))
+        first, past = rows_within(ellipse, width, width, rows)
+        batch[AT_FIRST_RIGHT + q] = max(low_right, two * np.floor(first / two))
+        batch[AT_PAST_RIGHT + q] = min(high_right, two * np.ceil(past / two))
+
+
+@part_jit
+def _rows_alive(s, half):
+    """First and past-the-last row of a half of the tile that is not behind something opaque, in steps of a quarter."""
+    quarter, upper, lower = np.uint64(HALF_PIXELS // 2), np.float32(0.0), np.float32(0.0)
+    begin = ALIVE + np.uint64(half * HALF_PIXELS)
+    for p in range(quarter):
+        upper += s[begin + p]
+        lower += s[begin + quarter + p]
+    middle = np.float32(TILE // 2)
+    first = np.float32(0.0) if upper > np.float32(0.0) else middle
+    return first, np.float32(TILE) if lower > np.float32(0.0) else middle
+
+
+@part_jit
+def _set_coordinates(s):
+    """Write the centres of a tile's pixels, relative to its corner."""
+    for p in range(np.uint64(PIXELS)):
+        half, within = np.int64(p) // HALF_PIXELS, np.int64(p) % HALF_PIXELS
+        s[X + p] = np.float32(half * HALF + within % HALF) + np.float32(0.5)
+        s[Y + p] = np.float32(within // HALF) + np.float32(0.5)
+
+
+@parallel(lambda tiles, *_: len(tiles))
+@jit
+def blend_forward(
+    first_tile, past_tile,
+    tiles, tiles_x, start, pair_splat, projected, extent_y, background, pair_rows, image, transmittance, last,
+):  # fmt: skip
+    """Render the listed tiles.
+
+    tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int64 into the pair
+    list; pair_splat (P,) int32 front to back in each tile; projected (N, 9) and extent_y (N,) from `project_forward`.
+    background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept
+    because the backward needs its small values exactly), last (H, W) int32: one past the last contributing pair
+    of the tile, counted from the tile's start, and pair_rows (P, 4) uint8: first and past-the-last row of the tile's
+    left and right half that the splat may reach, of those pairs that were looked at.
+    """
+    height, width = last.shape
+    s, batch = np.empty(STATE, np.float32), np.empty(COLUMNS, np.float32)
+    _set_coordinates(s)
+    for k in range(first_tile, past_tile):
+        tile = tiles[k]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        for p in range(np.uint64(PIXELS)):
+            s[p] = s[ALIVE + p] = np.float32(1.0)
+            s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
+        begin, end = start[tile], start[tile + 1]
+        for batch_begin in range(begin, end, BATCH):
+            low, high = _rows_alive(s, 0)
+            low_right, high_right = _rows_alive(s, 1)
+            if low == high and low_right == high_right:
+                break
+            count = min(BATCH, end - batch_begin)
+            _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
+            for q in range(np.uint64(count)):
+                batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
+            _find_rows(count, batch, low, high, low_right, high_right)
+            for q in range(np.uint64(count)):
+                j = np.uint64(batch_begin) + q
+                pair_rows[j, 0], pair_rows[j, 1] = batch[AT_FIRST + q], batch[AT_PAST + q]
+                pair_rows[j, 2], pair_rows[j, 3] = batch[AT_FIRST_RIGHT + q], batch[AT_PAST_RIGHT + q]
+                mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
+                qx = np.float32(-0.5) * LOG2E * batch[AT_PRECISION_X + q]
+                qy = np.float32(-0.5) * LOG2E * batch[AT_PRECISION_Y + q]
+                opacity = batch[AT_OPACITY + q]
+                red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
+                order = np.float32(np.int64(j) - begin + 1)
+                for half in range(2):
+                    first, past = half * HALF_PIXELS, half * HALF_PIXELS
+                    first, past = first + pair_rows[j, 2 * half] * HALF, past + pair_rows[j, 2 * half + 1] * HALF
+                    if past <= first:
+                        continue
+                    for p in range(np.uint64(first), np.uint64(past)):
+                        dy = s[Y + p] - mean_y
+                        dx = s[X + p] - mean_x - shear * dy
+                        power = qx * dx * dx + qy * dy * dy
+                        a = min(ALPHA_MAX, opacity * _exp2(power))
+                        a = a * s[ALIVE + p] if a >= ALPHA_MIN else np.float32(0.0)
+                        t = s[p]
+                        after = t * (np.float32(1.0) - a)
+                        goes_on = after > STOP
+                        weight = a * t if goes_on else np.float32(0.0)
+                        s[ALIVE + p] = s[ALIVE + p] if goes_on else np.float32(0.0)
+                        s[p] = after if goes_on else t
+                        s[SUM_RED + p] += weight * red
+                        s[SUM_GREEN + p] += weight * green
+                        s[SUM_BLUE + p] += weight * blue
+                        s[LAST + p] = order if weight > np.float32(0.0) else s[LAST + p]
+        for half in range(2):
+            for row in range(min(TILE, height - top)):
+                first, x0, y = np.uint64(half * HALF_PIXELS + row * HALF), left + half * HALF, np.uint64(top + row)
+                for column in range(np.uint64(max(0, min(HALF, width - x0)))):
+                    p, x = first + column, np.uint64(x0) + column
+                    image[0, y, x] = s[SUM_RED + p] + s[p] * background[0]
+                    image[1, y, x] = s[SUM_GREEN + p] + s[p] * background[1]
+                    image[2, y, x] = s[SUM_BLUE + p] + s[p] * background[2]
+                    transmittance[y, x] = s[p]
+                    last[y, x] = np.int32(s[LAST + p])
+
+
+@parallel(lambda tiles, *_: len(tiles))
+@jit
+def blend_backward(
+    first_tile, past_tile,
+    tiles, tiles_x, start, pair_splat, pair_rows, wanted, projected, background, transmittance, last,
+    v_image, v_transmittance, grads,
+):  # fmt: skip
+    """Gradient of every wanted (tile, splat) pair of the listed tiles.
+
+    wanted (N,) bool: splats whose gradient is needed. v_image (3, H, W) and v_transmittance (H, W): gradients of the
+    composited image and of the transmittance. Writes grads (P, 9), with the columns of `projected`: one row for each
+    pair, so that the sum over a splat's pairs has one order whatever the threads do.
+    """
+    height, width = last.shape
+    s, batch = np.empty(STATE, np.float32), np.empty(COLUMNS, np.float32)
+    _set_coordinates(s)
+    for k in range(first_tile, past_tile):
+        tile = tiles[k]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        if left + TILE > width or top + TILE > height:  # pixels outside the image
+            for p in range(np.uint64(PIXELS)):
+                s[p] = np.float32(1.0)
+                s[BEHIND + p] = s[V_RED + p] = s[V_GREEN + p] = s[V_BLUE + p] = s[LAST + p] = np.float32(0.0)
+        deepest = np.int64(0)
+        for half in range(2):
+            for row in range(min(TILE, height - top)):
+                first, x0, y = np.uint64(half * HALF_PIXELS + row * HALF), left + half * HALF, np.uint64(top + row)
+                for column in range(np.uint64(max(0, min(HALF, width - x0)))):
+                    p, x = first + column, np.uint64(x0) + column
+                    t = transmittance[y, x]
+                    s[p] = t
+                    vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
+                    behind = background[0] * vr + background[1] * vg + background[2] * vb
+                    s[BEHIND + p] = t * (behind + v_transmittance[y, x])
+                    s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
+                    s[LAST + p] = np.float32(last[y, x])
+                    deepest = max(deepest, np.int64(last[y, x]))
+        begin = start[tile]
+        grads[begin + deepest : start[tile + 1], :] = np.float32(0.0)
+        nearest = begin  # nothing in front of the first wanted pair needs to be walked
+        while nearest < begin + deepest and not wanted[pair_splat[nearest]]:
+            nearest += 1
+        batch_end = begin + deepest
+        while batch_end > nearest:
+            batch_begin = max(nearest, batch_end - BATCH)
+            count = batch_end - batch_begin
+            _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
+            for n in range(count):
+                q = np.uint64(count - 1 - n)
+                j = np.uint64(batch_begin) + q
+                mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
+                precision_x, precision_y = batch[AT_PRECISION_X + q], batch[AT_PRECISION_Y + q]
+                qx, qy = np.float32(-0.5) * LOG2E * precision_x, np.float32(-0.5) * LOG2E * precision_y
+                opacity = batch[AT_OPACITY + q]
+                red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
+                order, is_wanted = np.float32(np.int64(j) - begin + 1), wanted[pair_splat[j]]
+                g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
+                for half in range(2):
+                    first, past = half * HALF_PIXELS, half * HALF_PIXELS
+                    first, past = first + pair_rows[j, 2 * half] * HALF, past + pair_rows[j, 2 * half + 1] * HALF
+                    if past <= first:
+                        continue
+                    for p in range(np.uint64(first), np.uint64(past)):
+                        dy = s[Y + p] - mean_y
+                        dx = s[X + p] - mean_x - shear * dy
+                        power = qx * dx * dx + qy * dy * dy
+                        raw = opacity * _exp2(power)
+                        a = min(ALPHA_MAX, raw)
+                        a = a if (a >= ALPHA_MIN) and (order <= s[LAST + p]) else np.float32(0.0)
+                        ra = np.float32(1.0) / (np.float32(1.0) - a)
+                        t = s[p] * ra
+                        weight = a * t
+                        along = red * s[V_RED + p] + green * s[V_GREEN + p] + blue * s[V_BLUE + p]
+                        v_a = t * along - ra * s[BEHIND + p]
+                        s[p] = t
+                        s[BEHIND + p] += weight * along
+                        s[WEIGHT + p] = weight
+                        # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
+                        s[PULL + p] = a * v_a if raw < ALPHA_MAX else np.float32(0.0)
+                    if not is_wanted:
+                        continue  # a frozen splat only has to be stepped through, in the very same arithmetic
+                    for p in range(np.uint64(first), np.uint64(past)):
+                        dy = s[Y + p] - mean_y
+                        dx = s[X + p] - mean_x - shear * dy
+                        g, weight = s[PULL + p], s[WEIGHT + p]
+                        g0 += g
+                        gx += g * dx
+                        gy += g * dy
+                        gxx += g * dx * dx
+                        gxy += g * dx * dy
+                        gyy += g * dy * dy
+                        gr += weight * s[V_RED + p]
+                        gg += weight * s[V_GREEN + p]
+                        gb += weight * s[V_BLUE + p]
+                if is_wanted:
+                    grads[j, MEAN_X] = precision_x * gx
+                    grads[j, MEAN_Y] = precision_y * gy - shear * precision_x * gx
+                    grads[j, PRECISION_X] = np.float32(-0.5) * gxx
+                    grads[j, SHEAR] = precision_x * gxy
+                    grads[j, PRECISION_Y] = np.float32(-0.5) * gyy
+                    grads[j, OPACITY] = g0 / opacity
+                    grads[j, RED], grads[j, GREEN], grads[j, BLUE] = gr, gg, gb
+            batch_end = batch_begin

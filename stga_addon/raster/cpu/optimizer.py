@@ -1,0 +1,124 @@
+"""Per-row work of training: Adam on listed rows only, and the scale limit."""
+
+import math
+
+import numpy as np
+
+from . import jit, part_jit
+from .threads import parallel
+
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+CHUNK = 256
+LARGEST = np.float32(1e18)
+"""A gradient beyond this counts as broken: its square would make the second moment infinite, and the row NaN."""
+
+
+@parallel(lambda rows, *_: len(rows))
+@jit
+def adam_rows(
+    first_row, past_row, rows, steps, parameters, gradients, firsts, seconds, averages, rates, beta1, beta2, epsilon,
+    newest,
+):  # fmt: skip
+    """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
+
+    parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
+    (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
+    `newest`, or 4 / (steps + 3) where that is more: the first steps are long, and soon to be forgotten. Rows that are
+    not listed are not touched at all. A row whose gradient is not finite, or beyond LARGEST, keeps that parameter, its
+    moments and its average.
+    All parameters at once: every further parallel loop waits for its slowest thread.
+    """
+    log1, log2 = math.log(beta1), math.log(beta2)
+    correct1, correct2, blend = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    for begin in range(first_row, past_row, CHUNK):
+        end = min(past_row, begin + CHUNK)
+        for n in range(begin, end):
+            steps[rows[n]] += 1
+            count = np.float64(steps[rows[n]])
+            correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
+            correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
+            blend[n - begin] = max(np.float64(newest), 4.0 / (count + 3.0))
+        for p in range(len(parameters)):
+            _adam_block(
+                rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], averages[p],
+                correct1, correct2, blend, rates[p], beta1, beta2, epsilon,
+            )  # fmt: skip
+
+
+@part_jit
+def _adam_block(
+    rows, parameter, gradient, first, second, average, correct1, correct2, blend, rates, beta1, beta2, epsilon
+):
+    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorises."""
+    width = parameter.shape[1]
+    for n in range(len(rows)):
+        i = rows[n]
+        unsound = ZERO
+        for c in range(width):
+            unsound += ZERO if abs(gradient[i, c]) < LARGEST else ONE
+        if unsound != ZERO:
+            continue
+        scale1, scale2, share = correct1[n], correct2[n], blend[n]
+        for c in range(width):
+            g = gradient[i, c]
+            m = beta1 * first[i, c] + (ONE - beta1) * g
+            v = beta2 * second[i, c] + (ONE - beta2) * g * g
+            first[i, c] = m
+            second[i, c] = v
+            value = parameter[i, c] - rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
+            parameter[i, c] = value
+            average[i, c] += share * (value - average[i, c])
+
+
+@jit
+def scale_limit(rows, log_scale, face, unbound, limit, weight, gradient):
+    """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
+
+    limit (F,) per triangle, in the unit of the splats' local scale. Loose splats have no limit. Returns the norm.
+    """
+    total = 0.0
+    for n in range(len(rows)):
+        i = rows[n]
+        if not unbound[i]:
+            for c in range(3):
+                over = max(ZERO, math.exp(log_scale[i, c]) - limit[face[i]])
+                total += over * over
+    norm = math.sqrt(total)
+    if norm > 0.0:
+        factor = np.float32(weight / norm)
+        for n in range(len(rows)):
+            i = rows[n]
+            if not unbound[i]:
+                for c in range(3):
+                    scale = math.exp(log_scale[i, c])
+                    gradient[i, c] += factor * max(ZERO, scale - limit[face[i]]) * scale
+    return norm
+
+
+@jit
+def distance_limit(rows, xyz, face, unbound, limit, weight, gradient):
+    """weight · ‖ReLU(|xyz| − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
+
+    limit (F,) per triangle in local units. Loose splats have no limit. Returns the norm.
+    """
+    total = 0.0
+    for n in range(len(rows)):
+        i = rows[n]
+        if not unbound[i]:
+            over = max(ZERO, _length(xyz[i]) - limit[face[i]])
+            total += over * over
+    norm = math.sqrt(total)
+    if norm > 0.0:
+        factor = np.float32(weight / norm)
+        for n in range(len(rows)):
+            i = rows[n]
+            length = _length(xyz[i])
+            if not unbound[i] and length > limit[face[i]]:
+                for c in range(3):
+                    gradient[i, c] += factor * (length - limit[face[i]]) * xyz[i, c] / length
+    return norm
+
+
+@part_jit
+def _length(v):
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

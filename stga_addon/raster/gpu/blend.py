@@ -1,0 +1,220 @@
+"""Alpha blending of the splats of each 16×16 tile; the counterpart of `cpu/blend.py`.
+
+Forward: a thread a pixel, a block of 256 threads a tile, so all of a block read the same splat at once (one
+broadcast from the cache). Backward: a warp half a tile, four pixels a lane. The gradient of a (tile, splat) pair is
+summed over the warp's registers, and each half has a row of its own to write it to; the rows of a splat are summed
+later, in order. So no two threads write one place and no sum depends on chance.
+
+On Warp's CPU device, where threads run one after the other, a warp is a single lane: `_over_warp` and its like return
+what they are given, every lane counts as the leading one, and rows are added to, in the order of lanes.
+"""
+
+import warp as wp
+
+from ..cpu import blend as cpu
+from ..cpu import layout
+from ..cpu.layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
+from .project import Projected
+from .tiles import NO
+
+wp.set_module_options({"enable_backward": False})
+
+TILE, PIXELS = wp.constant(layout.TILE), wp.constant(layout.PIXELS)
+ALPHA_MAX, ALPHA_MIN, STOP = (wp.constant(float(c)) for c in (cpu.ALPHA_MAX, cpu.ALPHA_MIN, cpu.STOP))
+LANES = wp.constant(32)
+PARTS = wp.constant(2)
+"""Warps a tile has in the backward, and rows a pair: more warps fill a GPU better, fewer add up less."""
+SHARE = layout.PIXELS // (32 * 2)
+
+Share = wp.types.vector(length=SHARE, dtype=wp.float32)
+"""A value of each of a lane's pixels."""
+ShareInt = wp.types.vector(length=SHARE, dtype=wp.int32)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int offset = 16; offset > 0; offset >>= 1)
+        value += __shfl_xor_sync(0xffffffffu, value, offset);
+#endif
+    return value;
+""")
+def _over_warp(value: wp.float32) -> wp.float32:
+    """The sum over a warp, the same in all lanes; all must call."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int offset = 16; offset > 0; offset >>= 1)
+        value = max(value, __shfl_xor_sync(0xffffffffu, value, offset));
+#endif
+    return value;
+""")
+def _largest_of_warp(value: wp.int32) -> wp.int32:
+    """The largest value of a warp, the same in all lanes; all must call."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return (threadIdx.x & 31) == 0;
+#else
+    return true;
+#endif
+""")
+def _leads() -> wp.bool:
+    """Whether this lane writes for its warp."""
+    ...
+
+
+@wp.func
+def _power(row: Projected, x: float, y: float) -> float:
+    """Logarithm of a splat's density at an offset from its centre: squares, whose sign rounding cannot turn."""
+    dx = x - row[SHEAR] * y
+    return -0.5 * (row[PRECISION_X] * dx * dx + row[PRECISION_Y] * y * y)
+
+
+@wp.kernel
+def blend_forward(
+    tiles_x: wp.int32,
+    drawn: wp.array[wp.uint8],
+    first: wp.array[wp.int32],
+    past: wp.array[wp.int32],
+    pair_splat: wp.array[wp.int32],
+    projected: wp.array[Projected],
+    background: wp.vec3,
+    image: wp.array3d[wp.float32],
+    transmittance: wp.array2d[wp.float32],
+    last: wp.array2d[wp.int32],
+):
+    """As the CPU's, for the drawn tiles; launched over all tiles' pixels."""
+    n = wp.tid()
+    tile, p = n // PIXELS, n % PIXELS
+    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x, y = left + p % TILE, top + p // TILE
+    if drawn[tile] == NO or y >= last.shape[0] or x >= last.shape[1]:
+        return
+    px, py = float(p % TILE) + 0.5, float(p // TILE) + 0.5
+    colour, t, deepest = wp.vec3(), float(1.0), int(0)
+    begin = first[tile]
+    for j in range(begin, past[tile]):
+        row = projected[pair_splat[j]]
+        density = wp.exp(_power(row, px - (row[MEAN_X] - float(left)), py - (row[MEAN_Y] - float(top))))
+        a = wp.min(ALPHA_MAX, row[OPACITY] * density)
+        if a < ALPHA_MIN:
+            continue
+        after = t * (1.0 - a)
+        if after <= STOP:
+            break
+        colour += a * t * wp.vec3(row[RED], row[GREEN], row[BLUE])
+        t = after
+        deepest = j - begin + 1
+    colour += t * background
+    image[0, y, x] = colour[0]
+    image[1, y, x] = colour[1]
+    image[2, y, x] = colour[2]
+    transmittance[y, x] = t
+    last[y, x] = deepest
+
+
+@wp.kernel
+def blend_backward(
+    tiles_x: wp.int32,
+    touched: wp.array[wp.uint8],
+    first: wp.array[wp.int32],
+    pair_splat: wp.array[wp.int32],
+    pair_slot: wp.array[wp.int32],
+    wanted: wp.array[wp.uint8],
+    projected: wp.array[Projected],
+    background: wp.vec3,
+    transmittance: wp.array2d[wp.float32],
+    last: wp.array2d[wp.int32],
+    v_image: wp.array3d[wp.float32],
+    v_transmittance: wp.array2d[wp.float32],
+    rows: wp.array[Projected],
+):
+    """Add the gradient of every wanted pair of the touched tiles to its rows, slot · PARTS and on, which are zero.
+
+    Launched over PARTS · LANES threads a tile. v_transmittance may have no rows, which means zero.
+    """
+    n = wp.tid()
+    lane, part = n % LANES, (n // LANES) % PARTS
+    tile = n // (LANES * PARTS)
+    if touched[tile] == NO:
+        return
+    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    t, behind = Share(), Share()
+    v_red, v_green, v_blue = Share(), Share(), Share()
+    until = ShareInt()
+    deepest = int(0)
+    base = part * (PIXELS // PARTS) + lane  # neighbouring lanes have neighbouring pixels
+    for k in range(wp.static(SHARE)):
+        p = base + k * LANES
+        column, line = left + p % TILE, top + p // TILE
+        if line < last.shape[0] and column < last.shape[1]:
+            t[k] = transmittance[line, column]
+            v = wp.vec3(v_image[0, line, column], v_image[1, line, column], v_image[2, line, column])
+            v_red[k] = v[0]
+            v_green[k] = v[1]
+            v_blue[k] = v[2]
+            through = wp.dot(background, v)
+            if v_transmittance.shape[0] > 0:
+                through += v_transmittance[line, column]
+            behind[k] = t[k] * through
+            until[k] = last[line, column]
+            deepest = wp.max(deepest, until[k])
+    deepest = _largest_of_warp(deepest)
+    begin = first[tile]
+    nearest = begin  # nothing in front of the first wanted pair needs to be walked
+    while nearest < begin + deepest and wanted[pair_splat[nearest]] == NO:
+        nearest += 1
+    for back in range(begin + deepest - nearest):
+        j = begin + deepest - 1 - back
+        i = pair_splat[j]
+        row = projected[i]
+        mean_x, mean_y = row[MEAN_X] - float(left), row[MEAN_Y] - float(top)
+        red, green, blue = row[RED], row[GREEN], row[BLUE]
+        g0, gx, gy = float(0.0), float(0.0), float(0.0)
+        gxx, gxy, gyy = float(0.0), float(0.0), float(0.0)
+        g_red, g_green, g_blue = float(0.0), float(0.0), float(0.0)
+        counts = int(0)
+        for k in range(wp.static(SHARE)):
+            p = base + k * LANES
+            y = float(p // TILE) + 0.5 - mean_y
+            x = float(p % TILE) + 0.5 - mean_x
+            raw = row[OPACITY] * wp.exp(_power(row, x, y))
+            a = wp.min(ALPHA_MAX, raw)
+            if a >= ALPHA_MIN and j - begin < until[k]:
+                ra = 1.0 / (1.0 - a)
+                before = t[k] * ra
+                weight = a * before
+                along = red * v_red[k] + green * v_green[k] + blue * v_blue[k]
+                v_a = before * along - ra * behind[k]
+                t[k] = before
+                behind[k] = behind[k] + weight * along
+                g = wp.where(raw < ALPHA_MAX, v_a * raw, 0.0)
+                dx = x - row[SHEAR] * y
+                g0 += g
+                gx += g * dx
+                gy += g * y
+                gxx += g * dx * dx
+                gxy += g * dx * y
+                gyy += g * y * y
+                g_red += weight * v_red[k]
+                g_green += weight * v_green[k]
+                g_blue += weight * v_blue[k]
+                counts = int(1)
+        if wanted[i] == NO:
+            continue
+        if _largest_of_warp(counts) == 0:
+            continue
+        total = Projected(g0, gx, gy, gxx, gxy, gyy, g_red, g_green, g_blue)
+        for c in range(wp.static(layout.PROJECTED)):
+            total[c] = _over_warp(total[c])
+        if _leads():
+            by_x = row[PRECISION_X] * total[1]
+            at = pair_slot[j] * PARTS + part
+            rows[at] = rows[at] + Projected(
+                by_x, row[PRECISION_Y] * total[2] - row[SHEAR] * by_x, -0.5 * total[3], row[PRECISION_X] * total[4],
+                -0.5 * total[5], total[0] / row[OPACITY], total[6], total[7], total[8],
+            )  # fmt: skip

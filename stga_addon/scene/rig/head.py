@@ -1,0 +1,81 @@
+"""The tracked head as an animated Blender mesh: shape keys for any topology, a rig for FLAME."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...capture.model import Capture
+from .. import compat, tags
+from ..hierarchy import Warn, capture_root, log_warning, place, reset, triangle_mesh
+from .flame_rig import add_rig, remove_rig
+
+
+def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warning, correctives: str = "all") -> Any:
+    """The capture's head as a mesh object, animated so that Blender's frame number is the capture's timestep.
+
+    A FLAME capture becomes a rig (see `rig.add_rig`); any other gets one shape key a timestep, `t00012`, which is 1 at
+    its own frame, so that the evaluated mesh of that frame is the timestep's mesh; between frames the two neighbours
+    blend. Object coordinates are the capture's (metres, y-up). Regions become boolean face attributes
+    `stga_region_<name>`. Importing the same folder or file again replaces what the last import made; vertex groups and
+    materials stay where the triangles are the same. Raises StgaError
+    where a timestep cannot be read; the scene is then unchanged. `warn` receives one sentence for each thing worth
+    knowing. correctives: see `rig.add_rig`.
+    """
+    sequence = capture.flame
+    if sequence is not None:
+        frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+        head = _place_head(capture, name)
+        add_rig(head, sequence, frames, warn, correctives)
+        return head
+    meshes = np.empty((len(capture.timesteps), *capture.neutral.shape), np.float32)
+    for row, timestep in enumerate(capture.timesteps):
+        meshes[row] = capture.mesh(timestep)
+    head = _place_head(capture, name)
+    remove_rig(head)
+    _add_timestep_keys(head, capture.timesteps, meshes)
+    return head
+
+
+def _place_head(capture: Capture, name: str | None) -> Any:
+    root = capture_root(capture.root, name)
+    head = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    if head is not None and _has_triangles(head.data, capture.faces):
+        _renew_mesh(head, capture)
+    else:
+        title = f"{root.name} head"
+        head = place(root, tags.HEAD, title, triangle_mesh(title, capture.neutral, capture.faces), head)
+    for region, members in capture.regions.items():
+        attribute = head.data.attributes.new(tags.REGION_PREFIX + region, "BOOLEAN", "FACE")
+        attribute.data.foreach_set("value", np.ascontiguousarray(members, bool))
+    head[tags.TIMESTEPS] = [int(timestep) for timestep in capture.timesteps]
+    head.shape_key_add(name="Basis", from_mix=False)
+    return head
+
+
+def _has_triangles(mesh: Any, faces: np.ndarray) -> bool:
+    corners = np.empty(len(mesh.loops), np.int32)
+    mesh.loops.foreach_get("vertex_index", corners)
+    return np.array_equal(corners, faces.ravel())
+
+
+def _renew_mesh(head: Any, capture: Capture) -> None:
+    """The same triangles again: what an artist painted, and the selection that was made, stay on them."""
+    reset(head)
+    mesh = head.data
+    mesh.vertices.foreach_set("co", capture.neutral.astype(np.float32).ravel())
+    mesh.update()
+    for name in [name for name in mesh.attributes.keys() if name.startswith(tags.REGION_PREFIX)]:  # noqa: SIM118
+        mesh.attributes.remove(mesh.attributes[name])
+    for group in reversed(list(head.vertex_groups)):  # the last first: removal renumbers those behind
+        timestep = tags.group_timestep(group.name)
+        if timestep is not None and timestep not in capture.timesteps:
+            head.vertex_groups.remove(group)
+
+
+def _add_timestep_keys(head: Any, timesteps: Sequence[int], meshes: np.ndarray) -> None:
+    """meshes (T, V, 3) float32 in object space."""
+    names = [f"t{timestep:05d}" for timestep in timesteps]
+    for key_name, mesh in zip(names, meshes, strict=True):
+        head.shape_key_add(name=key_name, from_mix=False).points.foreach_set("co", mesh.ravel())
+    compat.write_hat_curves(head.data.shape_keys, names, timesteps)

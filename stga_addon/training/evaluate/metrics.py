@@ -1,0 +1,112 @@
+"""How close renderings come to the images: PSNR, SSIM and, where its weights are known, LPIPS."""
+
+import importlib.util
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ...avatar.file import Avatar
+from ...capture.model import Capture, View
+from ...raster.render import render_avatar
+from ..optimize.losses import similarity
+from . import lpips
+from .evaluation_views import EvaluationView, look
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None without its weights.
+
+    regions  the same by region of the images ("mask", "selected"), over the views that have the region
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+    regions: Mapping[str, "Quality"] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, float]:
+        """Flat: "psnr", "ssim", "psnr_mask" and so on; what was not measured is left out."""
+        own = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
+        flat = {name: value for name, value in own.items() if value is not None}
+        for region, quality in self.regions.items():
+            flat.update({f"{name}_{region}": value for name, value in quality.as_json().items()})
+        return flat
+
+
+def evaluate(
+    draw: Callable[[View], np.ndarray], evaluation_views: Iterable[EvaluationView], perceptual: bool = False
+) -> Quality:
+    """Mean quality of `draw(view)` (3, H, W) float32 against each view's image; images are clipped to 0…1."""
+    scores: dict[str, list[tuple[float, float, float]]] = {"": []}
+    for evaluation_view in evaluation_views:
+        image = np.clip(draw(evaluation_view.view), 0, 1)
+        scores[""].append(_scores(image, evaluation_view.target, perceptual))
+        for region, where in evaluation_view.regions.items():
+            scores.setdefault(region, []).append(_scores(image, evaluation_view.target, perceptual, where))
+    means = {region: _mean(of_views) for region, of_views in scores.items()}
+    whole = means.pop("")
+    return Quality(whole.psnr, whole.ssim, whole.lpips, means)
+
+
+def measure(avatar: Avatar, capture: Capture, split: str, perceptual: bool = False) -> Quality:
+    """Quality of an avatar on all views of a split, one at a time in memory."""
+    return evaluate(
+        lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
+        (look(capture, view) for view in capture.views[split]),
+        perceptual,
+    )
+
+
+def psnr(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of image (3, H, W) in 0…1 and target (H, W, 3) uint8, at `where` (H, W)."""
+    error = (image - target.transpose(2, 0, 1).astype(np.float32) / 255) ** 2
+    mean = float(error.mean() if where is None else error[:, where].mean())
+    return float(-10 * np.log10(max(mean, 1e-12)))
+
+
+def peak_memory_mb() -> float | None:
+    """Most memory that this process held so far, MiB; None where the system does not say (Windows)."""
+    with suppress(OSError):  # Linux; its getrusage also counts what the process held that started this one
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return round(int(status.partition("VmHWM:")[2].split()[0]) / 2**10, 1)
+    if importlib.util.find_spec("resource") is None:
+        return None
+    import resource
+
+    peak: int = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)  # bytes there, KiB elsewhere
+
+
+def _scores(
+    image: np.ndarray, target: np.ndarray, perceptual: bool, where: np.ndarray | None = None
+) -> tuple[float, float, float]:
+    """PSNR, SSIM and LPIPS, of the whole image or of the pixels `where` (H, W).
+
+    A region's SSIM and LPIPS see the image's own pixels everywhere else, so that only the region counts; SSIM is
+    then a mean over its pixels.
+    """
+    decibels = psnr(image, target, where)
+    share = 1.0
+    if where is not None:
+        image = np.where(where, image, target.transpose(2, 0, 1).astype(np.float32) / 255)
+        share = float(where.mean())
+    ssim = 1 - (1 - similarity(image, target)) / share
+    apart = _lpips(image, target) if perceptual else None
+    return decibels, ssim, np.nan if apart is None else apart
+
+
+def _mean(scores: list[tuple[float, float, float]]) -> Quality:
+    mean = np.mean(scores, axis=0) if scores else [np.nan] * 3
+    return Quality(float(mean[0]), float(mean[1]), None if np.isnan(mean[2]) else float(mean[2]))
+
+
+def _lpips(image: np.ndarray, target: np.ndarray) -> float | None:
+    network = lpips.network()
+    if network is None or min(target.shape[:2]) < lpips.SMALLEST:
+        return None
+    return network.distance(image, target.transpose(2, 0, 1).astype(np.float32) / 255)

@@ -1,0 +1,36 @@
+"""Adam with true freezing: a row that is not stepped keeps its value, its moments and its step count, bit for bit."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ...raster.cpu.optimizer import adam_rows
+from ...raster.cpu.rasterize import Parameters
+from .state import TrainState
+
+BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
+
+
+def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float], averaging: float = 1.0) -> None:
+    """Backend the listed rows (M,) int32 of every parameter along its gradient.
+
+    averaging: share with which the stepped row enters its running average; 1: the average is the row.
+
+    rates: learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`.
+    (STGA, selective training; Adam with a step count per row, because rows are trained unequally often.)
+    """
+    widest = max(tensor[0].numel() for tensor in state.parameters)  # with constant colour, not `sh`
+    by_column = np.zeros((len(state.parameters), widest), np.float32)
+    for row, name in zip(by_column, state.parameters._fields, strict=True):
+        row[:] = rates[name]
+        if name == "sh":
+            row[3:] = rates["sh_rest"]
+    adam_rows(
+        rows, state.steps.numpy(), _tables(state.parameters), _tables(state.gradients), _tables(state.first),
+        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, EPSILON, np.float32(averaging),
+    )  # fmt: skip
+
+
+def _tables(tensors: Parameters) -> tuple[np.ndarray, ...]:
+    """Each tensor as a numpy array (N, D) that shares its memory."""
+    return tuple(t.numpy().reshape(len(t), t[0].numel()) for t in tensors)

@@ -1,0 +1,303 @@
+"""One iteration on a Warp device: an NVIDIA GPU, or for tests Warp's CPU device."""
+
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from ...capture.model import View
+from ...errors import StgaError
+from ...raster.cpu.rasterize import Parameters
+from ...raster.gpu import optimizer
+from ...raster.gpu.embed import Embedding
+from ...raster.gpu.image_loss import change_background, differentiate
+from ...raster.gpu.rasterize import TYPES, DeviceFrames, Rasteriser, lens_of
+from ...raster.gpu.upload import Uploads
+from ..settings import TrainingSettings
+from .adam import BETA1, BETA2, EPSILON
+from .backend import Batch
+from .frames import FrameStore
+from .losses import REACH
+from .state import TrainState
+
+
+@dataclass(frozen=True)
+class _Table:
+    """One parameter of all splats on the device: as values (N, D), and as the rasteriser's rows of the same memory."""
+
+    values: wp.array
+    rows: wp.array
+
+
+@dataclass(frozen=True)
+class _DeviceState:
+    """`TrainState` on the device; a table per parameter."""
+
+    parameters: list[_Table]
+    gradients: list[_Table]
+    first: list[_Table]
+    second: list[_Table]
+    average: list[_Table]
+    steps: wp.array
+    face: wp.array
+    unbound: wp.array
+    screen_gradient: wp.array
+    gradient_count: wp.array
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """A batch whose arrays are on the device; place: where its loss goes in `GpuBackend._losses`."""
+
+    batch: Batch
+    vertices: wp.array
+    target: wp.array
+    mask: wp.array | None
+    selected: wp.array | None
+    place: int
+
+
+class GpuBackend:
+    """Trains on a device without waiting for it.
+
+    An iteration is only put into the device's queue. How many pairs of a splat and a tile it has, the host learns when
+    it begins the next one: by then the device is past that point. If there was no room for so many, the device has
+    left everything as it was, and the iteration is repeated. Losses are told two iterations late.
+    """
+
+    def __init__(
+        self, device: str, settings: TrainingSettings, lengths: np.ndarray, frames: FrameStore, state: TrainState
+    ) -> None:
+        self._settings, self._frames = settings, frames
+        capture = frames.capture
+        with _room(device):
+            self._rasteriser = Rasteriser(device)
+            self._device = self._rasteriser.device
+            self._uploads = Uploads(self._device)
+            self._embedding = Embedding(
+                self._device, capture.neutral, capture.faces, frames.convention, frames.strain
+            )  # fmt: skip
+            self._scale_limit, self._distance_limit = (
+                wp.array(np.float32(limit) * lengths, dtype=wp.float32, device=self._device)
+                for limit in (settings.scale_limit, settings.distance_limit)
+            )
+            self._losses = wp.zeros(2, wp.float32, device="cpu", pinned=self._device.is_cuda)
+        self._queued: _Sent | None = None
+        self._untold: deque[_Sent] = deque()
+        self._place = 0
+        self.state = state
+
+    def __len__(self) -> int:
+        return int(self._state.face.size)
+
+    @property
+    def state(self) -> TrainState:
+        """A copy in the host's memory, after everything that is queued."""
+        self._settle()
+        state = self._state
+        parameters, first, second, average = (
+            Parameters(*(_tensor(table.rows) for table in tables))
+            for tables in (state.parameters, state.first, state.second, state.average)
+        )
+        return TrainState(
+            parameters=parameters,
+            gradients=Parameters(*(torch.zeros_like(tensor) for tensor in parameters)),
+            first=first,
+            second=second,
+            average=average,
+            steps=_tensor(state.steps),
+            face=_tensor(state.face),
+            unbound=_tensor(state.unbound).bool(),
+            screen_gradient=_tensor(state.screen_gradient),
+            gradient_count=_tensor(state.gradient_count),
+        )
+
+    @state.setter
+    def state(self, state: TrainState) -> None:
+        self._settle()
+
+        def tables(tensors: Parameters) -> list[_Table]:
+            return [_table(tensor.numpy(), kind, self._device) for tensor, kind in zip(tensors, TYPES, strict=True)]
+
+        def array(tensor: torch.Tensor, kind: Any) -> wp.array:
+            return wp.array(tensor.numpy(), dtype=kind, device=self._device)
+
+        with _room(self._device):
+            self._state = _DeviceState(
+                parameters=tables(state.parameters),
+                gradients=tables(state.gradients),
+                first=tables(state.first),
+                second=tables(state.second),
+                average=tables(state.average),
+                steps=array(state.steps, wp.int32),
+                face=array(state.face, wp.int32),
+                unbound=array(state.unbound.to(torch.uint8), wp.uint8),
+                screen_gradient=array(state.screen_gradient, wp.float32),
+                gradient_count=array(state.gradient_count, wp.float32),
+            )
+
+    def train(self, batch: Batch) -> float | None:
+        """Queue one step; returns the loss of the iteration before the last, if that was a global one."""
+        with _room(self._device):
+            self._repeat_if_cut_short()
+            told = self._tell()
+            self._place = 1 - self._place
+            self._queued = self._send(batch)
+            self._untold.append(self._queued)
+            self._run(self._queued)
+        return told
+
+    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+        """The view as the splats' running average shows it, after everything that is queued."""
+        self._settle()
+        with _room(self._device):
+            self._uploads.begin()
+            vertices = self._send_mesh(view)
+            self._uploads.finish()
+            parameters, frames = _rows(self._state.average), self._see(vertices, view, degree)
+            return np.array(self._rasteriser.forward(parameters, self._state.face, frames, background).image.numpy())
+
+    def _settle(self) -> None:
+        """Wait until everything that is queued is done."""
+        with _room(self._device):
+            self._repeat_if_cut_short()
+            wp.synchronize_device(self._device)
+
+    def _repeat_if_cut_short(self) -> None:
+        queued, self._queued = self._queued, None
+        if queued is not None and not self._rasteriser.complete():
+            self._run(queued)
+
+    def _tell(self) -> float | None:
+        """The loss of the iteration before the last one queued, which the device has written by now."""
+        if len(self._untold) < 2:
+            return None
+        sent = self._untold.popleft()
+        return float(self._losses.numpy()[sent.place]) / sent.target.size if sent.selected is None else None
+
+    def _send(self, batch: Batch) -> _Sent:
+        self._uploads.begin()
+        send = self._uploads.send
+        sent = _Sent(
+            batch=batch,
+            vertices=self._send_mesh(batch.view),
+            target=send("target", batch.target, wp.uint8),
+            mask=None if batch.mask is None else send("mask", batch.mask, wp.uint8),
+            selected=None if batch.selected is None else send("selected", batch.selected, wp.uint8),
+            place=self._place,
+        )
+        self._uploads.finish()
+        return sent
+
+    def _send_mesh(self, view: View) -> wp.array:
+        return self._uploads.send("vertices", np.asarray(self._frames.capture.mesh(view.timestep)), wp.vec3d)
+
+    def _see(self, vertices: wp.array, view: View, degree: int) -> DeviceFrames:
+        """The triangles' frames as the view's camera sees them."""
+        origin, matrix, strain = self._embedding.place(vertices, view.camera)
+        strains = min(strain.shape[1], self._state.parameters[-1].rows.shape[1])
+        lens = lens_of(view.camera, degree, strains, antialiased=self._settings.antialiased)
+        return DeviceFrames(origin, matrix, strain, lens)
+
+    def _run(self, sent: _Sent) -> None:
+        """Put one iteration into the device's queue."""
+        rasteriser, state, batch = self._rasteriser, self._state, sent.batch
+        focus = None
+        if sent.selected is not None:
+            focus = rasteriser.scratch.take("focus", len(self), wp.uint8)
+            rasteriser.launch(optimizer.mark_focus, len(self), state.face, sent.selected, focus)
+        parameters, gradients = _rows(state.parameters), _rows(state.gradients)
+        frames = self._see(sent.vertices, batch.view, batch.degree)
+        rendering = rasteriser.forward(
+            parameters, state.face, frames, batch.background, focus, REACH, wait=False
+        )  # fmt: skip
+        v_image, loss = differentiate(rasteriser, rendering, self._over(sent), self._settings.ssim_weight)
+        screen = rasteriser.backward(rendering, parameters, state.face, v_image, gradients)
+        self._limit(rendering.wanted)
+        self._adam(rendering.wanted, batch.rates)
+        if sent.selected is None:
+            rasteriser.launch(
+                optimizer.gather_pull, len(self), rendering.wanted, screen, state.screen_gradient, state.gradient_count
+            )
+            total = rasteriser.scratch.take("loss_sum", 1)
+            wp.utils.array_sum(loss.flatten(), out=total)
+            wp.copy(self._losses, total, dest_offset=sent.place, count=1)
+
+    def _over(self, sent: _Sent) -> wp.array:
+        """The target over the background that is drawn behind the splats."""
+        if sent.mask is None:
+            return sent.target
+        out = self._rasteriser.scratch.take("over", sent.target.shape, wp.uint8)
+        change = 255 * sent.batch.background - 255 * np.array(self._settings.background, np.float32)
+        self._rasteriser.launch(
+            change_background, sent.mask.shape, sent.target, sent.mask, wp.vec3(*(float(c) for c in change)), out
+        )
+        return out
+
+    def _limit(self, wanted: wp.array) -> None:
+        """Add the gradients of the limits that keep splats near what they cover."""
+        settings, state, launch, n = self._settings, self._state, self._rasteriser.launch, len(self)
+        squares, square = self._rasteriser.scratch.take("squares", n), self._rasteriser.scratch.take("square", 1)
+        xyz, log_scale = _rows(state.parameters).xyz, _rows(state.parameters).log_scale
+        if settings.scale_weight:
+            given = wanted, state.unbound, log_scale, state.face, self._scale_limit
+            launch(optimizer.scale_excess, n, *given, squares)
+            wp.utils.array_sum(squares, out=square)
+            launch(optimizer.scale_limit, n, *given, settings.scale_weight, square, _rows(state.gradients).log_scale)
+        if settings.distance_weight:
+            given = wanted, state.unbound, xyz, state.face, self._distance_limit
+            launch(optimizer.distance_excess, n, *given, squares)
+            wp.utils.array_sum(squares, out=square)
+            launch(optimizer.distance_limit, n, *given, settings.distance_weight, square, _rows(state.gradients).xyz)
+
+    def _adam(self, wanted: wp.array, rates: Mapping[str, float]) -> None:
+        state, launch = self._state, self._rasteriser.launch
+        correct = self._rasteriser.scratch.take("correct", len(self), wp.vec3)
+        logarithms = math.log(BETA1), math.log(BETA2)
+        launch(optimizer.count_steps, len(self), wanted, *logarithms, self._settings.averaging, state.steps, correct)
+        for name, *tables in zip(
+            Parameters._fields, state.parameters, state.gradients, state.first, state.second, state.average, strict=True
+        ):
+            values = [table.values for table in tables]
+            rest, rate_rest = (3, rates["sh_rest"]) if name == "sh" else (values[0].shape[1], 0.0)
+            launch(
+                optimizer.adam, values[0].shape, wanted, correct, *values, rates[name], rate_rest, rest,
+                float(BETA1), float(BETA2), float(EPSILON),
+            )  # fmt: skip
+
+
+def _rows(tables: list[_Table]) -> Parameters:
+    return Parameters(*(table.rows for table in tables))
+
+
+def _table(values: np.ndarray, kind: Any, device: wp.Device) -> _Table:
+    flat = wp.array(values.reshape(len(values), math.prod(values.shape[1:])), dtype=wp.float32, device=device)
+    shape = values.shape if kind is wp.float32 else values.shape[:-1]
+    if not values.size:
+        return _Table(flat, wp.empty(shape, kind, device=device))
+    return _Table(flat, wp.array(ptr=flat.ptr, dtype=kind, shape=shape, device=device))
+
+
+def _tensor(array: wp.array) -> torch.Tensor:
+    """A copy in the host's memory."""
+    return torch.from_numpy(np.array(array.numpy()))
+
+
+@contextmanager
+def _room(device: wp.Device | str) -> Iterator[None]:
+    """Explain in one sentence that the device's memory is full."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, RuntimeError) and "allocate" not in str(error):
+            raise
+        raise StgaError(
+            f"--device cuda: the memory of {device} is full; close other programs that use it, train smaller images or "
+            "fewer splats, or give --device cpu"
+        ) from error

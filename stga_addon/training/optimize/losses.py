@@ -1,0 +1,45 @@
+"""The image loss and the limits that keep splats near what they cover (STGA, training)."""
+
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+
+from ...raster.cpu.image_loss import REACH, image_loss
+from ...raster.cpu.layout import TILE
+
+__all__ = ["REACH", "image_gradient", "similarity", "tile_rectangles", "whole_image"]
+
+
+def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:
+    """Rectangles (bands, 4) of pixels x0, y0, x1, y1 that tile an image, for the threads to share."""
+    edges = np.linspace(0, height, min(bands, height) + 1).astype(np.int64)
+    return np.array([[0, top, width, bottom] for top, bottom in pairwise(edges)], np.int64)
+
+
+def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool."""
+    groups = find_objects(label(tiles, np.ones((3, 3)))[0])
+    boxes = [(x.start, y.start, x.stop, y.stop) for y, x in groups]
+    return np.minimum(np.array(boxes, np.int64).reshape(-1, 4) * TILE, [width, height, width, height])
+
+
+def image_gradient(
+    image: np.ndarray, target: np.ndarray, rectangles: np.ndarray, ssim_weight: float, out: np.ndarray
+) -> tuple[float, float]:
+    """Write the gradient of (1 − w)·L1 + w·(1 − SSIM) with respect to the image into `out`, within the rectangles.
+
+    image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image whatever the
+    rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles tile it.
+    """
+    sums = np.zeros((3 * len(rectangles), 2))
+    share = 1.0 / image.size
+    image_loss(image, target, rectangles, np.float32(ssim_weight), np.float32(share), out, sums)
+    l1, ssim = sums.sum(0) * share
+    return float(l1), float(ssim)
+
+
+def similarity(image: np.ndarray, target: np.ndarray) -> float:
+    """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
+    unused = np.empty_like(image)
+    return image_gradient(image, target, whole_image(*image.shape[1:]), 1.0, unused)[1]

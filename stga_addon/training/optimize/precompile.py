@@ -1,0 +1,120 @@
+"""Compile (or load from the cache) every kernel before the clock of a training run starts."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from ...avatar.embedding import WORLD
+from ...avatar.splats import Splats
+from ...capture.camera import Camera
+from ...raster.cpu import CACHE
+from ...raster.cpu.image_loss import change_background
+from ...raster.cpu.layout import PROJECTED
+from ...raster.cpu.optimizer import distance_limit, scale_limit
+from ...raster.cpu.project import project_backward
+from ...raster.cpu.rasterize import Parameters, camera_frames, complete, render_backward, render_forward
+from ...worker.process import same_packages
+from . import adam
+from .losses import image_gradient, whole_image
+from .state import TrainState, new_state
+
+PACKAGE = "stga_addon"
+PATIENCE_S = 120.0
+CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+
+
+def precompile_kernels() -> None:
+    """Run each kernel once on two splats, with the argument types of real training.
+
+    On a machine where nothing is compiled yet, a second process compiles half of them meanwhile: Numba compiles one
+    function at a time in a process.
+    """
+    helper = _second_process()
+    _render()
+    _limit()
+    if helper is not None:
+        try:
+            helper.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            helper.kill()
+    _second_half()  # whatever the second process has left
+
+
+def _second_process() -> "subprocess.Popen[bytes] | None":
+    """A process that runs `_second_half`; None where the cache has that, or another process could not fill it."""
+    cached = any(Path(CACHE).glob("*/image_loss.image_loss-*.nbi"))
+    # As part of an extension the package has another name and another cache.
+    if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
+        return None
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import _second_half; _second_half()"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=same_packages(os.environ),
+        )
+    except OSError:
+        return None
+
+
+def _pair() -> TrainState:
+    # Two splats: a column of a one-row array counts as contiguous, which is another type to Numba.
+    return new_state(
+        Splats(
+            xyz=np.array([[0, 0, 1], [0, 0, 2]], np.float32),
+            rotation=np.array([[1, 0, 0, 0]] * 2, np.float32),
+            log_scale=np.full((2, 3), -3, np.float32),
+            opacity=np.zeros(2, np.float32),
+            sh=np.zeros((2, 16, 3), np.float32),
+            face=np.zeros(2, np.int32),
+            unbound=np.zeros(2, bool),
+        )
+    )
+
+
+def _render() -> None:
+    """Forwards and backwards."""
+    state = _pair()
+    seen, face = camera_frames(WORLD, CAMERA), state.face.numpy()
+    rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
+    gradients = Parameters(*(g.numpy() for g in state.gradients))
+    render_backward(rendering, state.arrays(), face, seen, np.zeros_like(rendering.image), gradients)
+
+
+def _second_half() -> None:
+    """The loss, Adam and a part of rendering: as long to compile as the rest."""
+    _project_backward()
+    image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
+    target.setflags(write=False)  # as the loader's are; Numba compiles for that
+    image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
+    rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
+    adam.step(_pair(), np.arange(2, dtype=np.int32), rates)
+
+
+def _project_backward() -> None:
+    """Two splats without a pair."""
+    state = _pair()
+    seen, none = camera_frames(WORLD, CAMERA), np.zeros(2, np.int32)
+    gradients = Parameters(*(g.numpy() for g in state.gradients))
+    project_backward(
+        none, *complete(state.arrays()), 3, state.face.numpy(), seen.origin, seen.matrix, seen.strain, seen.to_world,
+        seen.lens, seen.size, False, False, np.ones((2, PROJECTED), np.float32), none, none, none,
+        np.zeros((2, PROJECTED), np.float32), *complete(gradients), np.zeros(2, np.float32),
+    )  # fmt: skip
+
+
+def _limit() -> None:
+    """The limits, and the exchange of the background."""
+    state = _pair()
+    target, mask = np.zeros((16, 16, 3), np.uint8), np.zeros((16, 16), np.uint8)
+    target.setflags(write=False)
+    mask.setflags(write=False)
+    change_background(target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), np.empty_like(target))
+    rows = np.arange(2, dtype=np.int32)
+    tables = state.face.numpy(), state.unbound.numpy(), np.ones(1, np.float32), 1.0
+    scale_limit(rows, state.parameters.log_scale.numpy(), *tables, state.gradients.log_scale.numpy())
+    distance_limit(rows, state.parameters.xyz.numpy(), *tables, state.gradients.xyz.numpy())

@@ -1,0 +1,114 @@
+"""What training changes: the splats, their optimiser moments and what density control has gathered."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...avatar.splats import Splats
+from ...raster.cpu.rasterize import Parameters
+
+
+@dataclass
+class TrainState:
+    """N splats in training, torch tensors on one device, all with N rows.
+
+    parameters, gradients, first, second  as in `Splats`: values, last gradient, Adam's two moments
+    average  the parameters' running average over their steps, which is what the avatar is made of
+    steps    (N,) int32: how often Adam stepped the row
+    face     (N,) int32 and unbound (N,) bool, as in `Splats`
+    screen_gradient     (N,) sum of the screen-space gradient lengths since the last density control, and
+    gradient_count  (N,) float32: how many were summed
+    """
+
+    parameters: Parameters
+    gradients: Parameters
+    first: Parameters
+    second: Parameters
+    average: Parameters
+    steps: torch.Tensor
+    face: torch.Tensor
+    unbound: torch.Tensor
+    screen_gradient: torch.Tensor
+    gradient_count: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def arrays(self) -> Parameters:
+        """The parameters as numpy arrays that share their memory."""
+        return Parameters(*(t.numpy() for t in self.parameters))
+
+    def splats(self) -> Splats:
+        """A copy of the splats as they are now."""
+        return self._copy(self.parameters)
+
+    def averaged(self) -> Splats:
+        """A copy of the splats' running average."""
+        return self._copy(self.average)
+
+    def _copy(self, parameters: Parameters) -> Splats:
+        arrays = {name: t.numpy().copy() for name, t in parameters._asdict().items()}
+        return Splats(**arrays, face=self.face.numpy().copy(), unbound=self.unbound.numpy().copy())
+
+
+def new_state(splats: Splats) -> TrainState:
+    """Fresh optimiser moments around a copy of the splats."""
+    values = [torch.from_numpy(getattr(splats, name).astype(np.float32)) for name in Parameters._fields]
+    n = len(splats)
+
+    def zeros() -> Parameters:
+        return Parameters(*(torch.zeros_like(v) for v in values))
+
+    return TrainState(
+        parameters=Parameters(*values),
+        gradients=zeros(),
+        first=zeros(),
+        second=zeros(),
+        average=Parameters(*(v.clone() for v in values)),
+        steps=torch.zeros(n, dtype=torch.int32),
+        face=torch.from_numpy(splats.face.astype(np.int32)),
+        unbound=torch.from_numpy(splats.unbound.astype(bool)),
+        screen_gradient=torch.zeros(n),
+        gradient_count=torch.zeros(n),
+    )
+
+
+def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
+    """The rows at `keep`, a mask (N,) or indices, with everything that belongs to them."""
+    return _map(lambda tensors: tensors[0][keep], state)
+
+
+def join(state: TrainState, other: TrainState) -> TrainState:
+    """All rows of both, in order."""
+    return _map(lambda tensors: torch.cat(tensors), state, other)
+
+
+def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
+    """Every tensor under a flat name such as "first/xyz"; the inverse of `state_of`."""
+    flat = {}
+    for f in fields(state):
+        value = getattr(state, f.name)
+        if isinstance(value, torch.Tensor):
+            flat[f.name] = value
+        else:
+            flat.update({f"{f.name}/{name}": tensor for name, tensor in value._asdict().items()})
+    return flat
+
+
+def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
+    """Rebuild a state from `tensors_of`. Raises KeyError with the name of a missing tensor."""
+    values: dict[str, Any] = {}
+    for f in fields(TrainState):
+        if f.name in tensors:
+            values[f.name] = tensors[f.name]
+        else:
+            values[f.name] = Parameters(*(tensors[f"{f.name}/{name}"] for name in Parameters._fields))
+    return TrainState(**values)
+
+
+def _map(function: Callable[[list[torch.Tensor]], torch.Tensor], *states: TrainState) -> TrainState:
+    flat = [tensors_of(s) for s in states]
+    return state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})

@@ -1,0 +1,27 @@
+"""Progress of a run on a terminal."""
+
+from tqdm import tqdm
+
+from .loop import Progress
+
+
+class ProgressBar:
+    """tqdm over the share of the budget, with the figures a person wants beside it."""
+
+    def __enter__(self) -> "ProgressBar":
+        layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+        self._bar = tqdm(total=1.0, bar_format=layout, mininterval=0.5, dynamic_ncols=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def report(self, progress: Progress) -> bool:
+        self._bar.set_description(progress.message, refresh=bool(progress.iteration == 0))
+        psnr = "" if progress.psnr is None else f", PSNR {progress.psnr:.2f}"
+        if progress.iteration:
+            figures = f"{progress.per_second:.1f} it/s, loss {progress.loss:.4f}{psnr}, {progress.splats} splats"
+            forecast_text = f"; {progress.forecast_text}" if progress.forecast_text else ""
+            self._bar.set_postfix_str(figures + forecast_text, refresh=False)
+        self._bar.update(progress.share - self._bar.n)
+        return False

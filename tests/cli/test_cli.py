@@ -1,0 +1,523 @@
+"""The command line: what each command does, and one sentence with exit code 2 for every mistake."""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from capture import factory
+from PIL import Image
+
+from stga_addon import __version__
+from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.ply import read_ply
+from stga_addon.capture.open import open_capture
+from stga_addon.cli import commands
+from stga_addon.cli.parser import STRATEGIES, colour, duration, main, parser
+from stga_addon.errors import StgaError
+from stga_addon.training import settings as training_settings
+from stga_addon.training.run.folder import read_checkpoint, read_run
+
+TIMESTEPS, CAMERAS = (0, 1, 3), range(3)
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return factory.write_mesh_capture(tmp_path_factory.mktemp("cli") / "ball", TIMESTEPS, CAMERAS)
+
+
+@pytest.fixture(scope="session")
+def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of ten iterations without hull seeds (the paper's schedule)."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["train", str(root), "--out", str(out), "--iterations", "10", "--schedule", "paper"]) == 0
+    return out
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run a command that must fail: exit code 2 and one sentence on stderr, which is returned."""
+    capsys.readouterr()
+    assert main([str(a) for a in arguments]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stga: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def pictures(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        assert image.mode == "RGB"
+        return np.asarray(image)
+
+
+# What each command does
+
+
+def test_info(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an overview that does not run on a plain capture."""
+    assert main(["info", str(root)]) == 0
+    text = capsys.readouterr().out
+    assert "162 vertices, 320 triangles" in text
+    assert "40 x 60" in text
+
+
+def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a threshold that is ignored, timesteps without a line, and masks written under another timestep."""
+    out = tmp_path / "selection.npz"
+    assert main(["select", str(root), "--threshold", "0.0008", "--out", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "threshold 0.8 mm, 320 triangles"
+    assert [int(line.split()[0]) for line in lines[1:]] == list(TIMESTEPS)
+    with np.load(out) as data:
+        chosen = {int(name): data[name] for name in data.files}
+    assert set(chosen) == set(TIMESTEPS)
+    assert not chosen[0].any()
+    mouth = open_capture(root).regions["mouth"]
+    assert chosen[3][mouth].all()
+    assert chosen[3].mean() < 0.5
+    assert "mouth" in lines[3]
+    assert main(["select", str(root), "--threshold", "1"]) == 0
+    assert all("0.0%" in line for line in capsys.readouterr().out.splitlines()[1:])
+
+
+def test_train(trained: Path, root: Path) -> None:
+    """Catches options that do not reach the run."""
+    run = read_run(trained)
+    assert run.capture == root.resolve()
+    assert (run.settings.iterations, run.settings.seconds) == (10, None)
+    assert run.settings.global_every == 20
+    assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
+
+
+def test_train_with_defaults_and_every_option(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches defaults without the lattice, and a strategy, threshold or seed that is ignored."""
+    out = tmp_path / "run"
+    options = "--iterations 3 --strategy selective --threshold 0.0005 --seed 5 --device cpu --principal-point vhap"
+    assert main(["train", str(root), "--out", str(out), *options.split()]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"avatar: {out / 'avatar.npz'}"
+    run = read_run(out)
+    assert (run.settings.seed, run.settings.selection.threshold, run.settings.strategy) == (5, 0.0005, "selective")
+    splats = read_avatar(out / "avatar.npz").splats
+    assert (~splats.unbound).sum() == 6 * 320
+
+
+def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
+    """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
+    out = tmp_path / "run"
+    arguments = ["train", str(root), "--out", str(out), "--budget", "0.2s", "--strategy", "gaussian-avatars"]
+    assert main(arguments) == 0
+    first = read_checkpoint(out)
+    assert 0.2 <= first.elapsed_s < 1.5
+    assert main([*arguments, "--resume"]) == 0
+    again = read_checkpoint(out)
+    assert (again.iteration, again.elapsed_s) == (first.iteration, first.elapsed_s)
+
+
+def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches figures of another split, and figures that differ from those of the training's last evaluation."""
+    for split, views in (("val", 2), ("test", 3), ("train", 4)):
+        assert main(["eval", str(trained), "--split", split]) == 0
+        assert f"{split}: {views} views, PSNR " in capsys.readouterr().out
+        quality = json.loads((trained / f"quality_{split}.json").read_text())
+        assert quality["views"] == views
+    best = read_checkpoint(trained).best_psnr
+    measured = json.loads((trained / "quality_val.json").read_text())["psnr"]
+    assert measured == pytest.approx(best, abs=0.05)
+
+
+def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
+    """Catches pictures that are missing, misnamed, upside down or of another frame or background."""
+    for split, names in (("val", ["00000_02.png", "00001_02.png"]), ("test", [f"00003_{c:02d}.png" for c in CAMERAS])):
+        out = tmp_path / split
+        cameras = root / f"transforms_{split}.json"
+        assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out)]) == 0
+        assert pictures(out) == names
+    drawn = pixels(tmp_path / "val" / "00000_02.png")
+    assert drawn.shape == (60, 40, 3)
+    assert (drawn[0] == 255).all()
+    # Ten steps from grey: the ball stands where its silhouette says, in something that is not white.
+    dark = (drawn < 230).any(axis=2)
+    assert np.mean(dark == factory.silhouette()) > 0.9
+    assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("black", (0, 0, 0)), ("1,0,0.2", (255, 0, 51)), ("white", (255, 255, 255))]
+)
+def test_render_background(trained: Path, root: Path, tmp_path: Path, name: str, value: tuple[int, int, int]) -> None:
+    """Catches a background that is not the one asked for."""
+    cameras = str(root / "transforms_val.json")
+    assert main(["render", str(trained), "--cameras", cameras, "--out", str(tmp_path), "--background", name]) == 0
+    assert pixels(tmp_path / "00000_02.png")[1, 1].tolist() == list(value)
+
+
+def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -> None:
+    """Catches an avatar that is not driven by the frame's own mesh, and a PLY that needs a capture or differs."""
+    cameras = ["--cameras", str(root / "transforms_val.json")]
+    for name, source in (("run", [trained]), ("avatar", [trained / "avatar.npz", "--capture", root])):
+        assert main(["render", *map(str, source), *cameras, "--out", str(tmp_path / name)]) == 0
+    ply = tmp_path / "frame.ply"
+    assert main(["export", str(trained), "--format", "ply", "--timestep", "1", "--out", str(ply)]) == 0
+    assert main(["render", str(ply), *cameras, "--out", str(tmp_path / "ply")]) == 0
+    for name in ("00000_02.png", "00001_02.png"):
+        np.testing.assert_array_equal(pixels(tmp_path / "run" / name), pixels(tmp_path / "avatar" / name))
+    right, baked = (pixels(tmp_path / kind / "00001_02.png").astype(int) for kind in ("run", "ply"))
+    assert np.abs(right - baked).max() <= 1
+
+
+def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
+    """Catches pictures that overwrite each other: a name used in two folders, or twice; images need not exist."""
+    document = json.loads((root / "transforms_val.json").read_text())
+    first = document["frames"][0]
+    paths = ["a/0.png", "b/0.png", "b/1.jpg", "b/1.jpg", "../c/2"]
+    for entry in [first, *document["frames"]]:
+        entry.pop("fg_mask_path", None)
+    document["frames"] = [{**first, "file_path": path} for path in paths]
+    cameras = tmp_path / "ball" / "cameras.json"
+    cameras.parent.mkdir()
+    cameras.write_text(json.dumps(document))
+    out = tmp_path / "out"
+    assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out)]) == 0
+    assert len(pictures(out)) == len(paths)
+    assert {"a_0.png", "b_0.png"} <= set(pictures(out))
+    assert all(name.endswith(".png") for name in pictures(out))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball", "out"]
+
+
+def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
+    """Catches a PLY of another frame than asked for, and one in local coordinates."""
+    avatar, capture = read_avatar(trained / "avatar.npz"), open_capture(root)
+    meshes = {None: avatar.neutral, 3: capture.mesh(3)}
+    for timestep, mesh in meshes.items():
+        out = tmp_path / f"{timestep}.ply"
+        chosen = [] if timestep is None else ["--timestep", str(timestep)]
+        assert main(["export", str(trained), "--format", "ply", "--out", str(out), *chosen]) == 0
+        expected = to_world(avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral, avatar.convention))
+        again = read_ply(out)
+        np.testing.assert_allclose(again.xyz, expected.xyz, atol=1e-6)
+        np.testing.assert_allclose(again.log_scale, expected.log_scale, atol=1e-5)
+    assert np.abs(read_ply(tmp_path / "3.ply").xyz - read_ply(tmp_path / "None.ply").xyz).max() > 0.002
+    assert np.linalg.norm(read_ply(tmp_path / "None.ply").xyz, axis=1).mean() == pytest.approx(0.1, abs=0.01)
+
+
+def test_export_a_neutral_ply_without_capture(trained: Path, tmp_path: Path) -> None:
+    """Catches a capture being asked for where none is needed."""
+    out = tmp_path / "a.ply"
+    assert main(["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(out)]) == 0
+    assert len(read_ply(out)) == len(read_avatar(trained / "avatar.npz").splats)
+
+
+def test_export_a_sequence(trained: Path, tmp_path: Path) -> None:
+    """Catches frames numbered from zero instead of by their timestep."""
+    assert main(["export", str(trained), "--format", "ply-sequence", "--out", str(tmp_path / "s")]) == 0
+    assert pictures(tmp_path / "s") == ["00000.ply", "00001.ply", "00003.ply"]
+    low = [read_ply(path).xyz[:, 1].min() for path in sorted((tmp_path / "s").iterdir())]
+    assert low[0] > low[1] > low[2]
+
+
+def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a pair without motion, and one that is made up for a mesh capture, which has none."""
+    root, model = factory.write_flame_capture(tmp_path / "flame")
+    out, pair = tmp_path / "run", tmp_path / "pair"
+    options = ["--flame", str(model), "--iterations", "4", "--strategy", "gaussian-avatars"]
+    assert main(["train", str(root), "--out", str(out), *options]) == 0
+    assert main(["export", str(out), "--format", "gaussian-avatars", "--out", str(pair)]) == 0
+    assert pictures(pair) == ["flame_param.npz", "point_cloud.ply"]
+    with np.load(pair / "flame_param.npz") as data:
+        assert len(data["expr"]) >= 3
+    message = refused(capsys, "export", trained, "--format", "gaussian-avatars", "--out", tmp_path / "none")
+    assert "needs the FLAME parameters of a FLAME capture" in message
+    assert not (tmp_path / "none").exists()
+
+
+WITHOUT_TORCH = """
+import sys
+sys.modules.update(dict.fromkeys(("torch", "numba", "warp")))  # importing one of them fails
+from stga_addon.cli.parser import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_info_needs_no_torch(root: Path) -> None:
+    """Catches an import by which a capture can only be looked at where it could be trained."""
+    command = [sys.executable, "-c", WITHOUT_TORCH, "info", str(root)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr
+    assert "view-color" in done.stdout
+
+
+# Mistakes
+
+
+def test_missing_and_broken_captures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches tracebacks, and run folders made for a capture that cannot be read."""
+    out = tmp_path / "run"
+    assert "is not a folder" in refused(capsys, "train", tmp_path / "none", "--out", out, "--iterations", 3)
+    broken = factory.write_mesh_capture(tmp_path / "broken", TIMESTEPS, CAMERAS)
+    (broken / "transforms_val.json").write_text('{"frames": [')
+    for command in (["train", broken, "--out", out, "--iterations", 3], ["info", broken], ["select", broken]):
+        assert "transforms_val.json: is not valid JSON" in refused(capsys, *command)
+    assert not out.exists()
+
+
+def test_a_second_run_into_the_same_folder(trained: Path, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a run that overwrites another."""
+    before = {p.name: p.read_bytes() for p in trained.iterdir()}
+    message = refused(capsys, "train", root, "--out", trained, "--iterations", 3)
+    assert "already holds a run; give --resume" in message
+    assert {p.name: p.read_bytes() for p in trained.iterdir()} == before
+
+
+def test_resuming_what_is_not_there(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a new run started by a mistyped folder, and one continued with another capture."""
+    message = refused(capsys, "train", root, "--out", tmp_path / "none", "--resume")
+    assert "holds no run" in message
+    assert not (tmp_path / "none").exists()
+    other = factory.write_mesh_capture(tmp_path / "other", TIMESTEPS, CAMERAS)
+    assert f"this run trains {root.resolve()}, not" in refused(capsys, "train", other, "--out", trained, "--resume")
+
+
+@pytest.mark.parametrize("option", [["--stop-when-flat"], ["--target-psnr", 30], ["--preset", "final"], ["--seed", 5]])
+def test_resuming_with_another_goal(
+    trained: Path, root: Path, capsys: pytest.CaptureFixture[str], option: list[object]
+) -> None:
+    """Catches an option that is given and does nothing."""
+    message = refused(capsys, "train", root, "--out", trained, "--resume", *option)
+    assert f"{option[0]}: this run began with" in message
+
+
+def test_an_avatar_without_capture(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback where the meshes to follow are not known."""
+    avatar, cameras = trained / "avatar.npz", root / "transforms_val.json"
+    message = refused(capsys, "render", avatar, "--cameras", cameras, "--out", tmp_path / "o")
+    assert "give --capture" in message
+    message = refused(capsys, "export", avatar, "--format", "ply-sequence", "--out", tmp_path / "o")
+    assert "give --capture" in message
+    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o")
+    assert "give --capture" in message
+    assert not (tmp_path / "o").exists()
+
+
+def test_eval_of_what_is_no_run(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a traceback for an avatar's file where a run's folder is meant."""
+    assert "avatar.npz" in refused(capsys, "eval", trained / "avatar.npz")
+    assert "holds no run" in refused(capsys, "eval", tmp_path)
+
+
+def test_capture_of_another_topology(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches splats bound to triangles of another mesh."""
+    other = factory.write_mesh_capture(tmp_path / "other", TIMESTEPS, CAMERAS)
+    sphere = trimesh.creation.icosphere(1, factory.RADIUS)
+    for path in (other / "meshes").iterdir():
+        factory.write_mesh(path, np.array(sphere.vertices), np.array(sphere.faces))
+    (other / "regions.json").write_text(json.dumps({"mouth": [0, 1, 2]}))
+    cameras = root / "transforms_val.json"
+    arguments = ["render", trained / "avatar.npz", "--capture", other, "--cameras", cameras, "--out", tmp_path / "o"]
+    assert f"{other}: its mesh has other triangles" in refused(capsys, *arguments)
+    arguments = ["export", trained, "--capture", other, "--format", "ply-sequence", "--out", tmp_path / "o"]
+    assert f"{other}: its mesh has other triangles" in refused(capsys, *arguments)
+    assert not (tmp_path / "o").exists()
+
+
+def test_unreadable_avatars(trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a traceback for a truncated avatar, a foreign npz, a foreign PLY and a missing file."""
+    whole = (trained / "avatar.npz").read_bytes()
+    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+    np.savez(tmp_path / "foreign.npz", a=np.zeros(3))
+    (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    cameras = root / "transforms_val.json"
+    for name in ("half.npz", "foreign.npz", "none.npz", "mesh.ply", "none.ply"):
+        arguments = ["--capture", root, "--cameras", cameras, "--out", tmp_path / "o"]
+        assert f"{name}: " in refused(capsys, "render", tmp_path / name, *arguments)
+    assert not (tmp_path / "o").exists()
+
+
+def test_frames_that_the_capture_has_not(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a KeyError for a camera at a timestep without mesh."""
+    message = refused(capsys, "export", trained, "--format", "ply", "--timestep", 2, "--out", tmp_path / "a.ply")
+    assert "has no timestep 2" in message
+    cameras = tmp_path / "ball" / "cameras.json"
+    cameras.parent.mkdir()
+    cameras.write_text((root / "transforms_val.json").read_text())
+    factory.edit(cameras, lambda document: document["frames"][0].update(timestep_index=2))
+    message = refused(capsys, "render", trained, "--cameras", cameras, "--out", tmp_path / "o")
+    assert "has no mesh for timestep 2" in message
+
+
+def test_budgets_that_are_none(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches nonsense that trains nothing or for ever; what is no number at all the parser refuses."""
+    out = tmp_path / "run"
+    for budget in (["--iterations", 0], ["--iterations", -3], ["--budget", "0s"]):
+        assert "more than nothing" in refused(capsys, "train", root, "--out", out, *budget)
+    for budget in (["--iterations", "many"], ["--budget", "soon"], ["--budget", "-5"], ["--budget=-5"]):
+        with pytest.raises(SystemExit, match="2"):
+            main(["train", str(root), "--out", str(out), *budget])
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", str(root), "--out", str(out), "--budget", "5m", "--iterations", "5"])
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("option", [("--seed", "-1"), ("--threshold", "nan"), ("--threshold", "-1")])
+def test_numbers_that_make_no_sense(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[str, str]
+) -> None:
+    """Catches a traceback from deep inside, or a run that silently selects nothing or everything."""
+    try:
+        code = main(["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2", *option])
+    except SystemExit as error:  # the parser's way
+        code = error.code
+    assert code == 2
+    assert option[0].strip("-") in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_image_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an error in the loader's thread that hangs the training or ends in a traceback."""
+    root = factory.write_mesh_capture(tmp_path / "capture", TIMESTEPS, CAMERAS)
+    Image.new("RGB", (41, 60)).save(root / "images" / "00001_01.png")
+    out = tmp_path / "run"
+    message = refused(capsys, "train", root, "--out", out, "--iterations", 30, "--strategy", "gaussian-avatars")
+    assert "00001_01.png: the image has 41 x 60 pixels" in message
+    assert not (out / "run.lock").exists()
+
+
+def test_out_is_a_file(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a traceback, or talk of another run, for an --out that is a file."""
+    (tmp_path / "file").write_text("x")
+    message = refused(capsys, "train", root, "--out", tmp_path / "file", "--iterations", 3)
+    assert "cannot be written" in message
+    assert (tmp_path / "file").read_text() == "x"
+
+
+def test_splits_that_are_not_there(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a mean over no views, and a training without any."""
+    bare = factory.write_mesh_capture(tmp_path / "bare", TIMESTEPS, CAMERAS)
+    (bare / "transforms_train.json").unlink()
+    (bare / "transforms_test.json").unlink()
+    message = refused(capsys, "train", bare, "--out", tmp_path / "run", "--iterations", 3)
+    assert "has no training views" in message
+    run = json.loads((trained / "run.json").read_text())
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    (moved / "run.json").write_text(json.dumps({**run, "capture": str(bare)}))
+    (moved / "avatar.npz").write_bytes((trained / "avatar.npz").read_bytes())
+    assert "has no views in the split 'test'" in refused(capsys, "eval", moved, "--split", "test")
+
+
+# The parser
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1h", 3600), ("1.5m", 90), ("1m30", 90), (" 2m ", 120)],
+)
+def test_durations(text: str, seconds: float) -> None:
+    """Catches minutes taken for seconds."""
+    assert duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m"])
+def test_durations_that_are_none(text: str) -> None:
+    """Catches a budget that means something else than what was typed."""
+    with pytest.raises(argparse.ArgumentTypeError, match="is not a time such as"):
+        duration(text)
+
+
+def test_colours() -> None:
+    """Catches channels in another order or range."""
+    assert colour("white") == (1, 1, 1)
+    assert colour("black") == (0, 0, 0)
+    assert colour("0.25,1,0") == (0.25, 1, 0)
+    assert colour("0, .5 ,1.0") == (0, 0.5, 1)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "-1,0,0", "nan,0,0", "0,0,inf", "a,b,c"]
+)
+def test_colours_that_are_none(text: str) -> None:
+    """Catches 0…255 taken for 0…1, and values that would wrap around in the image."""
+    with pytest.raises(argparse.ArgumentTypeError, match="is not white, black or R,G,B"):
+        colour(text)
+
+
+def test_every_command_is_there() -> None:
+    """Catches a command that the parser knows and nothing does, and strategies that the trainer does not know."""
+    choices = next(a for a in parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    expected = {"train", "plan", "benchmark", "render", "eval", "select", "export", "info", "demo", "job"}
+    assert set(choices) == expected
+    assert all(callable(getattr(commands, name)) for name in choices)
+    assert training_settings.STRATEGIES == STRATEGIES
+
+
+def test_interruption_and_mistakes_have_their_codes(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback after Ctrl-C, and a bug of ours dressed up as the person's mistake."""
+
+    def fails_with(error: BaseException) -> None:
+        def info(options: argparse.Namespace) -> None:
+            raise error
+
+        monkeypatch.setattr(commands, "info", info)
+
+    fails_with(KeyboardInterrupt())
+    assert main(["info", str(root)]) == 130
+    fails_with(StgaError("the sentence"))
+    assert refused(capsys, "info", root) == "stga: the sentence"
+    fails_with(RuntimeError("a bug"))
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(["info", str(root)])
+
+
+# In a process of its own
+
+
+def stga(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "stga_addon", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_as_a_module(root: Path, trained: Path, tmp_path: Path) -> None:
+    """Catches a broken entry point, exit codes that get lost, and tracebacks on stderr."""
+    assert stga("--version").stdout.strip() == __version__
+    done = stga("info", root)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = stga("info", tmp_path / "none")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == f"stga: {tmp_path / 'none'}: is not a folder; expected that of a capture\n"
+    done = stga("train", root, "--out", trained, "--iterations", 3)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"stga: {trained}: already holds a run")
+    assert "Traceback" not in done.stderr
+    assert stga("train", root).returncode == 2
+    assert stga().returncode == 2
+
+
+def test_training_as_a_module(root: Path, tmp_path: Path) -> None:
+    """Catches a progress bar that breaks without a terminal, and output that hides where the avatar is."""
+    out = tmp_path / "run"
+    done = stga("train", root, "--out", out, "--iterations", 4, "--strategy", "gaussian-avatars")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == f"avatar: {out / 'avatar.npz'}"
+    assert "100%" in done.stderr
+    assert "PSNR" in done.stderr
+    assert len(read_avatar(out / "avatar.npz").splats) == 320

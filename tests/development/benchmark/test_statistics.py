@@ -1,0 +1,112 @@
+"""Means, spreads and fronts against ones computed by hand."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.development.benchmark.benchmark import report_text, table_lines
+from stga_addon.development.benchmark.statistics import (
+    MeanCurve,
+    Outcome,
+    Spread,
+    alike,
+    leaders,
+    mean_curves,
+    spread_of,
+    summarise,
+)
+from stga_addon.report.run_summary import evaluation_share
+
+
+def line(seconds: float, psnr: float, iteration: int = 0, **more: Any) -> dict[str, Any]:
+    return {"seconds": seconds, "psnr": psnr, "iteration": iteration, "splats": 7, "evaluation_s": 0.5, **more}
+
+
+def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outcome:
+    """A run of 10 s and 100 iterations whose curve rises by 1 dB a second to `psnr`."""
+    lines = [line(float(s), psnr - 10 + s, 10 * s) for s in range(1, 11)]
+    return Outcome(variant, seed, lines, {"val": {"psnr": psnr, "ssim": 0.9}} if finished else {})
+
+
+def test_summary_over_seeds() -> None:
+    """Catches the population's deviation for the sample's, seeds of other variants, and unfinished runs that count."""
+    runs = [outcome("a", seed, psnr) for seed, psnr in enumerate((30.0, 31.0, 32.0))]
+    table = summarise([*runs, outcome("a", 3, 99.0, finished=False), outcome("b", 0, 20.0)])
+    assert table["a"]["val_psnr"] == Spread(31.0, 1.0, 3)
+    assert table["a"]["ms_per_iteration"].mean == pytest.approx(100.0)
+    assert table["b"]["val_psnr"].mean == 20.0
+    assert np.isnan(table["b"]["val_psnr"].spread)
+
+
+def test_alike() -> None:
+    """Catches a difference claimed between runs that scatter as much."""
+    a, b = spread_of([30.0, 30.4]), spread_of([30.3, 30.9])
+    assert alike(a, b)
+    assert not alike(a, Spread(31.0, 0.1, 2))
+    assert not alike(Spread(30.0, float("nan"), 1), Spread(30.0, float("nan"), 1))  # nothing is known
+
+
+def test_mean_curves() -> None:
+    """Catches seeds averaged by position instead of by time."""
+    slow = Outcome("a", 0, [line(2.0, 10.0), line(10.0, 18.0)], {})
+    fast = Outcome("a", 1, [line(1.0, 11.0), line(5.0, 15.0), line(9.0, 19.0)], {})
+    curve = mean_curves([slow, fast, Outcome("b", 0, [line(1.0, 5.0)], {})])["a"]
+    assert (curve.seconds[0], curve.seconds[-1]) == (2.0, 9.0)
+    np.testing.assert_allclose(curve.low, curve.seconds + 8)
+    np.testing.assert_allclose(curve.high, curve.seconds + 10)
+    np.testing.assert_allclose(curve.mean, curve.seconds + 9)
+
+
+def curve(seconds: list[float], psnr: list[float]) -> MeanCurve:
+    values = np.array(psnr)
+    return MeanCurve(np.array(seconds), values, values, values)
+
+
+def test_the_front() -> None:
+    """Catches a variant on the front that another beat earlier, and time on it without any gain."""
+    curves = {
+        "early": curve([1, 2, 10], [20, 30, 30]),
+        "late": curve([1, 10], [20, 38]),
+        "never": curve([1, 10], [15, 29]),
+    }
+    (first, a, b), (second, c, d) = leaders(curves)
+    assert (first, second) == ("early", "late")
+    assert a == 1
+    assert b == pytest.approx(2, abs=0.05)  # after that it only waits
+    assert c == pytest.approx(6, abs=0.05)  # where the late one has caught up with 30 dB
+    assert d == 10
+    assert leaders({}) == []
+
+
+def test_the_table() -> None:
+    """Catches columns out of line, figures under the wrong heading, and a comparison with the wrong variant."""
+    runs = [outcome(name, seed, psnr + seed) for name, psnr in (("standard", 30.0), ("draft", 27.0)) for seed in (0, 1)]
+    lines = table_lines(summarise(runs))
+    assert len({len(text) for text in lines}) == 1
+    cells = [[cell.strip() for cell in text.strip("|").split("|")] for text in lines]
+    assert cells[0] == ["variant", "iterations", "ms/it", "splats", "val", "SSIM", "Δ val"]
+    assert cells[2] == ["standard", "100", "100.0", "7", "30.50 ± 0.71", "0.9000 ± 0.0000", "+0.00"]
+    assert cells[3][-1] == "-3.00"
+
+
+def test_the_report_says_what_is_not_shown() -> None:
+    """Catches a ranking that the seeds do not bear out, and one seed taken for certainty."""
+    two = [
+        outcome(name, seed, psnr + seed) for name, psnr in (("a", 30.0), ("b", 30.5), ("c", 20.0)) for seed in (0, 1)
+    ]
+    text = report_text(two, mean_curves(two), 10.0, Path("head"))
+    assert "b and a are 0.50 dB apart, within their spread" in text
+    assert "a and c" not in text
+    assert "Pareto front): b 1 s–10 s" in text
+    assert "Evaluation while training took 45.0%" in text
+    one = [run for run in two if run.seed == 0]
+    assert "One seed shows no spread" in report_text(one, mean_curves(one), 10.0, Path("head"))
+    none = [outcome("a", 0, 30.0, finished=False)]
+    assert report_text(none, {}, 10.0, Path("head")) == "head: no run is finished yet"
+
+
+def test_the_last_evaluation_comes_after_training() -> None:
+    """Catches the share of short runs being blamed on the evaluation that any run ends with."""
+    assert evaluation_share([line(5.0, 1.0), line(10.0, 2.0)]) == 0.05

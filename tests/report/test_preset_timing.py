@@ -1,0 +1,81 @@
+"""Plans: how long a preset takes."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
+from stga_addon.report import preset_timing
+from stga_addon.report.preset_timing import SETTLING, seconds_per_iteration, time_presets
+from stga_addon.training.settings import PRESETS, Preset, make_settings
+
+
+class Stopwatch:
+    """A clock that only steps of training move: by 0.01 s a thousand pixels."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Shares of the budget that the steps were made at."""
+    watch, seen = Stopwatch(), []
+
+    class Trainer:
+        def __init__(self, *_: Any, **__: Any) -> None:
+            pass
+
+        def step(self, view: Any, image: Any, share: float, mask: Any) -> None:
+            assert not image.flags.writeable
+            assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
+            watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000
+            seen.append(share)
+
+    monkeypatch.setattr(preset_timing, "perf_counter", watch)
+    monkeypatch.setattr(preset_timing, "Trainer", Trainer)
+    return seen
+
+
+def test_the_mean_over_the_whole_course(toy: Capture, shares: list[float]) -> None:
+    """Catches a calibration of the cheap beginning only: images of 40 x 60 pixels, a third of the time at half size."""
+    settings = make_settings(iterations=100, coarse_span=1 / 3)
+    pace = seconds_per_iteration(toy, settings, 2.4)
+    fine, coarse = 0.024, 0.006
+    steps = [0.8 / coarse, 1.6 / fine]  # seconds at each size over the time of a step
+    assert pace == pytest.approx(2.4 / sum(steps), rel=0.05)
+    assert shares[: SETTLING + 1] == [0.0] * (SETTLING + 1)
+    assert shares == sorted(shares)
+    assert 0.97 < shares[-1] < 1
+
+
+def test_plans(toy: Capture, shares: list[float]) -> None:
+    """Catches presets out of order, and a long capture that gets no more time than a short one."""
+    plans = time_presets(toy, seconds=0.1)
+    assert [plan.preset for plan in plans] == list(PRESETS)
+    assert [plan.seconds for plan in plans] == sorted(plan.seconds for plan in plans)
+    assert plans[1].seconds == pytest.approx(PRESETS["standard"].iterations * 0.024, rel=0.01)
+    assert time_presets(toy, ["final"], 0.1)[0].as_json()["preset"] == "final"
+
+
+def test_iterations_grow_with_the_capture() -> None:
+    """Catches a sequence of a thousand frames of which most are never seen."""
+    preset = Preset("", 1000, 0.5, {})
+    assert (preset.iterations_for(10), preset.iterations_for(5001)) == (1000, 2501)
+
+
+def test_nothing_to_train_on(toy: Capture) -> None:
+    """Catches an endless wait for views that never come."""
+    with pytest.raises(StgaError, match="has no training views"):
+        time_presets(replace(toy, views={}))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_settings(preset: str) -> None:
+    """Catches a preset that names a setting that does not exist, or forgets its own name."""
+    assert make_settings(preset=preset, seconds=1.0).preset == preset
+    assert make_settings(preset=preset, seconds=1.0, lattice=3).lattice == 3

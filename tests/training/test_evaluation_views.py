@@ -1,0 +1,58 @@
+"""Which pixels count as head and as moving, against the toy's own geometry."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from capture import factory
+from PIL import Image
+
+from stga_addon.capture.model import Capture
+from stga_addon.training.evaluate.evaluation_views import MOST_VIEWS, choose_evaluation_views, look, visible_pixels
+
+
+def test_watched_views_are_spread(toy: Capture) -> None:
+    """Catches evaluations while training that cost more than the training, or look at one end of the sequence."""
+    view = toy.views["val"][0]
+    many = tuple(replace(view, timestep=t) for t in range(100))
+    watched = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
+    assert len(watched) == MOST_VIEWS
+    assert (watched[0], watched[-1]) == (0, 99)
+    assert set(np.diff(watched)) <= {6, 7}
+    assert list(choose_evaluation_views(toy)) == list(toy.views["val"])
+
+
+def test_regions_of_a_view(toy: Capture) -> None:
+    """Catches a mask that is inverted, and a view in which nothing moves with a region for it."""
+    still, *_, moving = (look(toy, view) for view in toy.views["val"])
+    np.testing.assert_array_equal(still.regions["mask"], factory.silhouette())
+    assert "selected" not in still.regions  # timestep 0 is the neutral one
+    where = moving.regions["selected"]
+    assert where.any()
+    # The ball's lower part moves, which is below in the image, and only the ball does.
+    rows = np.flatnonzero(where.any(1))
+    assert rows.min() > factory.CY
+    assert not (where & ~factory.silhouette())[:-1].any() or (where & ~factory.silhouette()).mean() < 0.02
+    assert not moving.target.flags.writeable
+
+
+def test_only_the_nearest_triangle_is_seen(toy: Capture) -> None:
+    """Catches pixels of triangles on the far side of the head, which no camera sees."""
+    view = toy.views["val"][0]
+    mesh = toy.mesh(view.timestep)
+    away = mesh[toy.faces].mean(1) - view.camera.position
+    normals = np.cross(mesh[toy.faces[:, 1]] - mesh[toy.faces[:, 0]], mesh[toy.faces[:, 2]] - mesh[toy.faces[:, 0]])
+    behind = (away * normals).sum(1) > 0
+    everything = visible_pixels(toy, view, np.ones(len(toy.faces), bool))
+    assert visible_pixels(toy, view, behind).sum() < 0.06 * everything.sum()  # edges of the silhouette
+    assert visible_pixels(toy, view, ~behind).sum() > 0.94 * everything.sum()
+    disc = factory.silhouette()
+    assert (everything ^ disc).sum() < 0.08 * disc.sum()  # the ball is a polyhedron
+
+
+def test_a_view_without_mask_has_no_head(toy: Capture, tmp_path: Path) -> None:
+    """Catches a whole image taken for a head."""
+    path = tmp_path / "plain.png"
+    Image.fromarray(factory.picture(0, 0)).save(path)
+    view = replace(toy.views["val"][0], image=path, mask=None)
+    assert "mask" not in look(toy, view).regions

@@ -1,0 +1,213 @@
+"""The iteration on a Warp device, which here is Warp's CPU device, against the CPU's: states, freezing, whole runs."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from stga_addon.capture.images import read_image
+from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
+from stga_addon.raster.gpu import rasterize as warp_render
+from stga_addon.training.optimize.backend import Backend, Batch
+from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.gpu_backend import GpuBackend
+from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
+from stga_addon.training.optimize.trainer import face_lengths, initial_splats
+from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
+from stga_addon.training.run.loop import train
+from stga_addon.training.schedule import learning_rates
+from stga_addon.training.settings import TrainingSettings
+
+from .test_run import assert_same_state, make_run, stop_at
+from .test_trainer import large, view_of
+from .toys import bits, quick_settings
+
+
+def settings_of(**changes: Any) -> TrainingSettings:
+    """Every term of the loss at work on most splats."""
+    limits = {"scale_limit": 0.2, "distance_weight": 0.1, "distance_limit": 0.3}
+    return quick_settings("selective", **{**limits, "strain_color": True, "antialiased": True, **changes})
+
+
+def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
+    """Splats unlike each other, in the middle of training."""
+    state = new_state(initial_splats(capture, settings))
+    generator = torch.Generator().manual_seed(0)
+    for value in state.parameters:
+        value += torch.randn(value.shape, generator=generator) * (1e-3 if value.ndim == 2 else 0.2)
+    state.steps += torch.arange(len(state), dtype=torch.int32) % 7
+    state.unbound[::5] = True
+    return state
+
+
+def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
+    """Both implementations with the same splats."""
+    lengths, frames = face_lengths(capture, settings.convention), FrameStore(capture, settings.convention, True)
+    cpu = CpuBackend(settings, lengths, frames, disturbed(capture, settings))
+    return cpu, GpuBackend("cpu", settings, lengths, frames, disturbed(capture, settings))
+
+
+def batch_of(capture: Capture, settings: TrainingSettings, timestep: int = 1, **changes: Any) -> Batch:
+    view = view_of(capture, timestep)
+    values = {
+        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3, np.float32), "degree": 3,
+        "selected": None, "rates": learning_rates(settings.rates, 0.0),
+    }  # fmt: skip
+    return Batch(**{**values, **changes})
+
+
+def moments(step: Backend) -> dict[str, np.ndarray]:
+    """After the first step, a tenth of the gradient."""
+    return {name: tensor.numpy() for name, tensor in step.state.first._asdict().items()}
+
+
+@pytest.mark.parametrize("part", ["whole", "mouth", "another background"])
+def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
+    """Catches a term of the loss, a limit, a rate, a bias correction or a background that is left out or differs."""
+    settings = settings_of()
+    changes: dict[str, Any] = {}
+    if part == "mouth":
+        changes["selected"] = toy.regions["mouth"]
+    if part == "another background":
+        # All or nothing: a mixture may lie between two bytes, and either is right.
+        mask = 255 * np.random.default_rng(1).integers(0, 2, read_image(view_of(toy, 1)).shape[:2], np.uint8)
+        changes |= {"mask": mask, "background": np.float32([0.13, 0.82, 0.43])}
+    batch = batch_of(toy, settings, **changes)
+    cpu, warp = pair(toy, settings)
+    before = tensors_of(warp.state)["parameters/xyz"].numpy().copy()
+    cpu.train(batch)
+    warp.train(batch)
+    expected, state = tensors_of(cpu.state), tensors_of(warp.state)
+    assert not np.array_equal(before, expected["parameters/xyz"].numpy())
+    for name in state:
+        if name.startswith("gradients/"):
+            continue
+        got, want = state[name].double().numpy(), expected[name].double().numpy()
+        off = np.abs(got - want) > 2e-4 * np.abs(want).max()
+        # The first step is the rate times the gradient's sign, which rounding may turn where the gradient is nothing.
+        assert off.mean() < 2e-3 if name.startswith("parameters/") else not off.any(), name
+
+
+def test_losses_are_the_cpus_and_told_two_iterations_late(toy: Capture) -> None:
+    """Catches a loss of another iteration, of a local one, or told twice."""
+    settings = settings_of()
+    cpu, warp = pair(toy, settings)
+    parts = [(1, None), (3, None), (1, toy.regions["mouth"]), (3, None), (1, None), (3, None)]
+    batches = [batch_of(toy, settings, timestep, selected=part) for timestep, part in parts]
+    expected, told = ([step.train(batch) for batch in batches] for step in (cpu, warp))
+    assert [loss is None for loss in told] == [True, True, False, False, True, False]
+    assert [told[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
+
+
+def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
+    """Catches momentum, limits or statistics that reach rows which the frame does not select."""
+    settings = settings_of()
+    _, warp = pair(toy, settings)
+    warp.train(batch_of(toy, settings))
+    before = bits(warp.state)
+    for _ in range(2):
+        warp.train(batch_of(toy, settings, selected=toy.regions["mouth"]))
+    state = warp.state
+    after, selected = bits(state), toy.regions["mouth"][state.face.numpy()]
+    for name in before:
+        np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
+    for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
+        assert (after[name] != before[name]).any(axis=1)[selected].mean() > 0.3, name
+
+
+def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
+    """Catches tiles left out around the selection, and pixels read that no tile rendered: they hold NaN."""
+    settings = settings_of(scale_weight=0.0, distance_weight=0.0)
+    view, target = large(view_of(toy, 1))
+    whole = batch_of(toy, settings, view=view, target=target)
+    part = batch_of(toy, settings, view=view, target=target, selected=toy.regions["mouth"])
+    (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
+    first.train(whole)
+    second.draw(view, np.ones(3, np.float32), 3)  # takes the buffers
+    for buffer in second._rasteriser.scratch._buffers.values():
+        if buffer.dtype in warp_render.TYPES:
+            buffer.fill_(np.nan)
+    second.train(part)
+    assert 0 < second._rasteriser.scratch.take("drawn", 8 * 12, warp_render.wp.uint8).numpy().mean() < 0.8
+    rows = np.flatnonzero(second.state.steps.numpy() != disturbed(toy, settings).steps.numpy())
+    assert 20 < len(rows) < 0.5 * len(second)
+    for name, want in moments(first).items():
+        got = moments(second)[name]
+        assert np.abs(got[rows] - want[rows]).max() <= 1e-6 * np.abs(want[rows]).max(), name
+
+
+def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an iteration lost, counted twice or half done where the buffers were too small for it."""
+    settings = settings_of()
+    batches = [batch_of(toy, settings, timestep, selected=s) for timestep, s in ((1, None), (3, toy.regions["mouth"]))]
+    results = []
+    for capacity in (warp_render.FIRST_CAPACITY, 10):
+        monkeypatch.setattr(warp_render, "FIRST_CAPACITY", capacity)
+        _, step = pair(toy, settings)
+        for batch in (*batches, *batches):
+            step.train(batch)
+        results.append(bits(step.state))
+    for name, want in results[0].items():
+        np.testing.assert_array_equal(results[1][name], want, err_msg=name)
+
+
+def test_full_memory_is_one_sentence(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a traceback where a GPU's memory does not suffice, and other failures hidden behind that sentence."""
+
+    def full(*_: Any, **__: Any) -> None:
+        raise RuntimeError("Failed to allocate 99 bytes on device 'cuda:0'")
+
+    settings = settings_of()
+    _, step = pair(toy, settings)
+    monkeypatch.setattr(warp_render.wp, "empty", full)
+    with pytest.raises(StgaError, match=r"memory of .* is full; .* or give --device cpu"):
+        step.train(batch_of(toy, settings))
+    monkeypatch.setattr(warp_render.wp, "empty", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        step.train(batch_of(toy, settings))
+
+
+def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
+    """Catches density control whose result stays on the host, and a state that is no copy."""
+    settings = settings_of()
+    _, step = pair(toy, settings)
+    state = step.state
+    state.average.opacity.fill_(-20.0)  # which is what is drawn
+    white = np.ones(3, np.float32)
+    assert step.draw(view_of(toy, 1), white, 3).min() < 0.9
+    step.state = state
+    assert step.draw(view_of(toy, 1), white, 3).min() == 1
+
+
+@pytest.fixture(scope="module")
+def runs(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folders of the same run, from start to end, by device."""
+    folder = tmp_path_factory.mktemp("runs")
+    for device in ("cpu", "warp-cpu"):
+        train(toy, folder / device, make_run(toy, "selective", iterations=40, strain_color=True), device=device)
+    return lambda device: folder / device
+
+
+@pytest.mark.slow
+def test_a_run_reaches_the_cpus_quality(runs: Callable[[str], Path]) -> None:
+    """Catches an iteration that is nearly right: schedule, density control, resets and selection all take part."""
+    ours, theirs = (read_metrics(runs(device))[-1] for device in ("warp-cpu", "cpu"))
+    assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=0.15)
+    assert ours["psnr"] > read_metrics(runs("warp-cpu"))[0]["psnr"] + 1
+    assert ours["splats"] == pytest.approx(theirs["splats"], rel=0.02)
+    assert ours["loss"] == pytest.approx(theirs["loss"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, runs: Callable[[str], Path], tmp_path: Path) -> None:
+    """Catches anything queued that a checkpoint misses, and sums that depend on chance: every bit must agree."""
+    run: Run = make_run(toy, "selective", iterations=40, strain_color=True)
+    train(toy, tmp_path, run, report=stop_at(17), device="warp-cpu")
+    assert read_checkpoint(tmp_path).iteration == 17
+    train(toy, tmp_path, run, resume=True, device="warp-cpu")
+    assert_same_state(tmp_path, runs("warp-cpu"))
