@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def train(options: Namespace) -> None:
     """Train, or continue, a run."""
     from ..effects.decide import decide, describe_effects
-    from ..report.run_summary import CurveDrawer, conclude
+    from ..report.run_summary import CurveUpdater, report_run
     from ..training.optimize.device import choose_device
     from ..training.run.folder import read_run
     from ..training.run.loop import Progress
@@ -51,7 +51,7 @@ def train(options: Namespace) -> None:
     for warning in capture.warnings:
         print(f"warning: {warning}")
     _print_table(describe_effects(run.plan))
-    draw = CurveDrawer(options.out)
+    draw = CurveUpdater(options.out)
     with ProgressBar() as bar:
 
         def report(progress: Progress) -> bool:
@@ -60,7 +60,7 @@ def train(options: Namespace) -> None:
 
         selection = None if options.head is None else options.head.selection()
         avatar = train_run(capture, options.out, run, selection, options.resume, report, device)
-    for line in conclude(options.out):
+    for line in report_run(options.out):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
@@ -140,11 +140,11 @@ def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
 
 def _planned(capture: Capture, preset: str, device: str) -> float:
     """Seconds that a preset takes on this machine's device, which are printed."""
+    from ..format import format_duration
     from ..report.preset_timing import time_presets
-    from ..training.evaluate.forecast import clock
 
     (plan,) = time_presets(capture, [preset], device=device)
-    print(f"{preset}: {plan.iterations} iterations, {clock(plan.seconds)} on this machine")
+    print(f"{preset}: {plan.iterations} iterations, {format_duration(plan.seconds)} on this machine")
     return plan.seconds
 
 
@@ -228,8 +228,8 @@ def _unique_names(paths: list[str]) -> list[str]:
 def eval(options: Namespace) -> None:
     """Print the quality of a run's avatar on a split, and write it beside the run."""
     from ..files import write_json
-    from ..training.evaluate.lpips import SMALLEST
-    from ..training.evaluate.metrics import measure
+    from ..training.evaluate.lpips import MIN_SIDE_PX
+    from ..training.evaluate.metrics import evaluate_avatar
 
     if not options.run.is_dir():
         raise StgaError(f"{options.run}: is not a folder; expected that of a run")
@@ -238,14 +238,14 @@ def eval(options: Namespace) -> None:
     views = capture.views.get(options.split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{options.split}'")
-    quality = measure(avatar, capture, options.split, perceptual=True)
+    quality = evaluate_avatar(avatar, capture, options.split, perceptual=True)
     print(f"{options.split}: {len(views)} views, {_describe(quality)}")
-    for region, name in (("mask", "inside the head mask"), ("selected", "where something moves")):
+    for region, name in (("mask", "inside the head mask"), ("moving", "where something moves")):
         if region in quality.regions:
             print(f"  {name}: {_describe(quality.regions[region])}")
     if quality.lpips is None:
         print("LPIPS was not measured: it needs its weights, whose file STGA_LPIPS names (docs/dependencies.md),")
-        print(f"and images of {SMALLEST} pixels a side or more")
+        print(f"and images of {MIN_SIDE_PX} pixels a side or more")
     write_json(options.run / f"quality_{options.split}.json", {"views": len(views), **quality.as_json()})
 
 
@@ -345,15 +345,16 @@ def _print_table(lines: Sequence[tuple[str, str]]) -> None:
 
 def plan(options: Namespace) -> None:
     """Print what each preset is for, and how long it would train on this machine."""
+    from ..format import format_duration
     from ..report.preset_timing import time_presets
-    from ..training.evaluate.forecast import clock
     from ..training.optimize.device import choose_device
 
     capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
     device, why = choose_device(options.device)
     print(why)
     for plan in time_presets(capture, device=device):
-        print(f"{plan.preset:<9} {plan.iterations:6d} iterations  about {clock(plan.seconds):<10}  {plan.purpose}")
+        duration = format_duration(plan.seconds)
+        print(f"{plan.preset:<9} {plan.iterations:6d} iterations  about {duration:<10}  {plan.purpose}")
 
 
 def benchmark(options: Namespace) -> None:
@@ -394,7 +395,7 @@ def _avatar_and_capture(source: Path, options: Namespace) -> tuple[Avatar, Captu
     """
     capture, flame = getattr(options, "capture", None), getattr(options, "flame", None)
     if source.is_dir():
-        from ..training.optimize.tracking import refined
+        from ..training.optimize.tracking import with_refined_tracking
         from ..training.run.folder import read_run
 
         run = read_run(source)
@@ -406,7 +407,7 @@ def _avatar_and_capture(source: Path, options: Namespace) -> tuple[Avatar, Captu
             print(f"warning: {source}: was trained on refined meshes, which only its run's folder has", file=sys.stderr)
     opened = None if capture is None else open_capture(capture, flame, principal_point)
     if opened is not None and source.is_dir():
-        opened = refined(opened, source)
+        opened = with_refined_tracking(opened, source)
     return avatar, opened if opened is None or options.head is None else options.head.played(opened)
 
 
