@@ -17,10 +17,10 @@ from . import ids
 from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
 
 
-class Export(bpy.types.Operator):
+class ExportAvatar(bpy.types.Operator):
     """Export a trained avatar, posed as the head in the scene, for viewers of Gaussian splats"""
 
-    bl_idname = ids.EXPORT
+    bl_idname = ids.EXPORT_AVATAR
     bl_label = "Export Avatar"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 

@@ -70,9 +70,9 @@ def run_of(scene: Any) -> Path | None:
     None where the scene has no job.
     """
     chosen = getattr(scene, ids.SETTINGS)
-    if not chosen.job:
+    if not chosen.training_run:
         return None
-    began, beside = Path(chosen.job), Path(bpy.path.abspath(chosen.run_folder))
+    began, beside = Path(chosen.training_run), Path(bpy.path.abspath(chosen.run_folder))
     return next((run for run in (began, beside) if folder_of(run).is_dir()), began)
 
 
@@ -85,8 +85,8 @@ def snapshot_of(scene: Any) -> Snapshot:
 def set_job(scene: Any, run: Path | None) -> None:
     """Say which run the scene's job trains; None: the job is over and done with."""
     chosen = getattr(scene, ids.SETTINGS)
-    chosen.job, chosen.job_ended = "" if run is None else str(run), False
-    _jobs[scene.session_uid] = chosen.job
+    chosen.training_run, chosen.result_shown = "" if run is None else str(run), False
+    _jobs[scene.session_uid] = chosen.training_run
 
 
 def tick() -> float | None:
@@ -108,11 +108,11 @@ def _look(folder: Path) -> Snapshot:
 def _follow_job(scene: Any) -> float | None:
     """Bring the scene up to its job; seconds until there may be more to do, None where nothing is to come."""
     chosen = getattr(scene, ids.SETTINGS)
-    job = chosen.job or _jobs.get(scene.session_uid, "")
+    job = chosen.training_run or _jobs.get(scene.session_uid, "")
     if not job:
         return None
-    if chosen.job != job:
-        chosen.job = job
+    if chosen.training_run != job:
+        chosen.training_run = job
     _jobs[scene.session_uid] = job
     run = run_of(scene)
     assert run is not None
@@ -120,11 +120,11 @@ def _follow_job(scene: Any) -> float | None:
     if state.is_alive:
         wait = _show(scene, folder_of(run) / PREVIEW) if chosen.live_preview else None
         return INTERVAL_S if wait is None else wait
-    if state not in (State.FINISHED, State.CANCELLED) or chosen.job_ended:
+    if state not in (State.FINISHED, State.CANCELLED) or chosen.result_shown:
         return None
     chosen.avatar = str(run / "avatar.npz")
     wait = _show(scene, run / "avatar.npz") if chosen.show_result else None
-    chosen.job_ended = wait is None
+    chosen.result_shown = wait is None
     return wait
 
 
@@ -134,7 +134,7 @@ def _show(scene: Any, path: Path) -> float | None:
     Returns seconds until it should be called again; None where the file is shown, or cannot be.
     """
     chosen = getattr(scene, ids.SETTINGS)
-    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == chosen.job), None)
+    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == chosen.training_run), None)
     if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
         return INTERVAL_S  # neither bears a mesh that changes meanwhile
     try:
@@ -163,9 +163,9 @@ def _present(scene: Any, shown: Any, avatar: Avatar, prepared: SplatAttributes) 
         return True
     if shown is not None:
         bpy.data.objects.remove(shown)
-    name = f"{chosen.head.name} {Path(chosen.job).name}"
+    name = f"{chosen.head.name} {Path(chosen.training_run).name}"
     shown = show(scene, avatar, chosen.head, name, prepared=prepared)
-    shown[tags.RUN] = chosen.job
+    shown[tags.RUN] = chosen.training_run
     if not bpy.app.background:
         bpy.app.timers.register(_push_undo, first_interval=SLICE_S)  # saving the scene's state takes a slice as well
     return False

@@ -112,7 +112,7 @@ class Train(bpy.types.Operator):
                 return {"FINISHED"}
             avatar = _wait(run, process)
         scene_settings(context).avatar = str(avatar)
-        scene_settings(context).job_ended = True
+        scene_settings(context).result_shown = True
         self.report({"INFO"}, f"Trained {avatar}")
         return {"FINISHED"}
 

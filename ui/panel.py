@@ -55,7 +55,7 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         layout, chosen = self.layout, scene_settings(context)
         layout.prop(chosen, "avatar")
         layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = chosen.avatar
-        layout.operator(ids.EXPORT, icon="EXPORT").avatar = chosen.avatar
+        layout.operator(ids.EXPORT_AVATAR, icon="EXPORT").avatar = chosen.avatar
         layout.prop(chosen, "splats")
         if chosen.splats is not None:
             self._draw_display(layout, context, chosen.splats)

@@ -31,20 +31,20 @@ OPERATORS = (
     "toggle_region",
     "count_selected",
     "heat_map",
-    "plan_effects",
+    "analyze_capture",
     "train",
     "cancel_training",
     "dismiss_training",
     "copy_report",
-    "make_runtime",
-    "test_runtime",
-    "cancel_runtime",
+    "make_environment",
+    "test_environment",
+    "cancel_environment",
     "show_avatar",
     "apply_motion",
     "standard_view",
     "more_bounces",
     "import_ply",
-    "export",
+    "export_avatar",
 )
 
 
@@ -114,7 +114,7 @@ def test_every_operator_explains_itself(extension):
 
 def test_steps_wait_for_a_capture(extension):
     """Catches steps that run, and fail, before there is anything to work on."""
-    for name in ("select", "train", "show_avatar", "export", "heat_map", "apply_motion"):
+    for name in ("select", "train", "show_avatar", "export_avatar", "heat_map", "apply_motion"):
         assert not getattr(bpy.ops.stga, name).poll()
         with pytest.raises(RuntimeError, match="Import a capture first"):
             getattr(bpy.ops.stga, name)()
@@ -171,16 +171,16 @@ def test_exports_read_back(extension, mesh_capture, tmp_path):
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     capture = open_capture(mesh_capture)
     bpy.context.scene.frame_set(3)
-    assert bpy.ops.stga.export(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
     at_3 = expected_world(avatar, capture.mesh(3)).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "one.ply").xyz, at_3, atol=1e-5)
-    assert bpy.ops.stga.export(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
     assert sorted(path.name for path in (tmp_path / "many").iterdir()) == [f"{frame:05d}.ply" for frame in range(4)]
     np.testing.assert_allclose(read_ply(tmp_path / "many/00003.ply").xyz, at_3, atol=1e-5)
     assert np.abs(read_ply(tmp_path / "many/00000.ply").xyz - at_3).max() > 1e-3
     assert bpy.context.scene.frame_current == 3
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
-        bpy.ops.stga.export(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
+        bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
 
 
 def test_gaussian_avatars_export(extension, tmp_path):
@@ -193,7 +193,7 @@ def test_gaussian_avatars_export(extension, tmp_path):
         "filepath": str(tmp_path / "pair"),
         "format": "gaussian-avatars",
     }
-    assert bpy.ops.stga.export(**arguments) == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(**arguments) == {"FINISHED"}
     np.testing.assert_array_equal(read_gaussian_avatars(tmp_path / "pair/point_cloud.ply").face, avatar.splats.face)
     assert (tmp_path / "pair/flame_param.npz").is_file()
 
