@@ -23,7 +23,7 @@ from stga_addon.scene.display.splat_object import set_input, show_avatar, show_w
 from stga_addon.scene.render import engine  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
-from .test_splats import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
+from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
 
 WIDTH, HEIGHT = 96, 64
 SAME = 1 / 255
