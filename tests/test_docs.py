@@ -1,0 +1,71 @@
+"""README and docs: what they refer to exists, and the commands they show parse."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from stga_addon.cli.main import make_parser
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+PATH_FOLDERS = ("", "stga_addon/", "tests/", "stga_addon/training/")
+"""Folders that the docs leave out when they name a file."""
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def anchors(text: str) -> set[str]:
+    """Anchors of a page's headings, as Git hosts make them."""
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    """Catches links to pages, pictures and headings that were renamed or removed."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", TEXTS[page]):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        linked = page if not path else (page.parent / path).resolve()
+        assert linked.exists(), f"{name_of(page)}: {target}"
+        if anchor:
+            assert anchor in anchors(linked.read_text(encoding="utf-8")), f"{name_of(page)}: {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_named_files_exist(page):
+    """Catches docs that name a module or test file by an old path."""
+    for path in re.findall(r"`([\w./]+/[\w.]+\.py)", TEXTS[page]):
+        assert any((ROOT / folder / path).is_file() for folder in PATH_FOLDERS), f"{name_of(page)}: {path}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_named_tests_exist(page):
+    """Catches docs that cite a test which was renamed or removed."""
+    sources = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")}
+    for path, test in re.findall(r"`([\w./]+\.py)::(test_\w+)`", TEXTS[page]):
+        source = next(text for file, text in sources.items() if file.as_posix().endswith(path))
+        assert f"def {test}" in source, f"{name_of(page)}: {path}::{test}"
+    every = "\n".join(sources.values())
+    for test in re.findall(r"`(test_\w+)`", TEXTS[page]):
+        assert f"def {test}(" in every, f"{name_of(page)}: {test}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands_parse(page):
+    """Catches commands and flags that the docs show and the command line no longer knows."""
+    for line in re.findall(r"^stga .*$", TEXTS[page], re.MULTILINE):
+        words = shlex.split(line.partition("#")[0])[1:]
+        make_parser().parse_args(words)  # exits where a word is unknown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_no_package_index_is_named(page):
+    """Catches addresses of package files, which go stale: the docs name packages and versions."""
+    assert not re.search(r"pythonhosted|pypi\.org", TEXTS[page])
