@@ -154,7 +154,7 @@ def render(options: Namespace) -> None:
     from tqdm import tqdm
 
     from ..capture.transforms import read_transforms
-    from ..raster.images import to_bytes
+    from ..raster.render import to_uint8
 
     views = [frame.view for frame in read_transforms(options.cameras, options.principal_point or "vhap")]
     if options.motion is None:
@@ -164,16 +164,16 @@ def render(options: Namespace) -> None:
     names = _unique_names([view.name for view in views])
     for view, name in zip(tqdm(views, desc="rendering", unit="image"), names, strict=True):
         with replacing(options.out / name) as partial:
-            Image.fromarray(to_bytes(draw(view))).save(partial, format="PNG")
+            Image.fromarray(to_uint8(draw(view))).save(partial, format="PNG")
 
 
 def _drawer(options: Namespace) -> Callable[[View], np.ndarray]:
     """View -> image (3, H, W), for an avatar with its capture or a plain world-space PLY."""
-    from ..raster.render import render_avatar, render_splats
+    from ..raster.render import render, render_avatar
 
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
-        return lambda view: render_splats(splats, view.camera, options.background)
+        return lambda view: render(splats, view.camera, options.background)
     avatar, capture = _avatar_and_capture(options.source, options)
     if capture is None:
         raise StgaError(f"{options.source}: an avatar needs the meshes of a capture to follow; give --capture")
