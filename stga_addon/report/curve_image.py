@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..training.evaluate.forecast import clock, curve_of
+from ..format import format_duration
+from ..training.evaluate.forecast import curve_of
 
 SIZE = 256
 """Pixels of a side: Blender's icons are square."""
@@ -19,7 +20,7 @@ STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 LINES = 6
 
 
-def curve_picture(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | None:
+def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | None:
     """Held-out PSNR over seconds of training, with the last forecast and its error; None before two evaluations.
 
     lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the lowest row first, and what the axes
@@ -43,7 +44,7 @@ def curve_picture(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] 
         picture.band(x, y - error, y + error, COMING)
         picture.line(x, y, COMING)
     picture.line(t, psnr, LINE)
-    return picture.pixels, f"{low:g} to {high:g} dB, 0 to {clock(end)}"
+    return picture.pixels, f"{low:g} to {high:g} dB, 0 to {format_duration(end)}"
 
 
 class _Picture:
