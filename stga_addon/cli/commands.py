@@ -3,16 +3,16 @@
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..avatar.embedding import to_world
+from ..avatar.export import export_avatar
 from ..avatar.file import Avatar, read_avatar
-from ..avatar.ply import read_ply, write_ply
+from ..avatar.ply import read_ply
 from ..capture.model import Capture, View
 from ..capture.open import open_capture
 from ..errors import StgaError
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def train(options: Namespace) -> None:
     """Train, or continue, a run."""
-    from ..effects.decide import decide, describe_effects
+    from ..effects.plan import describe_effects, with_effect_plan
     from ..report.run_summary import CurveDrawer, conclude
     from ..training.optimize.device import choose_device
     from ..training.run.folder import read_run
@@ -47,7 +47,7 @@ def train(options: Namespace) -> None:
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
         capture = open_capture(options.capture, options.flame, options.principal_point or "vhap")
-        run = decide(_new_run(options, capture, device), capture, device)
+        run = with_effect_plan(_new_run(options, capture, device), capture, device)
     for warning in capture.warnings:
         print(f"warning: {warning}")
     _print_table(describe_effects(run.plan))
@@ -272,48 +272,27 @@ def export(options: Namespace) -> None:
     avatar, capture = _avatar_and_capture(options.avatar, options)
     if capture is not None:
         _fitting(capture, avatar)
-    export_avatar(avatar, capture, options.format, options.out, options.timestep)
+    sequence = None if capture is None else capture.flame
+    export_avatar(options.out, avatar, options.format, _posed_meshes(avatar, capture, options), sequence)
 
 
-def export_avatar(
-    avatar: Avatar, capture: Capture | None, kind: str, out: Path, timestep: int | None = None
-) -> list[Path]:
-    """Write `avatar` as "ply" (one frame, or the neutral mesh), "ply-sequence" or "gaussian-avatars".
-
-    Returns the files written.
-    Raises StgaError where the capture that holds the frames is missing or has not what the format needs.
-    """
-    if kind == "gaussian-avatars":
-        from ..avatar.gaussian_avatars import write_gaussian_avatars
-
-        if capture is None or capture.flame is None:
-            raise StgaError("the GaussianAvatars format needs the FLAME parameters of a FLAME capture; give --capture")
-        write_gaussian_avatars(out, avatar, capture.flame)
-        return [out / "point_cloud.ply", out / "flame_param.npz"]
-    if kind == "ply" and timestep is None:
-        write_ply(out, _baked(avatar, avatar.neutral))
-        return [out]
+def _posed_meshes(avatar: Avatar, capture: Capture | None, options: Namespace) -> Iterator[tuple[int, np.ndarray]]:
+    """(timestep, mesh) to export: all of a sequence, the one that was asked for, or the neutral mesh."""
+    if options.format == "ply" and options.timestep is None:
+        yield 0, avatar.neutral
+        return
     if capture is None:
         raise StgaError("frames other than the neutral mesh need a capture; give --capture")
-    wanted = capture.timesteps if kind == "ply-sequence" else (timestep,)
-    files = []
-    for number in wanted:
-        if number not in capture.timesteps:
-            raise StgaError(f"{capture.root}: has no timestep {number}")
-        path = out / f"{number:05d}.ply" if kind == "ply-sequence" else out
-        write_ply(path, _baked(avatar, capture.mesh(number)))
-        files.append(path)
-    return files
-
-
-def _baked(avatar: Avatar, mesh: np.ndarray) -> Any:
-    return to_world(avatar.splats, avatar.frames(mesh))
+    for timestep in capture.timesteps if options.format == "ply-sequence" else (options.timestep,):
+        if timestep not in capture.timesteps:
+            raise StgaError(f"{capture.root}: has no timestep {timestep}")
+        yield timestep, capture.mesh(timestep)
 
 
 def info(options: Namespace) -> None:
     """Print what a capture holds, and the effects that training on it would compute."""
     from ..capture.summary import describe
-    from ..effects.decide import decide_effects, describe_effects
+    from ..effects.plan import describe_effects, plan_effects
     from ..training.effect_plan import plan_to_json
     from ..training.optimize.device import choose_device
     from ..training.settings import make_settings
@@ -322,7 +301,7 @@ def info(options: Namespace) -> None:
     plan: tuple[Any, ...] = ()
     if capture.views.get("train"):
         device, _ = choose_device(options.device)
-        _, plan = decide_effects(capture, make_settings(iterations=1, effects=_choices(options)), device)
+        _, plan = plan_effects(capture, make_settings(iterations=1, effects=_choices(options)), device)
     if options.json:
         found: dict[str, Any] = {"plan": plan_to_json(plan)}
         if options.presets and plan:

@@ -169,7 +169,7 @@ def _add_device(command: argparse.ArgumentParser) -> None:
 
 def _add_principal_point(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--principal-point", choices=("vhap", "opencv", "centre"), help="what cy means in the capture (default vhap)"
+        "--principal-point", choices=("vhap", "opencv", "center"), help="what cy means in the capture (default vhap)"
     )
 
 

@@ -111,7 +111,7 @@ def work(run: Path, also: "Report | None" = None) -> Path:
         raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
     with process.telling(folder) as teller:
         teller.tell(0.0, "starting")
-        from ..effects.decide import decide
+        from ..effects.plan import with_effect_plan
         from ..training.optimize.device import choose_device
         from ..training.run.folder import Run, read_run, read_selection
         from ..training.run.loop import train
@@ -127,7 +127,7 @@ def work(run: Path, also: "Report | None" = None) -> Path:
             wanted = read_run(run)
         else:
             teller.tell(0.0, "looking at the capture")
-            wanted = decide(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
+            wanted = with_effect_plan(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
         report = _Report(teller, also)
         return train(capture, run, wanted, selection, job.settings is None, report, device)
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..capture.images import read_view
 from ..capture.loader import Loaded
 from ..capture.model import Capture, View
-from ..effects.decide import decide_effects
+from ..effects.plan import plan_effects
 from ..errors import StgaError
 from ..selection import select_capture
 from ..training.optimize.precompile import precompile_kernels
@@ -54,7 +54,7 @@ def time_presets(
     plans = []
     for name in names:
         iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
-        settings, _ = decide_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
+        settings, _ = plan_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
         pace = seconds_per_iteration(capture, settings, seconds, device)
         plans.append(PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace))
     return plans

@@ -7,8 +7,8 @@ from capture import factory
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.parser import main
-from stga_addon.effects import decide as planning
-from stga_addon.effects.decide import decide
+from stga_addon.effects import plan as planning
+from stga_addon.effects.plan import with_effect_plan
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.run.folder import Run, read_run, write_run
@@ -40,7 +40,7 @@ def test_the_run_keeps_its_plan(trained):
 
 def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr(planning, "decide_effects", None)
+    monkeypatch.setattr(planning, "plan_effects", None)
     before = read_run(trained)
     train = ["train", str(root), "--out", str(trained), "--resume"]
     assert main([*train, "--effect", "strain-color=on"]) == 0
@@ -90,7 +90,7 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
 def test_settings_that_ask_for_nothing(root):
     """Catches `make_settings` whose settings are not final: benchmarks and tests rely on them."""
     run = Run(root, None, "vhap", make_settings(iterations=5))
-    assert decide(run, open_capture(root)) is run
+    assert with_effect_plan(run, open_capture(root)) is run
 
 
 def test_a_damaged_plan(tmp_path):
