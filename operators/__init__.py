@@ -5,11 +5,11 @@ from typing import Any
 import bpy
 
 from . import analyze, ids, monitor
-from .analyze import PlanEffects
+from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
 from .environment import CancelRuntime, MakeRuntime, TestRuntime
-from .export import Export
+from .export import ExportAvatar
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
@@ -27,7 +27,7 @@ CLASSES = (
     ToggleRegion,
     CountSelected,
     HeatMap,
-    PlanEffects,
+    AnalyzeCapture,
     Train,
     CancelTraining,
     DismissTraining,
@@ -40,7 +40,7 @@ CLASSES = (
     MoreBounces,
     ApplyMotion,
     ImportPly,
-    Export,
+    ExportAvatar,
 )
 
 
@@ -52,7 +52,7 @@ def _import_menu(menu: Any, context: Any) -> None:
 
 
 def _export_menu(menu: Any, context: Any) -> None:
-    menu.layout.operator(ids.EXPORT, text="Gaussian Head Avatar (STGA)")
+    menu.layout.operator(ids.EXPORT_AVATAR, text="Gaussian Head Avatar (STGA)")
 
 
 def register() -> None:

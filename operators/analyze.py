@@ -20,10 +20,10 @@ _asked: dict[int, "subprocess.Popen[str]"] = {}
 """A scene's session id -> the worker that looks at its capture."""
 
 
-class PlanEffects(bpy.types.Operator):
+class AnalyzeCapture(bpy.types.Operator):
     """Look at the capture for seconds: which effects it calls for, and why; how long each preset takes here"""
 
-    bl_idname = ids.PLAN_EFFECTS
+    bl_idname = ids.ANALYZE_CAPTURE
     bl_label = "Plan Effects"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
@@ -46,8 +46,8 @@ class PlanEffects(bpy.types.Operator):
             raise StgaError(f"{command[0]}: cannot be started as a Python interpreter ({error.strerror})") from error
         if bpy.app.background:
             _show(context.scene, process)
-            if scene_settings(context).plan_error:
-                raise StgaError(scene_settings(context).plan_error)
+            if scene_settings(context).analysis_error:
+                raise StgaError(scene_settings(context).analysis_error)
             return {"FINISHED"}
         _asked[context.scene.session_uid] = process
         if not bpy.app.timers.is_registered(_tick):
@@ -103,12 +103,12 @@ def _show(scene: Any, process: "subprocess.Popen[str]") -> None:
     said, mistakes = process.communicate()
     if process.returncode:
         lines = mistakes.strip().splitlines() or ["the worker ended without a word"]
-        chosen.plan_error = lines[-1].removeprefix("stga: ").removeprefix("--effect ")
+        chosen.analysis_error = lines[-1].removeprefix("stga: ").removeprefix("--effect ")
         return
-    chosen.plan_error = ""
+    chosen.analysis_error = ""
     chosen.effects.clear()
     found = json.loads(said)
-    chosen.preset_seconds = json.dumps({row["preset"]: row["seconds"] for row in found.get("presets", ())})
+    chosen.preset_timing = json.dumps({row["preset"]: row["seconds"] for row in found.get("presets", ())})
     for decision in found["plan"]:
         row = chosen.effects.add()
         row.name = decision["effect"]

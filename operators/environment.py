@@ -64,7 +64,7 @@ def needs_quiet(operator: Any) -> bool:
 class MakeRuntime(bpy.types.Operator):
     """Make a Python environment with PyTorch for training, in Blender's folder for user files"""
 
-    bl_idname = ids.MAKE_RUNTIME
+    bl_idname = ids.MAKE_ENVIRONMENT
     bl_label = "Make Runtime"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
@@ -132,7 +132,7 @@ OFFLINE = "Allow Online Access in Preferences → System → Network first"
 class TestRuntime(bpy.types.Operator):
     """Start the Python that would train, and say which torch, numba and device it finds, or what it lacks"""
 
-    bl_idname = ids.TEST_RUNTIME
+    bl_idname = ids.TEST_ENVIRONMENT
     bl_label = "Test"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
@@ -153,7 +153,7 @@ class TestRuntime(bpy.types.Operator):
 class CancelRuntime(bpy.types.Operator):
     """Stop making the runtime, and remove what there is of it"""
 
-    bl_idname = ids.CANCEL_RUNTIME
+    bl_idname = ids.CANCEL_ENVIRONMENT
     bl_label = "Cancel"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 

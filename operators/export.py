@@ -6,17 +6,19 @@ import bpy
 
 from ..stga_addon.avatar.export import export_avatar
 from ..stga_addon.avatar.file import read_avatar
-from ..stga_addon.scene.compat import PATH_OPTIONS, evaluated_vertices
-from ..stga_addon.scene.display.splats import check_head
-from ..stga_addon.scene.rig.motion import performed_motion, played
+from ..stga_addon.scene.arrays import evaluated_vertices
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.display.splat_object import check_head
+from ..stga_addon.scene.rig.motion import sample_motion
+from ..stga_addon.scene.timeline import iterate_frames
 from . import ids
 from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
 
 
-class Export(bpy.types.Operator):
+class ExportAvatar(bpy.types.Operator):
     """Export a trained avatar, posed as the head in the scene, for viewers of Gaussian splats"""
 
-    bl_idname = ids.EXPORT
+    bl_idname = ids.EXPORT_AVATAR
     bl_label = "Export Avatar"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
@@ -63,8 +65,8 @@ class Export(bpy.types.Operator):
         motion = None
         if self.format == "gaussian-avatars":
             own = flame_of(capture_of(head), head.name)
-            motion = performed_motion(head, own, _frames(context), self._warn)
-        frames = played(_frames(context)) if self.format == "ply-sequence" else (context.scene.frame_current,)
+            motion = sample_motion(head, own, _frames(context), self._warn)
+        frames = iterate_frames(_frames(context)) if self.format == "ply-sequence" else (context.scene.frame_current,)
         export_avatar(path, avatar, self.format, ((frame, evaluated_vertices(head)) for frame in frames), motion)
         self.report({"INFO"}, f"Exported {len(avatar.splats)} splats to {path}")
         return {"FINISHED"}

@@ -12,7 +12,14 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.training_job import PREVIEW, folder_of
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.splats import Prepared, build_slice, can_refresh, check_head, prepare, refresh
+from ..stga_addon.scene.display.splat_object import (
+    SplatAttributes,
+    avatar_attributes,
+    build_next_node_group,
+    can_update,
+    check_head,
+    update_splats,
+)
 from ..stga_addon.worker import process as task
 from ..stga_addon.worker.process import Snapshot, State
 from . import ids
@@ -63,9 +70,9 @@ def run_of(scene: Any) -> Path | None:
     None where the scene has no job.
     """
     chosen = getattr(scene, ids.SETTINGS)
-    if not chosen.job:
+    if not chosen.training_run:
         return None
-    began, beside = Path(chosen.job), Path(bpy.path.abspath(chosen.run_folder))
+    began, beside = Path(chosen.training_run), Path(bpy.path.abspath(chosen.run_folder))
     return next((run for run in (began, beside) if folder_of(run).is_dir()), began)
 
 
@@ -78,8 +85,8 @@ def snapshot_of(scene: Any) -> Snapshot:
 def set_job(scene: Any, run: Path | None) -> None:
     """Say which run the scene's job trains; None: the job is over and done with."""
     chosen = getattr(scene, ids.SETTINGS)
-    chosen.job, chosen.job_ended = "" if run is None else str(run), False
-    _jobs[scene.session_uid] = chosen.job
+    chosen.training_run, chosen.result_shown = "" if run is None else str(run), False
+    _jobs[scene.session_uid] = chosen.training_run
 
 
 def tick() -> float | None:
@@ -101,11 +108,11 @@ def _look(folder: Path) -> Snapshot:
 def _follow_job(scene: Any) -> float | None:
     """Bring the scene up to its job; seconds until there may be more to do, None where nothing is to come."""
     chosen = getattr(scene, ids.SETTINGS)
-    job = chosen.job or _jobs.get(scene.session_uid, "")
+    job = chosen.training_run or _jobs.get(scene.session_uid, "")
     if not job:
         return None
-    if chosen.job != job:
-        chosen.job = job
+    if chosen.training_run != job:
+        chosen.training_run = job
     _jobs[scene.session_uid] = job
     run = run_of(scene)
     assert run is not None
@@ -113,11 +120,11 @@ def _follow_job(scene: Any) -> float | None:
     if state.is_alive:
         wait = _show(scene, folder_of(run) / PREVIEW) if chosen.live_preview else None
         return INTERVAL_S if wait is None else wait
-    if state not in (State.FINISHED, State.CANCELLED) or chosen.job_ended:
+    if state not in (State.FINISHED, State.CANCELLED) or chosen.result_shown:
         return None
     chosen.avatar = str(run / "avatar.npz")
     wait = _show(scene, run / "avatar.npz") if chosen.show_result else None
-    chosen.job_ended = wait is None
+    chosen.result_shown = wait is None
     return wait
 
 
@@ -127,7 +134,7 @@ def _show(scene: Any, path: Path) -> float | None:
     Returns seconds until it should be called again; None where the file is shown, or cannot be.
     """
     chosen = getattr(scene, ids.SETTINGS)
-    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == chosen.job), None)
+    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == chosen.training_run), None)
     if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
         return INTERVAL_S  # neither bears a mesh that changes meanwhile
     try:
@@ -142,23 +149,23 @@ def _show(scene: Any, path: Path) -> float | None:
     return None
 
 
-def _present(scene: Any, shown: Any, avatar: Avatar, prepared: Prepared) -> bool:
+def _present(scene: Any, shown: Any, avatar: Avatar, prepared: SplatAttributes) -> bool:
     """Show the avatar in the object that already shows this job's splats, or in a new one; whether there is more to do.
 
     A new one comes in slices, each call does one.
     """
     chosen = getattr(scene, ids.SETTINGS)
     check_head(avatar, chosen.head)
-    if shown is not None and can_refresh(shown, avatar):
-        refresh(shown, prepared)
+    if shown is not None and can_update(shown, avatar):
+        update_splats(shown, prepared)
         return False
-    if build_slice(avatar):
+    if build_next_node_group(avatar):
         return True
     if shown is not None:
         bpy.data.objects.remove(shown)
-    name = f"{chosen.head.name} {Path(chosen.job).name}"
+    name = f"{chosen.head.name} {Path(chosen.training_run).name}"
     shown = show(scene, avatar, chosen.head, name, prepared=prepared)
-    shown[tags.RUN] = chosen.job
+    shown[tags.RUN] = chosen.training_run
     if not bpy.app.background:
         bpy.app.timers.register(_push_undo, first_interval=SLICE_S)  # saving the scene's state takes a slice as well
     return False
@@ -174,10 +181,10 @@ class _Reader:
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._coming: dict[Path, Future[tuple[Avatar, Prepared]]] = {}
+        self._coming: dict[Path, Future[tuple[Avatar, SplatAttributes]]] = {}
         self._stamps: dict[Path, tuple[int, int]] = {}
 
-    def poll(self, path: Path) -> tuple[Avatar, Prepared] | None:
+    def poll(self, path: Path) -> tuple[Avatar, SplatAttributes] | None:
         """What has been read and not been taken; None where there is nothing new, or not yet.
 
         Raises StgaError where the file cannot be read.
@@ -211,9 +218,9 @@ class _Reader:
 _reader = _Reader()
 
 
-def _read(path: Path) -> tuple[Avatar, Prepared]:
+def _read(path: Path) -> tuple[Avatar, SplatAttributes]:
     avatar = read_avatar(path)
-    return avatar, prepare(avatar)
+    return avatar, avatar_attributes(avatar)
 
 
 def _redraw() -> None:

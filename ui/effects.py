@@ -20,9 +20,9 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, chosen = self.layout, scene_settings(context)
         looking = is_looking(context.scene)
-        layout.operator(ids.PLAN_EFFECTS, text="Looking…" if looking else "Look at Capture", icon="VIEWZOOM")
-        if chosen.plan_error:
-            draw_text(layout, context, chosen.plan_error, "ERROR")
+        layout.operator(ids.ANALYZE_CAPTURE, text="Looking…" if looking else "Look at Capture", icon="VIEWZOOM")
+        if chosen.analysis_error:
+            draw_text(layout, context, chosen.analysis_error, "ERROR")
         for row in chosen.effects:
             self._draw_effect(context, row)
 

@@ -41,14 +41,14 @@ def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
     box.label(text="Training Runtime")
     row = box.split(factor=0.8, align=True)
     row.prop(stored, "runtime_python")
-    row.operator(ids.TEST_RUNTIME)
+    row.operator(ids.TEST_ENVIRONMENT)
     made = made_python(runtime_folder())
     if made is not None:
         box.label(text=f"Made here: {made}", icon="CHECKMARK")
     if now.state.is_alive:
         row = box.row(align=True)
         row.progress(factor=now.status.share, text=now.status.message)
-        row.operator(ids.CANCEL_RUNTIME, text="", icon="CANCEL")
+        row.operator(ids.CANCEL_ENVIRONMENT, text="", icon="CANCEL")
         box.label(text=now.status.remark)
         return
     if now.state.failed:
@@ -56,7 +56,7 @@ def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
         draw_failure(box, context, now.status.error, now.tail, folder)
     elif now.state == State.FINISHED:
         box.label(text=now.status.message, icon="CHECKMARK")
-    box.operator(ids.MAKE_RUNTIME, text="Make Runtime…", icon="IMPORT")
+    box.operator(ids.MAKE_ENVIRONMENT, text="Make Runtime…", icon="IMPORT")
 
 
 def register() -> None:

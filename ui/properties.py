@@ -22,12 +22,12 @@ class SelectedFrame(bpy.types.PropertyGroup):
 def _forget_rows(chosen: Any, context: Any) -> None:
     chosen.selected_frames.clear()  # they counted another head
     chosen.effects.clear()
-    chosen.preset_seconds = ""
+    chosen.preset_timing = ""
 
 
 def seconds_of_presets(chosen: Any) -> dict[str, float]:
     """Preset -> seconds that it trains on this machine, where the capture was looked at."""
-    return dict(json.loads(chosen.preset_seconds or "{}"))
+    return dict(json.loads(chosen.preset_timing or "{}"))
 
 
 def _take_minutes(chosen: Any, context: Any) -> None:
@@ -82,17 +82,17 @@ class SceneSettings(bpy.types.PropertyGroup):
     minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
     strategy: strategy_property()
     preset: preset_property(update=_take_minutes)
-    preset_seconds: bpy.props.StringProperty(options={"HIDDEN"})  # JSON: preset -> what `operators.plan` was told
+    preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON: preset -> what `operators.plan` was told
     effects: bpy.props.CollectionProperty(type=EffectRow)
-    plan_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the capture could not be looked at
+    analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the capture could not be looked at
     live_preview: bpy.props.BoolProperty(
         name="Live Preview", description="Refresh the splats every few seconds while they train", default=True
     )
     show_result: bpy.props.BoolProperty(
         name="Show When Done", description="Show the avatar on the head as soon as it is trained", default=True
     )
-    job: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the run that is being trained, or was last
-    job_ended: bpy.props.BoolProperty(options={"HIDDEN"})  # its result has reached the scene
+    training_run: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last run
+    result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its result has reached the scene
     avatar: bpy.props.StringProperty(
         name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
     )

@@ -17,8 +17,8 @@ from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.sequence import read_motion  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
 from stga_addon.training.optimize.tracking import Tracking, refined, write_tracking  # noqa: E402
 
@@ -258,8 +258,8 @@ def test_exports_hold_what_plays_in_the_scene(scene, tmp_path):
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=3)
     the_head().data.shape_keys.key_blocks["identity_001"].value = 1.5
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 3, 7
-    assert bpy.ops.stga.export(filepath=str(tmp_path / "plys"), format="ply-sequence") == {"FINISHED"}
-    assert bpy.ops.stga.export(filepath=str(tmp_path / "pair"), format="gaussian-avatars") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "plys"), format="ply-sequence") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars") == {"FINISHED"}
     shape = scene.own.shape + 1.5 * np.eye(4)[1]
     pair = read_motion(tmp_path / "pair/flame_param.npz", scene.own.model)
     np.testing.assert_allclose(pair.shape, shape, atol=1e-6)

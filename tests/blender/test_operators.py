@@ -17,9 +17,9 @@ from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display import nodes  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats, set_input  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
 from stga_addon.scene.vertex_groups import closure, read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 
@@ -31,20 +31,20 @@ OPERATORS = (
     "toggle_region",
     "count_selected",
     "heat_map",
-    "plan_effects",
+    "analyze_capture",
     "train",
     "cancel_training",
     "dismiss_training",
     "copy_report",
-    "make_runtime",
-    "test_runtime",
-    "cancel_runtime",
+    "make_environment",
+    "test_environment",
+    "cancel_environment",
     "show_avatar",
     "apply_motion",
     "standard_view",
     "more_bounces",
     "import_ply",
-    "export",
+    "export_avatar",
 )
 
 
@@ -114,7 +114,7 @@ def test_every_operator_explains_itself(extension):
 
 def test_steps_wait_for_a_capture(extension):
     """Catches steps that run, and fail, before there is anything to work on."""
-    for name in ("select", "train", "show_avatar", "export", "heat_map", "apply_motion"):
+    for name in ("select", "train", "show_avatar", "export_avatar", "heat_map", "apply_motion"):
         assert not getattr(bpy.ops.stga, name).poll()
         with pytest.raises(RuntimeError, match="Import a capture first"):
             getattr(bpy.ops.stga, name)()
@@ -171,16 +171,16 @@ def test_exports_read_back(extension, mesh_capture, tmp_path):
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     capture = open_capture(mesh_capture)
     bpy.context.scene.frame_set(3)
-    assert bpy.ops.stga.export(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
     at_3 = expected_world(avatar, capture.mesh(3)).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "one.ply").xyz, at_3, atol=1e-5)
-    assert bpy.ops.stga.export(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
     assert sorted(path.name for path in (tmp_path / "many").iterdir()) == [f"{frame:05d}.ply" for frame in range(4)]
     np.testing.assert_allclose(read_ply(tmp_path / "many/00003.ply").xyz, at_3, atol=1e-5)
     assert np.abs(read_ply(tmp_path / "many/00000.ply").xyz - at_3).max() > 1e-3
     assert bpy.context.scene.frame_current == 3
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
-        bpy.ops.stga.export(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
+        bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
 
 
 def test_gaussian_avatars_export(extension, tmp_path):
@@ -193,7 +193,7 @@ def test_gaussian_avatars_export(extension, tmp_path):
         "filepath": str(tmp_path / "pair"),
         "format": "gaussian-avatars",
     }
-    assert bpy.ops.stga.export(**arguments) == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(**arguments) == {"FINISHED"}
     np.testing.assert_array_equal(read_gaussian_avatars(tmp_path / "pair/point_cloud.ply").face, avatar.splats.face)
     assert (tmp_path / "pair/flame_param.npz").is_file()
 
@@ -243,16 +243,16 @@ def test_more_bounces_where_cycles_needs_them(extension):
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.transparent_max_bounces = 8
-    assert "8 layers" in materials.few_bounces_hint(scene)
+    assert "8 layers" in materials.transparent_bounces_hint(scene)
     bpy.ops.stga.more_bounces()
     assert scene.cycles.transparent_max_bounces == 64
-    assert materials.few_bounces_hint(scene) is None
+    assert materials.transparent_bounces_hint(scene) is None
     scene.cycles.transparent_max_bounces = 200
     bpy.ops.stga.more_bounces()
     assert scene.cycles.transparent_max_bounces == 200
     scene.cycles.transparent_max_bounces = 8
     scene.render.engine = "BLENDER_WORKBENCH"
-    assert materials.few_bounces_hint(scene) is None
+    assert materials.transparent_bounces_hint(scene) is None
 
 
 def test_standard_view(extension):
@@ -283,7 +283,7 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
-    set_input(scene.stga.splats, nodes.SHOW_SELECTION, True)
+    set_input(scene.stga.splats, splat_nodes.SHOW_SELECTION, True)
     scene.frame_set(3)
     points = next(
         item.object.data
@@ -292,5 +292,5 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     )
     color = np.empty(4 * len(points.points), np.float32)
     points.attributes["stga_display_color"].data.foreach_get("color", color)
-    frozen = np.isclose(color.reshape(-1, 4), nodes.FROZEN_GREY).all(1)
+    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_GREY).all(1)
     np.testing.assert_array_equal(~frozen, read_selection(scene.stga.head)[3][avatar.splats.face])

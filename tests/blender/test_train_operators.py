@@ -15,7 +15,7 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.files import read_npz, write_json  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
 
@@ -142,7 +142,7 @@ def test_a_living_worker_is_not_disturbed(worker):
     assert bpy.ops.stga.train.poll()
     assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
     assert not (worker.run / "job").exists()
-    assert bpy.context.scene.stga.job == ""
+    assert bpy.context.scene.stga.training_run == ""
     assert not bpy.ops.stga.dismiss_training.poll()
 
 
@@ -183,7 +183,7 @@ def test_the_end_reaches_the_scene_once(extension, worker, wanted):
     scene.stga.show_result = wanted
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
-    tick_until(watch, lambda: scene.stga.job_ended)
+    tick_until(watch, lambda: scene.stga.result_shown)
     assert scene.stga.avatar == str(worker.run / "avatar.npz")
     assert (scene.stga.splats is not None) == wanted
     assert watch.tick() is None
@@ -206,7 +206,7 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
-    tick_until(watch, lambda: bpy.context.scene.stga.job_ended)
+    tick_until(watch, lambda: bpy.context.scene.stga.result_shown)
     assert bpy.context.scene.stga.splats is not None
 
 
@@ -221,7 +221,7 @@ def test_a_blend_that_moved(extension, worker, tmp_path):
     (tmp_path / "run").rename(moved / "run")
     bpy.ops.wm.save_as_mainfile(filepath=str(moved / "head.blend"))
     assert watch.run_of(bpy.context.scene) == moved / "run"
-    tick_until(watch, lambda: bpy.context.scene.stga.job_ended)
+    tick_until(watch, lambda: bpy.context.scene.stga.result_shown)
     (moved / "run").rename(moved / "gone")
     assert watch.snapshot_of(bpy.context.scene).state == "none"
     assert watch.run_of(bpy.context.scene) == tmp_path / "run"
@@ -232,9 +232,9 @@ def test_undo_does_not_lose_the_worker(extension, worker):
     """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
     watch, scene = extension.operators.monitor, bpy.context.scene
     watch.tick()
-    scene.stga.job = ""
+    scene.stga.training_run = ""
     assert watch.tick() is not None
-    assert scene.stga.job == str(worker.run)
+    assert scene.stga.training_run == str(worker.run)
 
 
 def test_a_worker_that_died(extension, worker):
@@ -269,13 +269,13 @@ def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
     monkeypatch.setattr(extension.operators.environment, "runtime_folder", lambda create=False: tmp_path / "runtime")
     python = str(tmp_path / "python")
     with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
-        bpy.ops.stga.test_runtime(python=python)
+        bpy.ops.stga.test_environment(python=python)
     if not bpy.app.online_access:
         with pytest.raises(RuntimeError, match="Allow Online Access"):
-            bpy.ops.stga.make_runtime()
+            bpy.ops.stga.make_environment()
     with pytest.raises(RuntimeError, match="is not a folder; expected one of wheel files"):
-        bpy.ops.stga.make_runtime(wheels=str(tmp_path / "none"))
+        bpy.ops.stga.make_environment(wheels=str(tmp_path / "none"))
     (tmp_path / "wheels").mkdir()
     with pytest.raises(RuntimeError, match=r"installing from the folder of wheels: failed, .*No matching distribution"):
-        bpy.ops.stga.make_runtime(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
-    assert not bpy.ops.stga.cancel_runtime.poll()
+        bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
+    assert not bpy.ops.stga.cancel_environment.poll()

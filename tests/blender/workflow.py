@@ -40,10 +40,10 @@ def main(archive: str, folder: Path, runtime: str) -> dict[str, object]:
     ops.show_avatar(filepath=str(folder / "a.npz"))
     ops.apply_motion(filepath=str(folder / "other.npz"), start=1)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
-    ops.export(filepath=str(folder / "pair"), format="gaussian-avatars")
+    ops.export_avatar(filepath=str(folder / "pair"), format="gaussian-avatars")
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "head.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(folder / "head.blend"))
-    ops.export(filepath=str(folder / "plys"), format="ply-sequence")
+    ops.export_avatar(filepath=str(folder / "plys"), format="ply-sequence")
     shown, frame = positions(), bpy.context.scene.frame_current
     if can_train():
         cameras, out = str(folder / "capture/transforms_test.json"), str(folder / "pictures")

@@ -69,7 +69,7 @@ def first() -> Iterator[Callable[[], bool]]:
     """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the worker at work."""
     bpy.context.preferences.addons[extension].preferences.runtime_python = PYTHON
     bpy.ops.wm.save_userpref()
-    bpy.ops.stga.test_runtime()
+    bpy.ops.stga.test_environment()
     runtime = task_folder(runtime_folder())
     yield lambda: not watch.snapshot(runtime).state.is_alive
     seen["runtime"] = watch.snapshot(runtime).status.message or watch.snapshot(runtime).status.error
@@ -86,7 +86,7 @@ def first() -> Iterator[Callable[[], bool]]:
     seen["refreshed"] = True
 
     bpy.ops.stga.cancel_training()
-    yield lambda: state() == "cancelled" and chosen().job_ended
+    yield lambda: state() == "cancelled" and chosen().result_shown
     seen["cancelled"] = {"avatar": Path(chosen().avatar).exists(), "splats": splats()}
 
     bpy.ops.stga.train(directory="//run", resume=True)
@@ -102,10 +102,10 @@ def first() -> Iterator[Callable[[], bool]]:
     yield is_training
     bpy.ops.ed.undo_push(message="before")
     with in_window():
-        while chosen().job and bpy.ops.ed.undo.poll():
+        while chosen().training_run and bpy.ops.ed.undo.poll():
             bpy.ops.ed.undo()
-    seen["undone"] = chosen().job
-    yield lambda: is_training() and chosen().job != ""
+    seen["undone"] = chosen().training_run
+    yield lambda: is_training() and chosen().training_run != ""
     with in_window():
         while bpy.ops.ed.redo.poll():
             bpy.ops.ed.redo()
@@ -125,16 +125,16 @@ def second() -> Iterator[Callable[[], bool]]:
     seen["found"] = int((job_folder() / "worker.lock").read_text())
     yield is_training
     bpy.ops.stga.cancel_training()
-    yield lambda: state() == "cancelled" and chosen().job_ended
+    yield lambda: state() == "cancelled" and chosen().result_shown
     try:
         bpy.ops.stga.train(directory="//run", minutes=1)
     except RuntimeError as error:
         seen["refused"] = str(error)
     bpy.ops.stga.train(directory="//short", iterations=30)
-    yield lambda: state() == "finished" and chosen().job_ended
+    yield lambda: state() == "finished" and chosen().result_shown
     seen["finished"] = {"avatar": chosen().avatar, "splats": splats()}
     bpy.ops.stga.dismiss_training()
-    seen["dismissed"] = chosen().job == ""
+    seen["dismissed"] = chosen().training_run == ""
 
 
 def in_window() -> Any:

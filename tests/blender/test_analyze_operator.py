@@ -25,17 +25,17 @@ def test_the_plan_reaches_the_run(chosen, extension, tmp_path):
     """Catches a plan that is empty, choices that are lost by looking again, and ones that training does not get."""
     from types import SimpleNamespace
 
-    assert bpy.ops.stga.plan_effects() == {"FINISHED"}
+    assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
     rows = {row.name: row for row in chosen.effects}
     assert (rows["exposure"].on, rows["exposure"].choice) == (False, "auto")
     assert "255 levels" in rows["exposure"].reason
     rows["strain-color"].choice = "on"
-    assert bpy.ops.stga.plan_effects() == {"FINISHED"}
+    assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
     rows = {row.name: row for row in chosen.effects}
     assert (rows["strain-color"].on, rows["strain-color"].choice) == (True, "on")
     effects = " ".join(extension.operators.analyze.chosen_effects(SimpleNamespace(effects=chosen.effects)))
     assert effects == "strain-color=on"
-    seconds = json.loads(chosen.preset_seconds)
+    seconds = json.loads(chosen.preset_timing)
     assert list(seconds) == list(PRESETS)
     chosen.preset = "draft"
     assert chosen.minutes == pytest.approx(seconds["draft"] / 60)
@@ -50,10 +50,10 @@ def test_the_plan_reaches_the_run(chosen, extension, tmp_path):
 def test_another_head_has_another_plan(chosen):
     """Catches a plan that outlives the capture it was made for."""
     chosen.effects.add().name = "jaw"
-    chosen.preset_seconds = '{"draft": 1}'
+    chosen.preset_timing = '{"draft": 1}'
     chosen.head = chosen.head
     assert not chosen.effects
-    assert not chosen.preset_seconds
+    assert not chosen.preset_timing
 
 
 def test_a_choice_that_cannot_be(chosen):
@@ -61,6 +61,6 @@ def test_a_choice_that_cannot_be(chosen):
     row = chosen.effects.add()
     row.name, row.choice = "jaw", "on"
     with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
-        bpy.ops.stga.plan_effects()
-    assert chosen.plan_error.startswith("jaw=on: ")
-    assert "Traceback" not in chosen.plan_error
+        bpy.ops.stga.analyze_capture()
+    assert chosen.analysis_error.startswith("jaw=on: ")
+    assert "Traceback" not in chosen.analysis_error
