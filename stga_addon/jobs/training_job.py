@@ -19,7 +19,7 @@ from ..avatar.file import Avatar, write_avatar
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..files import read_json, write_json, write_npz
-from ..training.evaluate.forecast import clock
+from ..format import format_duration
 from ..training.settings import TrainingSettings, from_json, to_json
 from ..worker import process
 
@@ -177,6 +177,6 @@ def describe(figures: Mapping[str, float]) -> list[str]:
     lines = []
     for pair in pairs:
         known = [(text, figures[name], name) for name, text in pair if figures.get(name)]
-        parts = [text.format(clock(value) if name == "left_s" else value) for text, value, name in known]
+        parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
         lines.append("   ".join(parts).replace(",", "\u202f"))
     return [line for line in lines if line]
