@@ -31,8 +31,8 @@ def train(options: Namespace) -> None:
     from ..report.run_summary import CurveDrawer, conclude
     from ..training.optimize.device import choose_device
     from ..training.run.folder import read_run
-    from ..training.run.loop import Progress
     from ..training.run.loop import train as train_run
+    from ..training.run.progress import Progress
     from ..training.run.progress_bar import ProgressBar
 
     if not options.capture.is_dir():
@@ -50,7 +50,7 @@ def train(options: Namespace) -> None:
         run = decide(_new_run(options, capture, device), capture, device)
     for warning in capture.warnings:
         print(f"warning: {warning}")
-    _print_table(describe_effects(run.plan))
+    _print_table(describe_effects(run.effect_plan))
     draw = CurveDrawer(options.out)
     with ProgressBar() as bar:
 
@@ -69,15 +69,15 @@ def train(options: Namespace) -> None:
 
 def job(options: Namespace) -> None:
     """Carry out the training job that Blender wrote into a run's folder; its panel shows the progress."""
-    from ..jobs.training_job import work
+    from ..jobs.training_job import run_training_job
 
     if not sys.stderr.isatty():  # a worker of Blender's: its folder says it all
-        work(options.run)
+        run_training_job(options.run)
         return
     from ..training.run.progress_bar import ProgressBar
 
     with ProgressBar() as bar:
-        work(options.run, also=bar.report)
+        run_training_job(options.run, also=bar.report)
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:
@@ -101,7 +101,7 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
         if getattr(options, name) not in (None, value):
             option = "--" + name.replace("_", "-")
             raise StgaError(f"{option}: this run began with {value}, which cannot change; use another --out")
-    decided = {decision.effect: decision for decision in run.plan}
+    decided = {decision.effect: decision for decision in run.effect_plan}
     for name, choice in _choices(options).items():
         if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
             raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
@@ -314,7 +314,7 @@ def info(options: Namespace) -> None:
     """Print what a capture holds, and the effects that training on it would compute."""
     from ..capture.summary import describe
     from ..effects.decide import decide_effects, describe_effects
-    from ..training.effect_plan import plan_to_json
+    from ..training.effect_plan import effect_plan_to_json
     from ..training.optimize.device import choose_device
     from ..training.settings import make_settings
 
@@ -324,7 +324,7 @@ def info(options: Namespace) -> None:
         device, _ = choose_device(options.device)
         _, plan = decide_effects(capture, make_settings(iterations=1, effects=_choices(options)), device)
     if options.json:
-        found: dict[str, Any] = {"plan": plan_to_json(plan)}
+        found: dict[str, Any] = {"plan": effect_plan_to_json(plan)}
         if options.presets and plan:
             from ..report.preset_timing import time_presets
 
