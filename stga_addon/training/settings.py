@@ -56,8 +56,9 @@ class TrainingSettings:
     distance_weight, distance_limit   the same for the distance from the triangle's origin
     ema_share      the avatar is made of each splat's running average over its steps, in which the latest has this
                    share; 1: of the splats as they are
-    stray_reset_interval, stray_limit, stray_reset_share    every so many iterations (0: never), a splat farther than the limit from its
-                   triangle's origin is put back to this share of the limit; 0: onto the origin, as in the paper
+    stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a splat farther than the
+                   limit from its triangle's origin is put back to this share of the limit; 0: onto the origin, as in
+                   the paper
                    All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
                    for "gaussian_avatars"
     sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
