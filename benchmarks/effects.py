@@ -33,8 +33,8 @@ from stga_addon.development.benchmark.statistics import Spread, spread_of
 from stga_addon.effects.decide import decide_effects
 from stga_addon.effects.facts import Facts
 from stga_addon.effects.rules import EFFECTS
-from stga_addon.training.evaluate.metrics import measure
-from stga_addon.training.optimize.tracking import refined
+from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.optimize.tracking import with_refined_tracking
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
@@ -119,8 +119,8 @@ def trained(
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
-        shown = refined(capture, Path(folder))
-    psnr = {split: measure(avatar, shown, split).psnr for split in ("val", "test") if shown.views.get(split)}
+        shown = with_refined_tracking(capture, Path(folder))
+    psnr = {split: evaluate_avatar(avatar, shown, split).psnr for split in ("val", "test") if shown.views.get(split)}
     return psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
 
 

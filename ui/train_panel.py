@@ -9,10 +9,10 @@ from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
 from ..operators.common import package, scene_settings
 from ..operators.environment import has_runtime
+from ..stga_addon.format import format_duration
 from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effect_plan import TRACKING
-from ..stga_addon.training.evaluate.forecast import clock
 from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.worker.process import Snapshot, State
 from .curve import draw_curve
@@ -41,7 +41,7 @@ def _draw_choices(layout: Any, context: Any) -> None:
     chosen = scene_settings(context)
     layout.prop(chosen, "run_folder", text="Folder")
     layout.prop(chosen, "preset")
-    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
+    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
     if times:
         draw_text(layout, context, f"On this machine: {times}", "TIME")
     layout.prop(chosen, "minutes")

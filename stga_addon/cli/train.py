@@ -46,7 +46,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     from ..effects.decide import decide, describe_effects
-    from ..report.run_summary import CurveDrawer, conclude
+    from ..report.run_summary import CurveUpdater, report_run
     from ..training.optimize.device import choose_device
     from ..training.run.folder import read_run
     from ..training.run.loop import train
@@ -69,7 +69,7 @@ def run(options: Namespace) -> None:
     for warning in capture.warnings:
         print(f"warning: {warning}")
     print_table(describe_effects(run.effect_plan))
-    draw = CurveDrawer(options.out)
+    draw = CurveUpdater(options.out)
     with ProgressBar() as bar:
 
         def report(progress: Progress) -> bool:
@@ -78,7 +78,7 @@ def run(options: Namespace) -> None:
 
         selection = None if options.head is None else options.head.selection()
         avatar = train(capture, options.out, run, selection, options.resume, report, device)
-    for line in conclude(options.out):
+    for line in report_run(options.out):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
@@ -138,9 +138,9 @@ def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
 
 def _preset_seconds(capture: Capture, preset: str, device: str) -> float:
     """Seconds that a preset takes on this machine's device, which are printed."""
+    from ..format import format_duration
     from ..report.preset_timing import time_presets
-    from ..training.evaluate.forecast import clock
 
     (timing,) = time_presets(capture, [preset], device=device)
-    print(f"{preset}: {timing.iterations} iterations, {clock(timing.seconds)} on this machine")
+    print(f"{preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
     return timing.seconds

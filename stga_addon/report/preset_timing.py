@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from ..capture.images import read_view
-from ..capture.loader import Loaded
+from ..capture.loader import LoadedView
 from ..capture.model import Capture, View
 from ..effects.decide import decide_effects
 from ..errors import StgaError
@@ -83,7 +83,7 @@ def seconds_per_iteration(
     return float(np.mean(times[SETTLING:]))
 
 
-def _ready(view: View, size: float, background: tuple[float, ...]) -> Loaded:
+def _ready(view: View, size: float, background: tuple[float, ...]) -> LoadedView:
     """A view as the loader gives it: read-only arrays, for which the kernels are compiled."""
     red, green, blue = (round(255 * c) for c in background)
     small, image, mask = read_view(view, size, (red, green, blue))

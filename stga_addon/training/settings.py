@@ -71,7 +71,7 @@ class TrainingSettings:
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
                    `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
-    stop_when_flat  stop when more time no longer helps (`forecast.level_since`)
+    stop_when_flat  stop when more time no longer helps (`forecast.plateau_start`)
     preset         the preset that these settings began with, or none
     strain_color   splats carry colour that follows how their triangle deforms (`avatar.strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)

@@ -12,7 +12,7 @@ from stga_addon.capture.images import read_view
 from stga_addon.effects.decide import decide_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
 from stga_addon.training.optimize import cpu_backend, frames, trainer
-from stga_addon.training.optimize.exposure import even_exposure
+from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.optimize.trainer import initial_splats
 from stga_addon.training.run import loop
 from stga_addon.training.run.folder import Run, read_checkpoint
@@ -94,7 +94,7 @@ def test_exposure_is_taken_away(painted):
     """Catches gains and offsets applied the wrong way round, to the background, or to a camera they are not of."""
     gain, offset = unlike_cameras()
     rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
-    correct = even_exposure(make_settings(iterations=1, exposure=rows))
+    correct = exposure_correction(make_settings(iterations=1, exposure=rows))
     assert correct is not None
     alike, unlike = painted(), painted(gain=gain, offset=offset)
     for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
@@ -109,7 +109,7 @@ def test_exposure_is_taken_away(painted):
 
 def test_no_exposure_is_no_pass():
     """Catches images that are copied for nothing."""
-    assert even_exposure(make_settings(iterations=1)) is None
+    assert exposure_correction(make_settings(iterations=1)) is None
 
 
 def test_no_splats_on_teeth(painted):

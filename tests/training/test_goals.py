@@ -12,7 +12,7 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.training.evaluate.forecast import hits
+from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
@@ -79,7 +79,7 @@ def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock
     train(toy, tmp_path, run_of(toy, iterations=200), report=lambda progress: bool(told.append(progress)))
     lines = read_metrics(tmp_path)
     assert [line["iteration"] for line in lines if "forecast" in line] == [80, 100, 120, 140, 160, 180]
-    hit, checked = hits(lines)
+    hit, checked = checked_forecasts(lines)
     assert 0 < hit <= checked == 6
     assert any("another" in progress.forecast_text for progress in told)
 

@@ -128,7 +128,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     part = batch_of(toy, settings, view=view, target=target, selected=toy.regions["mouth"])
     (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
     first.train(whole)
-    second.draw(view, np.ones(3, np.float32), 3)  # takes the buffers
+    second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
     for buffer in second._rasteriser.scratch._buffers.values():
         if buffer.dtype in warp_render.TYPES:
             buffer.fill_(np.nan)
@@ -179,9 +179,9 @@ def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
     state = step.state
     state.average.opacity.fill_(-20.0)  # which is what is drawn
     white = np.ones(3, np.float32)
-    assert step.draw(view_of(toy, 1), white, 3).min() < 0.9
+    assert step.render(view_of(toy, 1), white, 3).min() < 0.9
     step.state = state
-    assert step.draw(view_of(toy, 1), white, 3).min() == 1
+    assert step.render(view_of(toy, 1), white, 3).min() == 1
 
 
 @pytest.fixture(scope="module")

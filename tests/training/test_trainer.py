@@ -164,10 +164,10 @@ def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
     trainer = make_trainer(toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up_share=0.3)
     views, losses = toy.views["train"], []
     images = {view.name: read_image(view) for view in views}
-    before = [psnr(trainer.draw(view, 0.0), images[view.name]) for view in views]
+    before = [psnr(trainer.render(view, 0.0), images[view.name]) for view in views]
     for n, view in zip(range(60), view_order(views, 1, 0), strict=False):
         losses.append(trainer.step(view, images[view.name], n / 60))
-    after = [psnr(trainer.draw(view), images[view.name]) for view in views]
+    after = [psnr(trainer.render(view), images[view.name]) for view in views]
     everywhere = [loss for loss in losses if loss is not None]
     assert len(everywhere) == 60 if strategy != "selective" else 30 < len(everywhere) < 60
     assert np.mean(everywhere[-9:]) < 0.85 * np.mean(everywhere[:9])
@@ -231,21 +231,21 @@ def test_draw_shows_the_average(toy: Capture) -> None:
     """Catches evaluations of other splats than those that the avatar is made of."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
-    picture = trainer.draw(view)
+    picture = trainer.render(view)
     trainer.state.parameters.opacity.fill_(-20.0)
-    np.testing.assert_array_equal(trainer.draw(view), picture)
+    np.testing.assert_array_equal(trainer.render(view), picture)
     trainer.state.average.opacity.fill_(-20.0)
-    assert trainer.draw(view).min() == 1
+    assert trainer.render(view).min() == 1
 
 
 def test_draw_is_a_copy(toy: Capture) -> None:
     """Catches pictures that change when the next one is drawn, since buffers are used again."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
-    picture = trainer.draw(view)
+    picture = trainer.render(view)
     kept = picture.copy()
     disturb(trainer)
-    assert not np.array_equal(trainer.draw(view), kept)
+    assert not np.array_equal(trainer.render(view), kept)
     np.testing.assert_array_equal(picture, kept)
 
 

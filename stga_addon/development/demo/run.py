@@ -18,7 +18,7 @@ from ...files import replacing, write_json
 from ...raster.images import selection_picture, side_by_side, to_bytes
 from ...raster.render import render_avatar
 from ...selection import SelectionOptions, select_capture
-from ...training.evaluate.metrics import measure
+from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import Run
 from ...training.run.loop import train
 from ...training.run.progress_bar import ProgressBar
@@ -133,4 +133,4 @@ def _save(path: Path, pixels: np.ndarray) -> None:
 
 
 def _measure(capture: Capture, avatar: Avatar) -> dict[str, dict[str, float]]:
-    return {split: measure(avatar, capture, split).as_json() for split in ("val", "test")}
+    return {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}

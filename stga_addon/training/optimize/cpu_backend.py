@@ -41,7 +41,7 @@ class CpuBackend:
             state.gradient_count.numpy()[rows] += 1
         return loss
 
-    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
         """The view as the splats' running average shows it: a new (3, H, W) float32 image."""
         average = Parameters(*(tensor.numpy() for tensor in self.state.average))
         return self._render(average, view, background, degree).image.copy()

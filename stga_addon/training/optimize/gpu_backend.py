@@ -153,7 +153,7 @@ class GpuBackend:
             self._run(self._queued)
         return told
 
-    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
         """The view as the splats' running average shows it, after everything that is queued."""
         self._settle()
         with _room(self._device):

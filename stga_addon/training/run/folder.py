@@ -30,7 +30,7 @@ from ...files import partial_name, read_json, read_npz, replacing, write_json, w
 from ...worker.lock import held, owner
 from ..effect_plan import TRACKING, EffectDecision, effect_plan_from_json, effect_plan_to_json
 from ..optimize.state import TrainState, state_of, tensors_of
-from ..optimize.tracking import Refinement
+from ..optimize.tracking import RefinementState
 from ..settings import SCHEDULES, STRATEGIES, TrainingSettings, from_json, to_json
 from .metrics_log import METRICS, read_metrics
 
@@ -70,7 +70,7 @@ class Checkpoint:
     best_psnr: float
     evaluations: int
     losses: list[float]
-    tracking: Refinement | None = None
+    tracking: RefinementState | None = None
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -233,12 +233,12 @@ def _check_state(path: Path, state: TrainState) -> None:
             raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 
-def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> Refinement | None:
+def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | None:
     """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
     names = [name for name in arrays if name.startswith(REFINEMENT)]
     if not names:
         return None
-    found = Refinement(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
+    found = RefinementState(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
     whole = found.change.shape
     if len(whole) != 2:
         raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")

@@ -11,13 +11,14 @@ from ...avatar.file import Avatar, write_avatar
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture
 from ...errors import StgaError
+from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, look
-from ..evaluate.forecast import clock, curve_of, forecast, horizon, level_since
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
+from ..evaluate.forecast import curve_of, forecast, forecast_horizon, plateau_start
 from ..evaluate.metrics import evaluate, peak_memory_mb
-from ..optimize.exposure import even_exposure
+from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
 from ..optimize.tracking import write_tracking
 from ..optimize.trainer import Trainer
@@ -55,7 +56,7 @@ def train(
     Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or the
     weights of LPIPS are named and are none.
     """
-    lpips.network()  # read now, because it is needed only when everything is trained
+    lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
@@ -87,7 +88,7 @@ class _Loop:
         self.lines: list[dict[str, Any]] = []
         self.psnr: float | None = None
         self.forecast_text = ""
-        self.evaluation_views = [look(capture, view) for view in choose_evaluation_views(capture)]
+        self.evaluation_views = [read_evaluation_view(capture, view) for view in choose_evaluation_views(capture)]
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start anew: choose triangles, place splats, and write down what is going to happen."""
@@ -134,7 +135,7 @@ class _Loop:
         views = self.capture.views["train"]
         order = view_order(views, settings.views_per_visit, settings.seed, trainer.iteration)
         red, green, blue = (round(255 * c) for c in settings.background)
-        correct = even_exposure(settings)
+        correct = exposure_correction(settings)
         saved, started = self.elapsed, self.elapsed
         first = trainer.iteration
         self.clock_began = perf_counter() - (self.lines[-1].get("wall_s", 0.0) if self.lines else 0.0)
@@ -189,7 +190,7 @@ class _Loop:
         curve, target = curve_of(self.lines), self.settings.target_psnr
         if target is not None and any(psnr >= target for _, psnr in curve):
             return True
-        return self.settings.stop_when_flat and level_since(curve) is not None
+        return self.settings.stop_when_flat and plateau_start(curve) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Look at the held-out views, keep the avatar if it is the best so far, and write the metrics down."""
@@ -204,7 +205,7 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.evaluation_views:
-            quality = evaluate(lambda view: self.trainer.draw(view, share), self.evaluation_views, perceptual)
+            quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
             self.psnr = quality.psnr
             line.update(quality.as_json())
         # Without held-out views the latest avatar counts as the best.
@@ -223,14 +224,14 @@ class _Loop:
     def _look_ahead(self, line: dict[str, Any]) -> None:
         """Say what more time will bring, and note it in the line so that it can be checked."""
         curve, left = curve_of(self.lines), self._left_s()
-        ahead = horizon(self.elapsed, left)
+        ahead = forecast_horizon(self.elapsed, left)
         coming = None if ahead is None else forecast(curve, ahead)
         self.forecast_text = "" if coming is None else str(coming)
         if coming is not None:
             line["forecast"] = coming.as_json()
-        level = level_since(curve) if left else None
+        level = plateau_start(curve) if left else None
         if level is not None:
-            self.forecast_text = f"no gain since {clock(level)}: more time no longer helps"
+            self.forecast_text = f"no gain since {format_duration(level)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None
         if target is not None and end is not None and end.psnr + end.error < target:
             far = f"{target:g} dB is out of reach ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"

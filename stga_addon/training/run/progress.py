@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.file import Avatar
-from ..evaluate.forecast import clock
+from ...format import format_duration
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,6 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     lines = []
     for pair in pairs:
         known = [(text, figures[name], name) for name, text in pair if figures.get(name)]
-        parts = [text.format(clock(value) if name == "left_s" else value) for text, value, name in known]
+        parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
         lines.append("   ".join(parts).replace(",", "\u202f"))
     return [line for line in lines if line]

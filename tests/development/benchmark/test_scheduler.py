@@ -56,7 +56,7 @@ def test_one_job(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     first, second, last = (json.loads(line) for line in answers.getvalue().splitlines())
     assert (first["iteration"], second["share"], last) == (1, 0.5, {"done": True})
     quality = json.loads((job.out / QUALITY).read_text())
-    assert {"psnr", "ssim", "psnr_mask", "psnr_selected"} <= set(quality["val"]) & set(quality["test"])
+    assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality["val"]) & set(quality["test"])
     assert job.finished
     answers = io.StringIO()
     write_run(tmp_path / "lost", replace(job.run, capture=tmp_path / "nowhere"))
