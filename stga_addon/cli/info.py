@@ -5,7 +5,7 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from ..jobs.delegate import OpenHead
-from ..training.effect_plan import parse_choices, plan_to_json
+from ..training.effect_plan import effect_plan_to_json, parse_choices
 from ..training.settings import make_settings
 from .arguments import add_capture, add_device, add_effects
 from .inputs import open_named_capture
@@ -33,7 +33,7 @@ def run(options: Namespace) -> None:
         device, _ = choose_device(options.device)
         _, plan = plan_effects(capture, make_settings(iterations=1, effects=parse_choices(options.effect)), device)
     if options.json:
-        found: dict[str, Any] = {"plan": plan_to_json(plan)}
+        found: dict[str, Any] = {"plan": effect_plan_to_json(plan)}
         if options.presets and plan:
             from ..report.preset_timing import time_presets
 

@@ -21,10 +21,10 @@ def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run"
     device: what it is to be trained on, one of `choose_device`.
     Raises StgaError for a choice that cannot work on this capture.
     """
-    if run.settings.effects is None or run.plan or not capture.views.get("train"):
+    if run.settings.effects is None or run.effect_plan or not capture.views.get("train"):
         return run
     settings, plan = plan_effects(capture, run.settings, device)
-    return replace(run, settings=settings, plan=plan)
+    return replace(run, settings=settings, effect_plan=plan)
 
 
 def plan_effects(

@@ -93,7 +93,7 @@ def exposure(facts: CaptureFacts) -> Verdict:
 
 def antialiasing(facts: CaptureFacts) -> Verdict:
     settings, widest = facts.settings, facts.pixel_range
-    if settings.scale < 1 or settings.coarse_span > 0:
+    if settings.scale < 1 or settings.coarse_share > 0:
         return Verdict(True, "images are trained on at less than the size that they are drawn at")
     if widest > PIXEL_RANGE:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
@@ -214,7 +214,7 @@ EFFECTS = (
         on={"hull_points": True},
         off={"hull_points": False},
     ),
-    Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_every": 0}),
+    Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
     Effect(
         "selection",
         "none: local iterations are cheaper than global ones",

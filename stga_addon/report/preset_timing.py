@@ -15,8 +15,7 @@ from ..errors import StgaError
 from ..selection import select_capture
 from ..training.optimize.precompile import precompile_kernels
 from ..training.optimize.trainer import Trainer
-from ..training.run.loop import COARSE
-from ..training.schedule import view_order
+from ..training.schedule import image_scale, view_order
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 
 SECONDS = 2.0
@@ -72,13 +71,12 @@ def seconds_per_iteration(
     wanted = settings.strategy == "selective"
     trainer = Trainer(capture, settings, select_capture(capture, settings.selection) if wanted else {}, device=device)
     views = list(islice(view_order(capture.views["train"], settings.views_per_visit, settings.seed), VIEWS))
-    sizes = {settings.scale, settings.scale * COARSE} if settings.coarse_span else {settings.scale}
+    sizes = {image_scale(settings, share) for share in (0.0, 1.0)}
     images = {size: cycle([_ready(view, size, settings.background) for view in views]) for size in sizes}
     times: list[float] = []
     while sum(times[SETTLING:]) < seconds and len(times) < MOST_ITERATIONS:
         share = min(1.0, sum(times[SETTLING:]) / seconds)
-        size = settings.scale * (COARSE if share < settings.coarse_span else 1.0)
-        view, image, mask = next(images[size])
+        view, image, mask = next(images[image_scale(settings, share)])
         begin = perf_counter()
         trainer.step(view, image, share, mask)
         times.append(perf_counter() - begin)

@@ -34,10 +34,10 @@ ITERATIONS = 12
 def train(capture, folder, monkeypatch, choice):
     """Train with all effects on or off; how often each was called, and the checkpoint."""
     names = dict.fromkeys((*CALLS, "view-color", "antialiasing"), choice)
-    wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up=0.0)
+    wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up_share=0.0)
     settings, plan = plan_effects(capture, wanted)
-    if settings.density_every:
-        settings = replace(settings, density_every=2, density_span=(0.0, 1.0))
+    if settings.density_interval:
+        settings = replace(settings, density_interval=2, density_span=(0.0, 1.0))
     calls: Counter[str] = Counter()
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))

@@ -31,7 +31,7 @@ def trained(root, tmp_path_factory):
 def test_the_run_keeps_its_plan(trained):
     """Catches decisions or their reasons that are lost in run.json, and settings that do not follow them."""
     run = read_run(trained)
-    plan = {decision.effect: decision for decision in run.plan}
+    plan = {decision.effect: decision for decision in run.effect_plan}
     assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == ("on", True, True)
     assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == ("off", False, False)
     assert plan["exposure"].choice == "auto"
@@ -81,7 +81,7 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         out = tmp_path / options[1]
         assert main(["train", str(root), "--out", str(out), "--iterations", "2", *options]) == 0
         run = read_run(out)
-        assert (run.plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
+        assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
         again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
         assert main([*again, "--effect", "strain-color=on"]) == 2
         assert "--effect: " in capsys.readouterr().err
@@ -99,7 +99,7 @@ def test_a_damaged_plan(tmp_path):
     whole = read_json(tmp_path / "run.json")
     good = {"effect": "jaw", "choice": "auto", "on": True, "reason": "", "cost": ""}
     for plan in (7, [7], [{**good, "on": "yes"}], [{**good, "choice": "maybe"}], [{"effect": "jaw"}]):
-        write_json(tmp_path / "run.json", {**whole, "plan": plan})
+        write_json(tmp_path / "run.json", {**whole, "effect_plan": plan})
         with pytest.raises(StgaError, match=r"run\.json: "):
             read_run(tmp_path)
     for row in ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0]):

@@ -138,7 +138,7 @@ def test_many_splats_a_pixel(painted):
     """Catches density control where the first splats are already finer than the images."""
     settings, plan = plan_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
     assert not next(decision.on for decision in plan if decision.effect == "density")
-    assert settings.density_every == 0
+    assert settings.density_interval == 0
 
 
 def test_selection_follows_the_strategy(painted):
@@ -230,7 +230,7 @@ def test_overrides(painted):
     """Catches a choice that does not reach the settings, or whose reason is lost."""
     plan, settings = planned(painted(), strain_color="on", view_color="on", background="off", density="off")
     assert (settings.strain_color, settings.sh_degree, settings.random_background) == (True, 3, False)
-    assert settings.density_every == 0
+    assert settings.density_interval == 0
     assert plan["strain-color"].choice == "on"
     assert "as asked" in str(plan["strain-color"])
     assert "0.0 of 255 levels" in plan["strain-color"].reason
