@@ -12,7 +12,7 @@ from ...avatar.file import Avatar, read_avatar
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
-from ...effects.decide import decide
+from ...effects.plan import with_effect_plan
 from ...errors import StgaError
 from ...files import replacing, write_json
 from ...raster.render import render_avatar, to_uint8
@@ -77,7 +77,7 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
     # What was pictured is what the files say, and Blender shows the head as they do.
     settings = make_settings(seconds=seconds, seed=SEED, effects={"tracking": "off"})
-    run = decide(Run(capture.root, model.resolve(), "vhap", settings), capture)
+    run = with_effect_plan(Run(capture.root, model.resolve(), "vhap", settings), capture)
     folder = out / "run"
     if (folder / "run.json").exists():
         (folder / "run.json").unlink()  # the demo always starts anew

@@ -42,7 +42,7 @@ class CpuBackend:
         if batch.refine:
             self._refine(batch, rows)
         self._limit(rows)
-        adam.step(state, rows, batch.rates, self._settings.averaging)
+        adam.step(state, rows, batch.rates, self._settings.ema_share)
         if focus is None:
             state.screen_gradient.numpy()[rows] += screen[rows]
             state.gradient_count.numpy()[rows] += 1

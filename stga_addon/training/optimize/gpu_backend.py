@@ -268,7 +268,7 @@ class GpuBackend:
         state, launch = self._state, self._rasterizer.launch
         correct = self._rasterizer.buffers.get("correct", len(self), wp.vec3)
         logarithms = math.log(BETA1), math.log(BETA2)
-        launch(optimizer.count_steps, len(self), wanted, *logarithms, self._settings.averaging, state.steps, correct)
+        launch(optimizer.count_steps, len(self), wanted, *logarithms, self._settings.ema_share, state.steps, correct)
         for name, *tables in zip(
             Parameters._fields, state.parameters, state.gradients, state.first, state.second, state.average, strict=True
         ):
