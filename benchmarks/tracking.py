@@ -20,8 +20,8 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.flame_capture import with_sequence
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.effects.decide import decide_effects
-from stga_addon.effects.facts import Facts
+from stga_addon.effects.facts import CaptureFacts
+from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import tracking
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.training.evaluate.metrics import evaluate_avatar
@@ -66,7 +66,7 @@ def millimetres(capture: Capture, true: Capture) -> float:
 
 def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tuple[Capture, Mapping[str, float], float]:
     """The capture as it was refined, the PSNR by split, and the seconds of an iteration."""
-    settings, plan = decide_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
+    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         shown, last = with_refined_tracking(capture, Path(folder)), read_metrics(Path(folder))[-1]
@@ -86,7 +86,7 @@ def main() -> None:
     print("|" + " --- |" * 8)
     for error in options.errors:
         capture = lose_track(true, error)
-        facts = Facts(capture, make_settings(iterations=1))
+        facts = CaptureFacts(capture, make_settings(iterations=1))
         decided = tracking(facts)
         auto = "on" if decided is not None and decided.on else "off"
         for choice in ("off", "on"):

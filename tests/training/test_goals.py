@@ -16,7 +16,8 @@ from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
-from stga_addon.training.run.loop import EVALUATION_SHARE, Progress, train
+from stga_addon.training.run.loop import EVALUATION_SHARE, train
+from stga_addon.training.run.progress import Progress
 
 from .toys import quick_settings
 
@@ -140,5 +141,5 @@ def test_images_grow_where_settings_say_so(toy: Capture, tmp_path: Path, monkeyp
         return step(trainer, view, target, *rest)
 
     monkeypatch.setattr(run_module.Trainer, "step", note)
-    train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_span=0.25))
+    train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_share=0.25))
     assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

@@ -192,7 +192,9 @@ def test_nothing_moves_before_there_is_something_to_see(lost: Made) -> None:
     """Catches a tracking that follows grey splats, and one that moves in local iterations."""
     capture, _ = lost
     trainer = Trainer(
-        capture, quick_settings("selective", warm_up=0.0, global_every=2, tracking=True), {0: np.arange(320) < 9}
+        capture,
+        quick_settings("selective", warm_up_share=0.0, global_interval=2, tracking=True),
+        {0: np.arange(320) < 9},
     )
     view = next(view for view in capture.views["train"] if view.timestep == 0)
     assert trainer.tracking is not None

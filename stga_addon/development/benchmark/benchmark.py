@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.model import Capture
-from ...effects.decide import decide
+from ...effects.plan import with_effect_plan
 from ...files import replacing, write_json
 from ...format import format_duration
 from ...report.run_summary import evaluation_share
@@ -87,7 +87,7 @@ def _runs(capture: Capture, run: Run, variants: Mapping[str, Changes], seconds: 
     """variant -> its run; one that would train as an earlier one does is left out."""
     runs: dict[str, Run] = {}
     for name, changes in variants.items():
-        decided = decide(replace(run, settings=settings_of(changes, seconds)), capture)
+        decided = with_effect_plan(replace(run, settings=settings_of(changes, seconds)), capture)
         if not any(_same(decided.settings, other.settings) for other in runs.values()):
             runs[name] = decided
     return runs

@@ -20,7 +20,8 @@ from ...report.preset_timing import seconds_per_iteration
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.optimize.tracking import with_refined_tracking
 from ...training.run.folder import read_run
-from ...training.run.loop import Progress, train
+from ...training.run.loop import train
+from ...training.run.progress import Progress
 
 WARM_UP = 1.0
 """Seconds of training before the run that are not counted: caches fill and the clock of the processor rises."""

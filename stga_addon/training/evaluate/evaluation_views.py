@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from PIL import Image, ImageDraw
 
-from ...capture.camera import Camera
 from ...capture.images import read_image, read_mask
 from ...capture.model import Capture, View
 from ...selection import SelectionOptions, select_capture
@@ -59,7 +58,8 @@ def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:
 def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
     """(H, W) bool: where one of the triangles `faces` (F,) bool is the nearest one."""
     mesh = np.asarray(capture.mesh(view.timestep))
-    corners, depth = _in_image(mesh, view.camera)
+    corners, depth = view.camera.project(mesh)
+    corners -= 0.5  # Pillow's pixel centers lie at whole numbers
     centres = depth[capture.faces].mean(1)
     picture = Image.new("1", (view.camera.width, view.camera.height))
     draw = ImageDraw.Draw(picture)
@@ -69,10 +69,3 @@ def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarra
     for polygon, chosen in zip(polygons, faces[drawn].tolist(), strict=True):
         draw.polygon(polygon, fill=int(chosen))
     return np.asarray(picture)
-
-
-def _in_image(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2), with pixel centres at whole numbers as Pillow has them, and depths (N,) of points (N, 3)."""
-    p = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = p[:, :2] / np.maximum(p[:, 2:], 1e-6) * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
-    return pixels - 0.5, p[:, 2]

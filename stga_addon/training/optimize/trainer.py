@@ -121,13 +121,13 @@ class Trainer:
         """Stray resets and density control, when their time has come."""
         settings = self.settings
         start, end = settings.density_span
-        stray = _is_due(settings.stray_every, self.iteration)
-        density = _is_due(settings.density_every, self.iteration) and start <= progress < end
+        stray = _is_due(settings.stray_reset_interval, self.iteration)
+        density = _is_due(settings.density_interval, self.iteration) and start <= progress < end
         if not stray and not density:
             return
         state = self.state
         if stray:
-            reset_strays(state, settings.stray_limit * self._lengths, settings.stray_to)
+            reset_strays(state, settings.stray_limit * self._lengths, settings.stray_reset_share)
         if density:
             room = round(self.initial_count * (1 + settings.growth)) - len(state)
             rng = np.random.default_rng([settings.seed, self.iteration])

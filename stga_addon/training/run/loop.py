@@ -1,8 +1,6 @@
 """A whole training run: from a capture to an avatar in a folder, with evaluation, checkpoints and resumption."""
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,11 +22,12 @@ from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
 from ..optimize.tracking import write_tracking
 from ..optimize.trainer import Trainer
-from ..schedule import view_order
+from ..schedule import image_scale, view_order
 from ..settings import to_json
 from . import folder as run_folder
 from .folder import Checkpoint, Run
 from .metrics_log import read_metrics
+from .progress import Progress, Report
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
@@ -38,30 +37,6 @@ EVALUATION_SHARE = 0.04
 """Largest share of the training time that evaluations add to a budget in seconds; the last one comes on top."""
 MOST_EVALUATIONS = 40
 """Evaluations over a budget in seconds, however little they cost."""
-COARSE = 0.5
-"""Size of the images during `TrainingSettings.coarse_span`, as a share of the size trained at afterwards."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a person sees while it trains: share of the budget, iterations, speed, loss (mean of the last global
-    iterations), PSNR of the last evaluation or None, splat count, seconds left, what is going on, and what more time
-    is expected to bring. `avatar` makes the avatar as it is now; None before there is one."""
-
-    share: float
-    iteration: int
-    per_second: float
-    loss: float
-    psnr: float | None
-    splats: int
-    left_s: float
-    message: str = ""
-    forecast_text: str = ""
-    avatar: Callable[[], Avatar] | None = None
-
-
-Report = Callable[[Progress], bool]
-"""Called after every iteration; answers True to stop early, keeping what is trained."""
 
 
 def train(
@@ -89,7 +64,7 @@ def train(
     with run_folder.locked(out):
         if (out / "run.json").exists() and not resume:
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
-        report(Progress(0, 0, 0, np.nan, None, 0, np.nan, "compiling kernels"))
+        report(Progress(message="Compiling kernels"))
         precompile_kernels()
         loop = _Loop(capture, out, run, report, device)
         if resume and (out / "checkpoint.npz").exists():
@@ -117,7 +92,7 @@ class _Loop:
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start anew: choose triangles, place splats, and write down what is going to happen."""
-        self._tell("choosing triangles and placing splats")
+        self._tell("Placing splats")
         if selection is None:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
@@ -129,7 +104,7 @@ class _Loop:
 
     def resume(self) -> None:
         """Take up the folder's checkpoint."""
-        self._tell("reading the checkpoint")
+        self._tell("Reading the checkpoint")
         checkpoint = run_folder.read_checkpoint(self.out)
         selection = run_folder.read_selection(self.out, len(self.capture.faces))
         face = checkpoint.state.face
@@ -186,7 +161,7 @@ class _Loop:
                     break
         self._evaluate(perceptual=self._share() >= 1 or self._enough())  # who stops a run is not made to wait
         self._save()
-        self.report(self._progress(speed, "trained"))
+        self.report(self._progress(speed, "Finished"))
 
     def _share(self) -> float:
         """Share of the budget spent."""
@@ -196,9 +171,8 @@ class _Loop:
 
     def _size(self, iteration: int) -> float:
         """Size of an iteration's image, as a share of the captured one; by the clock, a few images ahead of it."""
-        settings = self.settings
-        share = self._share() if settings.iterations is None else iteration / settings.iterations
-        return settings.scale * (COARSE if share < settings.coarse_span else 1.0)
+        total = self.settings.iterations
+        return image_scale(self.settings, self._share() if total is None else iteration / total)
 
     def _due(self) -> bool:
         """Whether to evaluate now; at the end of the budget there is an evaluation anyway."""
@@ -286,7 +260,7 @@ class _Loop:
             ),
         )  # fmt: skip
 
-    def _progress(self, per_second: float, message: str = "training") -> Progress:
+    def _progress(self, per_second: float, message: str = "Training") -> Progress:
         return Progress(
             min(1.0, self._share()),
             self.trainer.iteration,
@@ -306,4 +280,4 @@ class _Loop:
         return max(0.0, self.elapsed * (1 / share - 1)) if share > 0 else np.nan
 
     def _tell(self, message: str) -> None:
-        self.report(Progress(0, 0, 0, np.nan, None, 0, np.nan, message))
+        self.report(Progress(message=message))

@@ -17,10 +17,10 @@ from stga_addon.development.benchmark.variants import KNOBS, MAIN, chosen
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
 from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics, write_run
-from stga_addon.training.run.loop import Progress
+from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
 
-TINY = {"lattice": 0, "hull_points": False, "sh_degree": 0, "sh_steps": (), "density_every": 0}
+TINY = {"lattice": 0, "hull_points": False, "sh_degree": 0, "sh_steps": (), "density_interval": 0}
 VARIANTS = {"standard": TINY, "coarse": {**TINY, "scale": 0.5}}
 
 
