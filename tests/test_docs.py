@@ -4,8 +4,12 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
+from stga_addon.avatar.ply import write_ply
+from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.cli.main import make_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,3 +73,24 @@ def test_commands_parse(page):
 def test_no_package_index_is_named(page):
     """Catches addresses of package files, which go stale: the docs name packages and versions."""
     assert not re.search(r"pythonhosted|pypi\.org", TEXTS[page])
+
+
+def test_readme_renders_a_ply(tmp_path, monkeypatch):
+    """Catches a public rendering function that is not the one which the README shows."""
+    splats = Splats(
+        xyz=np.zeros((1, 3), np.float32),
+        rotation=np.array([[1, 0, 0, 0]], np.float32),
+        log_scale=np.full((1, 3), np.log(0.05), np.float32),
+        opacity=np.full(1, 5, np.float32),
+        sh=np.full((1, 1, 3), -0.5 / SH_C0, np.float32),
+        face=np.zeros(1, np.int32),
+        unbound=np.zeros(1, bool),
+    )
+    write_ply(tmp_path / "splats.ply", splats)
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", TEXTS[ROOT / "README.md"], re.DOTALL)
+    exec(example, {})
+    pixels = np.asarray(Image.open("splats.png"))
+    assert pixels.shape == (480, 640, 3)
+    assert pixels[240, 320].max() < 10, "a black splat at the camera's target"
+    assert pixels[0, 0].min() == 255, "on a white background"
