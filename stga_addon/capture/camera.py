@@ -1,5 +1,6 @@
 """Calibrated pinhole camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,3 +68,27 @@ def camera_from_gl(
     """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
     return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)
+
+
+def look_at(
+    eye: Sequence[float],
+    target: Sequence[float],
+    width: int,
+    height: int,
+    focal_length: float,
+    up: Sequence[float] = (0.0, 1.0, 0.0),
+) -> Camera:
+    """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the image's center.
+
+    width, height, focal_length in pixels. up: the world direction that points up in the image; FLAME's is +y.
+    Raises ValueError where `eye` is at `target`, or `up` is parallel to the viewing direction.
+    """
+    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    right = np.cross(forward, np.asarray(up, np.float64))
+    if not np.linalg.norm(right):
+        raise ValueError(f"look_at needs a viewing direction that is not parallel to up, got {forward} and {up}")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ np.asarray(eye, np.float64)
+    return Camera(width, height, focal_length, focal_length, width / 2, height / 2, pose)

@@ -129,11 +129,11 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
     first.train(whole)
     second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
-    for buffer in second._rasteriser.scratch._buffers.values():
-        if buffer.dtype in warp_render.TYPES:
+    for buffer in second._rasterizer.buffers._buffers.values():
+        if buffer.dtype in warp_render.PARAMETER_TYPES:
             buffer.fill_(np.nan)
     second.train(part)
-    assert 0 < second._rasteriser.scratch.take("drawn", 8 * 12, warp_render.wp.uint8).numpy().mean() < 0.8
+    assert 0 < second._rasterizer.buffers.get("rendered", 8 * 12, warp_render.wp.uint8).numpy().mean() < 0.8
     rows = np.flatnonzero(second.state.steps.numpy() != disturbed(toy, settings).steps.numpy())
     assert 20 < len(rows) < 0.5 * len(second)
     for name, want in moments(first).items():
@@ -146,8 +146,8 @@ def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest
     settings = settings_of()
     batches = [batch_of(toy, settings, timestep, selected=s) for timestep, s in ((1, None), (3, toy.regions["mouth"]))]
     results = []
-    for capacity in (warp_render.FIRST_CAPACITY, 10):
-        monkeypatch.setattr(warp_render, "FIRST_CAPACITY", capacity)
+    for capacity in (warp_render.INITIAL_PAIR_CAPACITY, 10):
+        monkeypatch.setattr(warp_render, "INITIAL_PAIR_CAPACITY", capacity)
         _, step = pair(toy, settings)
         for batch in (*batches, *batches):
             step.train(batch)

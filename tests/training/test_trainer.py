@@ -103,7 +103,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
     screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
-    for buffer in step._scratch._buffers.values():
+    for buffer in step._buffers._buffers.values():
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for tensor in trainer.state.gradients:
         tensor.fill_(7.0)

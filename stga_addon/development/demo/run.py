@@ -15,8 +15,7 @@ from ...capture.open import open_capture
 from ...effects.plan import with_effect_plan
 from ...errors import StgaError
 from ...files import replacing, write_json
-from ...raster.images import selection_picture, side_by_side, to_bytes
-from ...raster.render import render_avatar
+from ...raster.render import render_avatar, to_uint8
 from ...selection import SelectionOptions, select_capture
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import Run
@@ -24,6 +23,7 @@ from ...training.run.loop import train
 from ...training.run.progress_bar import ProgressBar
 from ...training.settings import make_settings
 from .capture import CaptureOptions, make_capture
+from .pictures import selection_picture, side_by_side
 
 SEED = 0
 TOLERANCE = 1e-5
@@ -119,12 +119,12 @@ def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray],
     pictures = []
     for view in (capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]):
         image = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
-        pictures += [read_image(view), to_bytes(image)]
+        pictures += [read_image(view), to_uint8(image)]
     _save(out / "comparison.png", side_by_side(pictures))
     busiest = max(capture.views["val"], key=lambda view: selection[view.timestep].sum())
     selected = selection[busiest.timestep]
     picture = selection_picture(avatar, capture.mesh(busiest.timestep), busiest.camera, selected)
-    _save(out / "selection.png", to_bytes(picture))
+    _save(out / "selection.png", to_uint8(picture))
 
 
 def _save(path: Path, pixels: np.ndarray) -> None:

@@ -64,7 +64,7 @@ def _find_gpu() -> tuple[str | None, str]:
     try:
         import warp
 
-        from ...raster.gpu.trial import compile_kernels, passes
+        from ...raster.gpu.self_test import compile_kernels, passes
 
         if not warp.is_cuda_available():
             return None, "the NVIDIA driver finds no GPU that it can use"
