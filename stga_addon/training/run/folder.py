@@ -160,7 +160,7 @@ def read_selection(folder: Path, faces: int) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh."""
     path = folder / "selection.npz"
     selection = {}
-    for name, mask in read_npz(path, max_packing=faces // 100 + 16).items():  # an entry of a zip has some 200 bytes
+    for name, mask in read_npz(path, max_compression=faces // 100 + 16).items():  # an entry of a zip has some 200 bytes
         if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
             raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep")
         selection[int(name)] = mask
