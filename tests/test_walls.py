@@ -29,8 +29,8 @@ LAYERS = (
     {"report"},
     {"jobs"},
     {"scene"},
-    {"development"},
     {"cli"},
+    {"development"},
     {"__main__", "__init__"},
 )
 LIGHT = (
