@@ -19,6 +19,7 @@ COMMANDS = (
     ".export",
     ".info",
     ".presets",
+    ".environment",
     "..development.benchmark.command",
     "..development.demo.command",
 )

@@ -69,7 +69,7 @@ def start_python(
     variables: environment variables to add. options: those of subprocess.Popen.
     Raises StgaError where the interpreter cannot be started.
     """
-    environment = {**worker_environment(os.environ), **(variables or {})}
+    environment = {**worker_environment(os.environ, python), **(variables or {})}
     try:
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
@@ -77,12 +77,17 @@ def start_python(
         raise StgaError(f"{python}: cannot be started as a Python interpreter ({reason})") from error
 
 
-def worker_environment(variables: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables for another interpreter: the path of this package, and none of Blender's own Python."""
+def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, str]:
+    """Environment variables for the interpreter `python`: the path of this package, and none of Blender's own Python.
+
+    Another process of this interpreter finds the packages that this process does: Blender's extensions have a folder
+    for theirs, which its Python does not search by itself.
+    """
     kept = {name: value for name, value in variables.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
+    own_paths = filter(None, sys.path) if python == sys.executable else ()
     return {
         **kept,
-        "PYTHONPATH": str(PACKAGES_FOLDER),
+        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *own_paths]),
         "PYTHONSAFEPATH": "1",
         "PYTHONDONTWRITEBYTECODE": "1",  # the extension's folder belongs to Blender
         "PYTHONUNBUFFERED": "1",

@@ -12,7 +12,7 @@ from ..files import file_size
 
 ACQUIRE_TIMEOUT_S = 0.3
 """How long a lock is waited for: a process that only asks whether it is held has it for a moment."""
-PROBE_TIMEOUT_S, PROBE_INTERVAL_S = 0.006, 0.002
+PROBE_TIMEOUT_S, PROBE_INTERVAL_S = 0.03, 0.002
 """The same between two processes that only ask."""
 OWNER_OFFSET = 1
 """Where the owner's process number starts: on Windows, other processes cannot read the first byte, which is locked."""

@@ -16,8 +16,17 @@ from stga_addon.jobs import training_job
 from stga_addon.jobs.delegate import FOLDER
 from stga_addon.jobs.training_job import TrainingJob, describe, folder_of, read_job, work, write_job
 from stga_addon.training.settings import make_settings
-from stga_addon.worker import process as task
-from stga_addon.worker.process import State
+from stga_addon.worker.launch import start_worker
+from stga_addon.worker.status import (
+    CANCEL_FILE,
+    LOG_FILE,
+    STATUS_FILE,
+    WorkerState,
+    inspect_worker,
+    log_lines,
+    request_cancel,
+    status_writer,
+)
 
 
 @pytest.fixture
@@ -35,7 +44,7 @@ def painted() -> dict[int, np.ndarray]:
 
 
 def start(run: Path) -> "subprocess.Popen[bytes]":
-    return task.start(folder_of(run), sys.executable, training_job.arguments(run))
+    return start_worker(folder_of(run), sys.executable, training_job.arguments(run))
 
 
 def test_round_trip(tmp_path, capture):
@@ -51,10 +60,10 @@ def test_the_next_job_forgets_the_last(tmp_path, capture):
     """Catches yesterday's selection, preview or wish to cancel in today's training."""
     run, folder = tmp_path / "run", folder_of(tmp_path / "run")
     write_job(run, new_job(capture), painted())
-    for name in (training_job.PREVIEW, task.CANCEL, task.STATUS):
+    for name in (training_job.PREVIEW, CANCEL_FILE, STATUS_FILE):
         (folder / name).write_text("{}")
     write_job(run, new_job(capture))
-    assert sorted(path.name for path in folder.iterdir()) == [training_job.JOB, task.LOG]
+    assert sorted(path.name for path in folder.iterdir()) == [training_job.JOB, LOG_FILE]
 
 
 def test_refusals(tmp_path, capture):
@@ -68,7 +77,7 @@ def test_refusals(tmp_path, capture):
         write_job(run, new_job(capture))
     write_job(run, TrainingJob(capture, None, "vhap", None))
     assert read_job(run).settings is None
-    with task.telling(folder_of(run)), pytest.raises(StgaError, match="another worker is at work"):
+    with status_writer(folder_of(run)), pytest.raises(StgaError, match="another worker is running"):
         write_job(run, TrainingJob(capture, None, "vhap", None))
 
 
@@ -103,9 +112,9 @@ def test_a_worker_trains_what_this_process_would(tmp_path, capture):
         write_job(run, new_job(capture), painted())
     assert work(here) == here / "avatar.npz"
     process = start(there)
-    assert process.wait(300) == 0, task.log_lines(folder_of(there), 50)
-    seen = task.look(folder_of(there), process)
-    assert seen.state == State.FINISHED
+    assert process.wait(300) == 0, log_lines(folder_of(there), 50)
+    seen = inspect_worker(folder_of(there), process)
+    assert seen.state == WorkerState.FINISHED
     assert seen.status.figures["splats"] > 0
     assert {"psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
     one, two = (read_npz(run / "avatar.npz") for run in (here, there))
@@ -128,19 +137,19 @@ def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path, capture):
 
     def cancel(progress):
         if progress.iteration == 5:
-            task.ask_to_stop(folder)
+            request_cancel(folder)
         assert progress.iteration <= 6
         return False
 
     work(run, also=cancel)
-    assert task.look(folder).state == State.CANCELLED
+    assert inspect_worker(folder).state == WorkerState.CANCELLED
     assert (run / "avatar.npz").exists()
     write_job(run, TrainingJob(capture, None, "opencv", None))
     first = []
     work(run, also=lambda progress: first.append(progress.iteration))
     assert min(n for n in first if n) > 5
     assert max(first) == 40
-    assert task.look(folder).state == State.FINISHED
+    assert inspect_worker(folder).state == WorkerState.FINISHED
 
 
 @pytest.mark.slow
@@ -193,8 +202,8 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     write_job(run, new_job(capture))
     (capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
     assert main(["job", str(run)]) == 2
-    seen = task.look(folder_of(run))
-    assert seen.state == State.FAILED
+    seen = inspect_worker(folder_of(run))
+    assert seen.state == WorkerState.FAILED
     assert "00003.obj" in seen.status.error
     assert seen.status.traceback == ""
 
@@ -204,10 +213,10 @@ def test_an_interpreter_without_anything_is_named(tmp_path, capture):
     write_job(tmp_path / "run", new_job(capture))
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv/bin/python"
-    process = task.start(folder_of(tmp_path / "run"), str(python), training_job.arguments(tmp_path / "run"))
+    process = start_worker(folder_of(tmp_path / "run"), str(python), training_job.arguments(tmp_path / "run"))
     assert process.wait(60) == 2
-    seen = task.look(folder_of(tmp_path / "run"), process)
-    assert seen.status.error == f"the worker ended with exit status 2: stga: {python} lacks the package 'numpy'"
+    seen = inspect_worker(folder_of(tmp_path / "run"), process)
+    assert seen.status.error == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
 
 
 def test_a_head_that_is_not_there_is_a_sentence(tmp_path):
