@@ -1,7 +1,6 @@
 """Train an avatar from a capture, or continue a run."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import Any
 
 from ..capture.model import Capture
@@ -11,7 +10,7 @@ from ..jobs.delegate import OpenHead
 from ..selection import SelectionOptions
 from ..training.effect_plan import parse_choices
 from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, make_settings
-from .arguments import add_capture, add_device, add_effects, duration
+from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number
 from .inputs import open_named_capture
 from .table import print_table
 
@@ -20,10 +19,10 @@ NAME, HELP = "train", "train an avatar from a capture"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder of the run")
+    parser.add_argument("--out", type=usable_path, required=True, metavar="RUN", help="folder of the run")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
-    budget.add_argument("--iterations", type=int, help="number of iterations instead")
+    budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
     parser.add_argument(
         "--strategy",
         choices=STRATEGIES,
@@ -33,23 +32,24 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), help="quality and training time; `stga presets` shows the times"
     )
-    parser.add_argument("--target-psnr", type=float, metavar="DB", help="stop when the held-out views reach it")
+    parser.add_argument("--target-psnr", type=real_number, metavar="DB", help="stop when the held-out views reach it")
     parser.add_argument(
         "--stop-when-flat", action="store_true", default=None, help="stop when more time no longer helps"
     )
-    parser.add_argument("--threshold", type=float, metavar="METERS", help="selection threshold")
+    parser.add_argument("--threshold", type=real_number, metavar="METERS", help="selection threshold")
     add_effects(parser)
     parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
     add_device(parser)
-    parser.add_argument("--seed", type=int, help="fixes every random choice (default 0)")
+    parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
 
 
 def run(options: Namespace) -> None:
-    from ..effects.decide import decide, describe_effects
-    from ..report.run_summary import CurveDrawer, conclude
+    from ..effects.plan import describe_effects, with_effect_plan
+    from ..report.run_summary import CurveUpdater, report_run
     from ..training.optimize.device import choose_device
     from ..training.run.folder import read_run
-    from ..training.run.loop import Progress, train
+    from ..training.run.loop import train
+    from ..training.run.progress import Progress
     from ..training.run.progress_bar import ProgressBar
 
     if not options.capture.is_dir():
@@ -64,11 +64,11 @@ def run(options: Namespace) -> None:
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
         capture = open_named_capture(options)
-        run = decide(_new_run(options, capture, device), capture, device)
+        run = with_effect_plan(_new_run(options, capture, device), capture, device)
     for warning in capture.warnings:
         print(f"warning: {warning}")
-    print_table(describe_effects(run.plan))
-    draw = CurveDrawer(options.out)
+    print_table(describe_effects(run.effect_plan))
+    draw = CurveUpdater(options.out)
     with ProgressBar() as bar:
 
         def report(progress: Progress) -> bool:
@@ -77,7 +77,7 @@ def run(options: Namespace) -> None:
 
         selection = None if options.head is None else options.head.selection()
         avatar = train(capture, options.out, run, selection, options.resume, report, device)
-    for line in conclude(options.out):
+    for line in report_run(options.out):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
@@ -105,7 +105,7 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
         if getattr(options, name) not in (None, value):
             option = "--" + name.replace("_", "-")
             raise StgaError(f"{option}: this run began with {value}, which cannot change; use another --out")
-    decided = {decision.effect: decision for decision in run.plan}
+    decided = {decision.effect: decision for decision in run.effect_plan}
     for name, choice in parse_choices(options.effect).items():
         if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
             raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
@@ -137,9 +137,9 @@ def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
 
 def _preset_seconds(capture: Capture, preset: str, device: str) -> float:
     """Seconds that a preset takes on this machine's device, which are printed."""
+    from ..format import format_duration
     from ..report.preset_timing import time_presets
-    from ..training.evaluate.forecast import clock
 
     (timing,) = time_presets(capture, [preset], device=device)
-    print(f"{preset}: {timing.iterations} iterations, {clock(timing.seconds)} on this machine")
+    print(f"{preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
     return timing.seconds

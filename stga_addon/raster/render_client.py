@@ -16,14 +16,15 @@ from ..worker.launch import start_python
 from .posed_splats import ComposedImage, PosedSplats
 from .render_protocol import pack_layers, receive, send
 
-NEEDED = ("numba", "platformdirs")
+REQUIRED_PACKAGES = ("numba", "platformdirs")
 """What drawing needs beside numpy, as pip calls it."""
 
 
 class RenderClient:
     """Draws layers, from any thread, one picture at a time.
 
-    find_python: the interpreter that draws where this one lacks NEEDED; raises StgaError where there is none.
+    find_python: the interpreter that draws where this one lacks REQUIRED_PACKAGES; raises StgaError where there is
+    none.
     """
 
     def __init__(self, find_python: Callable[[], str]) -> None:
@@ -35,7 +36,7 @@ class RenderClient:
     def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
         """`compose.compose`, here or in the worker. Raises StgaError where neither can draw."""
         with self._lock:
-            if not missing():
+            if not missing_packages():
                 from .cpu.compose import compose
 
                 return compose(layers, camera, with_depth)
@@ -84,11 +85,11 @@ class RenderClient:
         except StgaError as error:
             own = f"{sys.executable}, {sys.version.split()[0]}"
             raise StgaError(
-                f"drawing splats needs {' and '.join(missing())} in Blender's own Python ({own}), "
+                f"drawing splats needs {' and '.join(missing_packages())} in Blender's own Python ({own}), "
                 "or a training environment, which the add-on's preferences or `stga environment` make or choose"
             ) from error
 
 
-def missing() -> list[str]:
-    """The packages of NEEDED that this interpreter lacks."""
-    return [name for name in NEEDED if find_spec(name) is None]
+def missing_packages() -> list[str]:
+    """The packages of REQUIRED_PACKAGES that this interpreter lacks."""
+    return [name for name in REQUIRED_PACKAGES if find_spec(name) is None]

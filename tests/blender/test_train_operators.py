@@ -43,7 +43,7 @@ def worker(extension, head, tmp_path):
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
         job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
         watch.set_job(bpy.context.scene, run)
-        writer = stack.enter_context(status.status_writer(job.folder_of(run)))
+        writer = stack.enter_context(status.status_writer(job.job_folder(run)))
         writer.update(0.25, "training")
         writer.run, writer.leave = run, stack.close
         yield writer
