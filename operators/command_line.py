@@ -34,14 +34,11 @@ _commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from ..stga_addon.cli.parser import (  # only here: enabling the extension loads nothing that a command needs
-        main,
-        parser,
-    )
+    from ..stga_addon.cli.main import main, make_parser  # loaded when a command is given, not when Blender starts
 
     try:
         head = _open_head()
-        command = parser(head).parse_args(arguments).command
+        command = make_parser(head).parse_args(arguments).command
         if command in IN_BLENDER or not missing_here():
             return main(arguments, head)
         return _hand_over(arguments, head, played=command == "render")

@@ -10,7 +10,7 @@ from bpy.app.handlers import persistent
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.training_job import PREVIEW, folder_of
+from ..stga_addon.jobs.training_job import PREVIEW, job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.splat_object import (
     SplatAttributes,
@@ -73,13 +73,13 @@ def run_of(scene: Any) -> Path | None:
     if not chosen.training_run:
         return None
     began, beside = Path(chosen.training_run), Path(bpy.path.abspath(chosen.run_folder))
-    return next((run for run in (began, beside) if folder_of(run).is_dir()), began)
+    return next((run for run in (began, beside) if job_folder(run).is_dir()), began)
 
 
 def snapshot_of(scene: Any) -> Snapshot:
     """The scene's job as it is; `State.NONE` where there is none, or its folder is gone."""
     run = run_of(scene)
-    return Snapshot() if run is None else snapshot(folder_of(run))
+    return Snapshot() if run is None else snapshot(job_folder(run))
 
 
 def set_job(scene: Any, run: Path | None) -> None:
@@ -116,9 +116,9 @@ def _follow_job(scene: Any) -> float | None:
     _jobs[scene.session_uid] = job
     run = run_of(scene)
     assert run is not None
-    state = _look(folder_of(run)).state
+    state = _look(job_folder(run)).state
     if state.is_alive:
-        wait = _show(scene, folder_of(run) / PREVIEW) if chosen.live_preview else None
+        wait = _show(scene, job_folder(run) / PREVIEW) if chosen.live_preview else None
         return INTERVAL_S if wait is None else wait
     if state not in (State.FINISHED, State.CANCELLED) or chosen.result_shown:
         return None
