@@ -12,14 +12,8 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.training_job import PREVIEW, job_folder
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.splat_object import (
-    SplatAttributes,
-    avatar_attributes,
-    build_next_node_group,
-    can_update,
-    check_head,
-    update_splats,
-)
+from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
+from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
 from ..stga_addon.worker import process as task
 from ..stga_addon.worker.process import Snapshot, State
 from . import ids
