@@ -239,7 +239,7 @@ def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
 
 def test_more_bounces_where_cycles_needs_them(extension):
     """Catches a hint that shows where nothing has to be done, and a button that lowers what somebody raised."""
-    materials = extension.stga_addon.scene.display.materials
+    materials = extension.stga_addon.scene.display.hints
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.transparent_max_bounces = 8
