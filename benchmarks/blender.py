@@ -22,9 +22,10 @@ from stga_addon.capture.model import Capture
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh
-from stga_addon.scene.display.splats import show_avatar
-from stga_addon.scene.file import go_to_frame, new_file
+from stga_addon.scene.blend_file import new_file
+from stga_addon.scene.display.splat_object import show_avatar
 from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.timeline import go_to_frame
 from stga_addon.scene.vertex_groups import read_selection, write_selection
 
 

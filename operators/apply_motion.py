@@ -11,7 +11,7 @@ from ..stga_addon.flame.motion import PARTS, retimed, strengthened
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.rig.motion import apply_motion, performed_motion
+from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
 from . import ids
 from .common import capture_of, file_path, flame_model_path, flame_of, head_of, is_head, needs_rig, reporting
 
@@ -125,7 +125,7 @@ class ApplyMotion(bpy.types.Operator):
         if other == head:
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
         numbers = range(context.scene.frame_start, context.scene.frame_end + 1)
-        return other.name, performed_motion(other, flame_of(capture_of(other), other.name), numbers, self._warn)
+        return other.name, sample_motion(other, flame_of(capture_of(other), other.name), numbers, self._warn)
 
     def _tracked(self, head: Any, step: float) -> tuple[FlameSequence, list[float]]:
         """What the head was imported from, and where its timesteps come to lie."""

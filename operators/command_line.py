@@ -14,9 +14,10 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import evaluated_vertices
-from ..stga_addon.scene.rig.motion import performed_motion, played
-from ..stga_addon.scene.vertex_groups import painted_selection
+from ..stga_addon.scene.arrays import evaluated_vertices
+from ..stga_addon.scene.rig.motion import sample_motion
+from ..stga_addon.scene.timeline import iterate_frames
+from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.worker import process
 from ..stga_addon.worker.environment import missing_here
 from . import ids
@@ -33,14 +34,11 @@ _commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from ..stga_addon.cli.parser import (  # only here: enabling the extension loads nothing that a command needs
-        main,
-        parser,
-    )
+    from ..stga_addon.cli.main import main, make_parser  # loaded when a command is given, not when Blender starts
 
     try:
         head = _open_head()
-        command = parser(head).parse_args(arguments).command
+        command = make_parser(head).parse_args(arguments).command
         if command in IN_BLENDER or not missing_here():
             return main(arguments, head)
         return _hand_over(arguments, head, played=command == "render")
@@ -61,7 +59,7 @@ def _open_head() -> "OpenHead | None":
         flame=Path(model) if model else None,
         principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
         avatar=file_path(avatar, "avatar") if avatar else None,
-        selection=lambda: painted_selection(head),
+        selection=lambda: training_selection(head),
         played=lambda capture: _played(head, capture),
     )
 
@@ -88,10 +86,10 @@ def _played(head: Any, capture: Capture) -> Capture:
     frames = range(scene.frame_start, scene.frame_end + 1)
 
     def mesh(frame: int) -> np.ndarray:
-        (vertices,) = [evaluated_vertices(head) for _ in played((frame,))]
+        (vertices,) = [evaluated_vertices(head) for _ in iterate_frames((frame,))]
         return np.asarray(vertices, np.float64)
 
-    flame = capture.flame and performed_motion(head, capture.flame, frames)
+    flame = capture.flame and sample_motion(head, capture.flame, frames)
     return replace(capture, timesteps=tuple(frames), mesh=mesh, flame=flame)
 
 

@@ -8,9 +8,11 @@ from ..stga_addon.avatar.embedding import to_world
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
 from ..stga_addon.avatar.ply import write_ply
-from ..stga_addon.scene.compat import PATH_OPTIONS, evaluated_vertices
-from ..stga_addon.scene.display.splats import check_head
-from ..stga_addon.scene.rig.motion import performed_motion, played
+from ..stga_addon.scene.arrays import evaluated_vertices
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.display.splat_object import check_head
+from ..stga_addon.scene.rig.motion import sample_motion
+from ..stga_addon.scene.timeline import iterate_frames
 from . import ids
 from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
 
@@ -62,11 +64,11 @@ class ExportAvatar(bpy.types.Operator):
         check_head(avatar, head)
         if self.format == "gaussian-avatars":
             own = flame_of(capture_of(head), head.name)
-            write_gaussian_avatars(path, avatar, performed_motion(head, own, _frames(context), self._warn))
+            write_gaussian_avatars(path, avatar, sample_motion(head, own, _frames(context), self._warn))
         elif self.format == "ply":
             write_ply(path if path.suffix else path.with_suffix(".ply"), _posed(avatar, head))
         else:
-            for frame in played(_frames(context)):
+            for frame in iterate_frames(_frames(context)):
                 write_ply(path / f"{frame:05d}.ply", _posed(avatar, head))
         self.report({"INFO"}, f"Exported {len(avatar.splats)} splats to {path}")
         return {"FINISHED"}

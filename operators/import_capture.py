@@ -10,7 +10,7 @@ from ..stga_addon.capture.open import open_capture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import configure_scene, import_cameras
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.hierarchy import capture_root, leave_edit_mode
+from ..stga_addon.scene.objects import capture_root, leave_edit_mode
 from ..stga_addon.scene.rig.head import import_head
 from . import ids
 from .common import file_path, flame_model_path, flame_property, reporting, scene_settings

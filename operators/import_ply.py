@@ -7,7 +7,7 @@ import bpy
 
 from ..stga_addon.avatar.ply import read_ply
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.display.splats import show_world_splats
+from ..stga_addon.scene.display.splat_object import show_world_splats
 from . import ids
 from .common import file_path, reporting, scene_settings
 

@@ -12,7 +12,14 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.training_job import PREVIEW, folder_of
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.splats import Prepared, build_slice, can_refresh, check_head, prepare, refresh
+from ..stga_addon.scene.display.splat_object import (
+    SplatAttributes,
+    avatar_attributes,
+    build_next_node_group,
+    can_update,
+    check_head,
+    update_splats,
+)
 from ..stga_addon.worker import process as task
 from ..stga_addon.worker.process import Snapshot, State
 from . import ids
@@ -142,17 +149,17 @@ def _show(scene: Any, path: Path) -> float | None:
     return None
 
 
-def _present(scene: Any, shown: Any, avatar: Avatar, prepared: Prepared) -> bool:
+def _present(scene: Any, shown: Any, avatar: Avatar, prepared: SplatAttributes) -> bool:
     """Show the avatar in the object that already shows this job's splats, or in a new one; whether there is more to do.
 
     A new one comes in slices, each call does one.
     """
     chosen = getattr(scene, ids.SETTINGS)
     check_head(avatar, chosen.head)
-    if shown is not None and can_refresh(shown, avatar):
-        refresh(shown, prepared)
+    if shown is not None and can_update(shown, avatar):
+        update_splats(shown, prepared)
         return False
-    if build_slice(avatar):
+    if build_next_node_group(avatar):
         return True
     if shown is not None:
         bpy.data.objects.remove(shown)
@@ -174,10 +181,10 @@ class _Reader:
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._coming: dict[Path, Future[tuple[Avatar, Prepared]]] = {}
+        self._coming: dict[Path, Future[tuple[Avatar, SplatAttributes]]] = {}
         self._stamps: dict[Path, tuple[int, int]] = {}
 
-    def poll(self, path: Path) -> tuple[Avatar, Prepared] | None:
+    def poll(self, path: Path) -> tuple[Avatar, SplatAttributes] | None:
         """What has been read and not been taken; None where there is nothing new, or not yet.
 
         Raises StgaError where the file cannot be read.
@@ -211,9 +218,9 @@ class _Reader:
 _reader = _Reader()
 
 
-def _read(path: Path) -> tuple[Avatar, Prepared]:
+def _read(path: Path) -> tuple[Avatar, SplatAttributes]:
     avatar = read_avatar(path)
-    return avatar, prepare(avatar)
+    return avatar, avatar_attributes(avatar)
 
 
 def _redraw() -> None:

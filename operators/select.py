@@ -9,8 +9,8 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import hide_heat, is_heat_shown, show_heat
-from ..stga_addon.scene.vertex_groups import painted_regions, read_selection, splats_per_face, write_selection
+from ..stga_addon.scene.display.heat_map import has_heat_map, hide_heat_map, show_heat_map
+from ..stga_addon.scene.vertex_groups import read_regions, read_selection, splats_per_face, write_selection
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.settings import TrainingSettings
 from . import ids
@@ -61,8 +61,8 @@ class Select(bpy.types.Operator):
         write_selection(head, chosen)
         head[tags.KEY_REGIONS] = "\n".join(names)
         _count(context, head)
-        if is_heat_shown(head):
-            show_heat(head, _shares(head))
+        if has_heat_map(head):
+            show_heat_map(head, _shares(head))
         moving = [faces.mean() for faces in chosen.values() if faces.any()]
         share = 100 * sum(moving) / len(moving) if moving else 0.0
         self.report(
@@ -132,10 +132,10 @@ class HeatMap(bpy.types.Operator):
             share = _shares(head)
             if not share.any():
                 raise StgaError(f"{head.name}: no frame selects a triangle yet; select moving triangles first")
-            show_heat(head, share)
+            show_heat_map(head, share)
             self.report({"INFO"}, f"The most selected triangle is selected in {share.max():.0%} of the frames")
         else:
-            hide_heat(head)
+            hide_heat_map(head)
         in_view = context.view_layer.objects
         if splats is not None and in_view.get(splats.name) is splats and in_view.get(head.name) is head:
             # One of the two at a time: each covers the other.
@@ -164,7 +164,7 @@ def key_regions(head: Any) -> list[str]:
 
 def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
     """The capture with those of the regions that are vertex groups; what was painted wins over a region of its name."""
-    painted = painted_regions(head, [name for name in names if name in head.vertex_groups])
+    painted = read_regions(head, [name for name in names if name in head.vertex_groups])
     for name in names:
         if name not in painted and name not in capture.regions:
             raise StgaError(f"{head.name}: has no region and no vertex group '{name}'")

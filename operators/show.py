@@ -6,8 +6,8 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.display.materials import TRANSPARENT_BOUNCES, view_transform_hint
-from ..stga_addon.scene.display.splats import Prepared, hide, show_avatar
+from ..stga_addon.scene.display.hints import TRANSPARENT_BOUNCES, view_transform_hint
+from ..stga_addon.scene.display.splat_object import SplatAttributes, hide_object, show_avatar
 from . import ids
 from .common import file_path, head_of, needs_head, reporting, scene_settings
 
@@ -53,7 +53,7 @@ class ShowAvatar(bpy.types.Operator):
 
 
 def show(
-    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, prepared: Prepared | None = None
+    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, prepared: SplatAttributes | None = None
 ) -> Any:
     """Show the avatar on the head; the splat object becomes the one that the scene's panel works on.
 
@@ -61,7 +61,7 @@ def show(
     """
     shown = show_avatar(avatar, head, name, prepared)
     if hide_head:
-        hide(head, scene)
+        hide_object(head, scene)
     getattr(scene, ids.SETTINGS).splats = shown
     return shown
 

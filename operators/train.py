@@ -11,7 +11,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.training_job import TrainingJob, arguments, folder_of, work, write_job
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.vertex_groups import painted_selection
+from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effect_plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker import process as task
@@ -100,7 +100,7 @@ class Train(bpy.types.Operator):
         waits = self.wait or bpy.app.background
         here = waits and not self.python and not missing_here()
         python = "" if here else training_python(context, self.python)
-        write_job(run, self._job(head), painted_selection(head))
+        write_job(run, self._job(head), training_selection(head))
         if here:
             monitor.set_job(context.scene, run)
             avatar = _work_here(context, run)

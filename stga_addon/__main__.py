@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 try:
-    from .cli.parser import main
+    from .cli.main import main
     from .errors import StgaError
     from .jobs.delegate import FOLDER, read_head
 except ModuleNotFoundError as error:

@@ -10,7 +10,7 @@ from PIL import Image
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.parser import main
+from stga_addon.cli.main import main
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.raster.images import to_bytes
 from stga_addon.raster.render import render_avatar

@@ -7,7 +7,7 @@ import bpy.utils.previews
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.curve import SIZE, curve_picture
+from ..stga_addon.report.curve_image import SIZE, curve_image
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 
 SCALE = 8.0
@@ -42,7 +42,7 @@ def _update(run: Path) -> str | None:
 
 def _paint(run: Path) -> str | None:
     try:
-        drawn = curve_picture(read_metrics(run))
+        drawn = curve_image(read_metrics(run))
     except (StgaError, KeyError, TypeError, ValueError):
         return None  # a damaged file is training's to report
     if drawn is None:

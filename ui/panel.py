@@ -9,9 +9,9 @@ from ..operators.common import is_head, register_classes, scene_settings, unregi
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
-from ..stga_addon.scene.display import nodes
-from ..stga_addon.scene.display.materials import few_bounces_hint, view_transform_hint
-from ..stga_addon.scene.display.splats import input_identifier, splat_modifier
+from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
+from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
 from .render_panel import RenderPanel
@@ -20,13 +20,13 @@ from .sidebar import SidebarPanel
 from .train_panel import TrainPanel
 
 DISPLAY_INPUTS = (
-    nodes.DISPLAY,
-    nodes.SIZE,
-    nodes.OPACITY_THRESHOLD,
-    nodes.PERCENTAGE,
-    nodes.VIEW_DEPENDENT,
-    nodes.SHOW_SELECTION,
-    nodes.SELECTED_ONLY,
+    splat_nodes.DISPLAY,
+    splat_nodes.SIZE,
+    splat_nodes.OPACITY_THRESHOLD,
+    splat_nodes.PERCENTAGE,
+    splat_nodes.VIEW_DEPENDENT,
+    splat_nodes.SHOW_SELECTION,
+    splat_nodes.SELECTED_ONLY,
 )
 
 
@@ -79,7 +79,7 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         if view_transform_hint(context.scene):
             layout.label(text="View transform changes the colours", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)
-        hint = few_bounces_hint(context.scene)
+        hint = transparent_bounces_hint(context.scene)
         if hint:
             layout.label(text=hint, icon="ERROR")
             layout.operator(ids.MORE_BOUNCES)

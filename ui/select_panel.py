@@ -8,7 +8,7 @@ from ..operators import ids
 from ..operators.common import is_head, scene_settings
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import is_heat_shown
+from ..stga_addon.scene.display.heat_map import has_heat_map
 from .sidebar import SidebarPanel
 
 
@@ -43,7 +43,7 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
         if any(tags.group_timestep(group.name) is not None for group in chosen.head.vertex_groups):
             row = layout.row(align=True)
             row.operator(ids.COUNT_SELECTED, text="Count Again", icon="FILE_REFRESH")
-            shown = is_heat_shown(chosen.head)
+            shown = has_heat_map(chosen.head)
             text = "Hide Heat Map" if shown else "Heat Map"
             row.operator(ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown).show = not shown
         else:

@@ -12,7 +12,8 @@ from ..capture.camera import Camera
 from ..capture.model import Capture, View
 from ..errors import StgaError
 from . import compat, tags
-from .hierarchy import Warn, log_warning, place, remove
+from .animation import write_curve
+from .objects import Warn, log_warning, place, remove
 
 SENSOR_WIDTH = 36.0  # millimetres; with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # metres
@@ -112,12 +113,12 @@ def _set_pose(camera: Any, views: list[View]) -> None:
     curves = compat.action_curves(camera)
     frames = np.array([view.timestep for view in views])
     for axis in range(3):
-        compat.write_curve(curves, "location", axis, frames, poses[:, axis, 3])
+        write_curve(curves, "location", axis, frames, poses[:, axis, 3])
     quaternions = [Matrix(pose[:3, :3].tolist()).to_quaternion() for pose in poses]
     for last, quaternion in pairwise(quaternions):
         quaternion.make_compatible(last)
     for element, values in enumerate(np.array(quaternions).T):
-        compat.write_curve(curves, "rotation_quaternion", element, frames, values)
+        write_curve(curves, "rotation_quaternion", element, frames, values)
 
 
 def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
@@ -136,7 +137,7 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
         # Shown from its own frame until the next image's; the first also before, the last also after.
         near = np.arange(max(row - 1, 0), min(row + 2, len(found)))
         path = f"background_images[{row}].show_background_image"
-        compat.write_curve(curves, path, 0, frames[near], (near == row).astype(float), "CONSTANT")
+        write_curve(curves, path, 0, frames[near], (near == row).astype(float), "CONSTANT")
     data.show_background_images = True
 
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from ..errors import StgaError
 from . import tags
-from .display.node_colors import FACE
+from .arrays import mesh_triangles
+from .display.color_nodes import FACE
 
 
 def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -30,7 +31,7 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
     """
     if head.mode == "EDIT":
         raise StgaError(f"{head.name}: is in edit mode, leave it before the selection is written")
-    faces = _faces(head.data)
+    faces = mesh_triangles(head.data)
     for timestep, selected in selection.items():
         if selected.shape != (len(faces),):
             raise StgaError(
@@ -57,7 +58,7 @@ def read_selection(head: Any) -> dict[int, np.ndarray]:
     timesteps = {group.index: tags.group_timestep(group.name) for group in head.vertex_groups}
     columns = {index: timestep for index, timestep in timesteps.items() if timestep is not None}
     painted = _painted(mesh, len(head.vertex_groups), list(columns))
-    faces = _faces(mesh)
+    faces = mesh_triangles(mesh)
     known = {int(timestep) for timestep in head.get(tags.TIMESTEPS, ())} | set(columns.values())
     selection = {timestep: np.zeros(len(faces), bool) for timestep in sorted(known)}
     for row, timestep in zip(painted, columns.values(), strict=True):
@@ -65,18 +66,18 @@ def read_selection(head: Any) -> dict[int, np.ndarray]:
     return selection
 
 
-def painted_selection(head: Any) -> dict[int, np.ndarray] | None:
+def training_selection(head: Any) -> dict[int, np.ndarray] | None:
     """`read_selection` for training; None where the head has no selection group, so that the trainer selects itself."""
     if any(tags.group_timestep(group.name) is not None for group in head.vertex_groups):
         return read_selection(head)
     return None
 
 
-def painted_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
+def read_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
     """name -> (F,) bool of vertex groups of the head: the triangles whose corners all have a weight of 0.5 or more."""
     head.update_from_editmode()
     painted = _painted(head.data, len(head.vertex_groups), [head.vertex_groups[name].index for name in names])
-    faces = _faces(head.data)
+    faces = mesh_triangles(head.data)
     return {name: row[faces].all(1) for name, row in zip(names, painted, strict=True)}
 
 
@@ -97,7 +98,7 @@ def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
     if group is None:
         return None
     (painted,) = _painted(head.data, len(head.vertex_groups), [group.index])
-    return np.asarray(painted[_faces(head.data)].all(1))
+    return np.asarray(painted[mesh_triangles(head.data)].all(1))
 
 
 def _painted(mesh: Any, groups: int, wanted: list[int]) -> np.ndarray:
@@ -117,9 +118,3 @@ def _painted(mesh: Any, groups: int, wanted: list[int]) -> np.ndarray:
     painted = np.zeros((len(wanted), len(members)), bool)
     painted[rows[taken], vertices[taken]] = True
     return painted
-
-
-def _faces(mesh: Any) -> np.ndarray:
-    corners = np.empty(len(mesh.loops), np.int32)
-    mesh.loops.foreach_get("vertex_index", corners)
-    return corners.reshape(-1, 3)

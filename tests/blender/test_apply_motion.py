@@ -17,8 +17,8 @@ from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.sequence import read_motion  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
 from stga_addon.training.optimize.tracking import Tracking, refined, write_tracking  # noqa: E402
 

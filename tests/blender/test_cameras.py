@@ -17,7 +17,7 @@ from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.cameras import configure_scene, import_cameras  # noqa: E402
-from stga_addon.scene.hierarchy import capture_root  # noqa: E402
+from stga_addon.scene.objects import capture_root  # noqa: E402
 
 from .captures import mesh_capture  # noqa: E402
 

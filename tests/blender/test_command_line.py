@@ -15,7 +15,7 @@ from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E4
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 
 

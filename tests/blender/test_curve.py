@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from stga_addon.scene.curve import COMING, LINE, MARGIN, SIZE, curve_picture
+from stga_addon.report.curve_image import COMING, LINE, MARGIN, SIZE, curve_image
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
@@ -24,7 +24,7 @@ def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
 
 def test_the_curve_is_where_the_axes_say():
     """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not after the curve."""
-    pixels, axes = curve_picture(lines())
+    pixels, axes = curve_image(lines())
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
     inner = SIZE - 2 * MARGIN
     for second, color in [(second, LINE) for second in (15, 30, 50, 75)] + [(90, COMING)]:
@@ -38,10 +38,10 @@ def test_the_curve_is_where_the_axes_say():
 
 def test_too_little_is_no_curve():
     """Catches a division by nothing before the first evaluations, and a flat curve without a height."""
-    assert curve_picture([]) is None
-    assert curve_picture(lines(1, forecast=False)) is None
+    assert curve_image([]) is None
+    assert curve_image(lines(1, forecast=False)) is None
     flat = [{"iteration": row, "seconds": 1.0 + row, "psnr": 30.0} for row in range(3)]
-    pixels, axes = curve_picture(flat)
+    pixels, axes = curve_image(flat)
     assert np.isfinite(pixels).all()
     assert axes == "30 to 30.1 dB, 0 to 3 s"
 
@@ -60,7 +60,7 @@ def test_it_is_painted_anew_after_every_evaluation(extension, tmp_path):
     assert seen[0] is None
     assert seen[1] is not None
     painted = np.array(curve._pictures[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
-    np.testing.assert_allclose(painted, curve_picture(lines())[0], atol=1 / 255)
+    np.testing.assert_allclose(painted, curve_image(lines())[0], atol=1 / 255)
     file.write_text('{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n')
     assert curve._update(tmp_path) is None
     assert len(bpy.data.images) == 0

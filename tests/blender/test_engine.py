@@ -17,13 +17,13 @@ from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.raster.cpu.project import _basis  # noqa: E402
 from stga_addon.raster.render import render_avatar, render_splats  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display import nodes  # noqa: E402
-from stga_addon.scene.display.splats import set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
 from stga_addon.scene.render import engine  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
-from .test_splats import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
+from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
 
 WIDTH, HEIGHT = 96, 64
 SAME = 1 / 255
@@ -307,18 +307,18 @@ def test_display_settings_count(tmp_path):
     frozen = ~np.isin(avatar.faces, vertices).all(1)[avatar.splats.face]
     larger = replace(avatar.splats, log_scale=avatar.splats.log_scale + np.float32(np.log(2)))
     cases = {
-        nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
-        nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
-        nodes.VIEW_DEPENDENT: (False, True, replace(avatar.splats, sh=avatar.splats.sh[:, :1])),
-        nodes.SIZE: (2.0, 1.0, larger),
-        nodes.PERCENTAGE: (0.0, 100.0, avatar.splats.rows(np.zeros(3000, bool))),
+        splat_nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
+        splat_nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
+        splat_nodes.VIEW_DEPENDENT: (False, True, replace(avatar.splats, sh=avatar.splats.sh[:, :1])),
+        splat_nodes.SIZE: (2.0, 1.0, larger),
+        splat_nodes.PERCENTAGE: (0.0, 100.0, avatar.splats.rows(np.zeros(3000, bool))),
     }
     for name, (value, default, splats) in cases.items():
         set_input(shown, name, value)
         expected = render_avatar(replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3)
         assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME, name
         set_input(shown, name, default)
-    set_input(shown, nodes.SHOW_SELECTION, True)
+    set_input(shown, splat_nodes.SHOW_SELECTION, True)
     grey = displayed(render(tmp_path), 0.0)
     assert (
         np.ptp(grey, axis=0).mean()
@@ -386,7 +386,7 @@ def test_a_head_that_was_changed_is_one_sentence():
     head.modifiers.new("finer", "SUBSURF")
     with pytest.raises(RuntimeError, match="head: has other triangles than head splats"):
         bpy.ops.render.render()
-    set_input(shown, nodes.HEAD, None)
+    set_input(shown, splat_nodes.HEAD, None)
     with pytest.raises(RuntimeError, match="has no head to follow"):
         bpy.ops.render.render()
 

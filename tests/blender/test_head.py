@@ -10,7 +10,7 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402

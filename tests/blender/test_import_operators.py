@@ -20,8 +20,8 @@ from capture.factory import (  # noqa: E402
 from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 

@@ -13,10 +13,11 @@ from stga_addon.flame.forward import flame_forward  # noqa: E402
 from stga_addon.flame.motion import PARTS, retimed  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh  # noqa: E402
 from stga_addon.scene import compat  # noqa: E402
-from stga_addon.scene.compat import SLOTTED_ACTIONS, evaluated_vertices  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.compat import SLOTTED_ACTIONS  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
-from stga_addon.scene.rig.motion import apply_motion, performed_motion  # noqa: E402
+from stga_addon.scene.rig.motion import apply_motion, sample_motion  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 
@@ -176,7 +177,7 @@ def test_a_performance_is_read_back(head, own):
     """Fails when a joint is read in another's space, or a translation without the joint's own movement."""
     said = []
     bpy.context.scene.frame_set(3)
-    read = performed_motion(head, own, range(1, 7), warn=said.append)
+    read = sample_motion(head, own, range(1, 7), warn=said.append)
     assert_same_motion(read, [own.frame(timestep) for timestep in own.timesteps])
     np.testing.assert_allclose(read.shape, own.shape)
     assert said == []
@@ -194,7 +195,7 @@ def test_a_performance_by_hand_is_read_back(head, own):
     rig.pose.bones["jaw"].constraints.new("COPY_ROTATION").target = turned
     keys["identity_002"].value, keys["expr_001"].value = 1.5, -2.0
     said = []
-    read = performed_motion(head, own, (1,), warn=said.append)
+    read = sample_motion(head, own, (1,), warn=said.append)
     assert read.shape[2] == pytest.approx(own.shape[2] + 1.5)
     # The constraint bypasses the bone's own rotation, which the correctives are driven by; all else is FLAME's.
     flat = replace(own.model, posedirs=np.zeros_like(own.model.posedirs))
@@ -211,7 +212,7 @@ def test_what_flame_cannot_say_is_told(head, own):
     key.data[5].co.x += 0.01
     key.value = 1.0
     said = []
-    performed_motion(head, own, (2,), warn=said.append)
+    sample_motion(head, own, (2,), warn=said.append)
     assert len(said) == 1
     assert re.search(r"by up to \d+\.\d mm", said[0])
 
@@ -221,7 +222,7 @@ def test_offsets_are_read_back(own, tmp_path):
     tracked = flame_sequence(own.model, timesteps=range(1, 5), seed=1, dynamic=True)
     head = import_head(motion_capture(tracked, tmp_path / "own.npz"), warn=lambda sentence: None)
     said = []
-    read = performed_motion(head, tracked, range(1, 5), warn=said.append)
+    read = sample_motion(head, tracked, range(1, 5), warn=said.append)
     for index, timestep in enumerate(tracked.timesteps):
         np.testing.assert_allclose(sequence_mesh(read, index), sequence_mesh(tracked, timestep), atol=1e-5)
     assert said == []

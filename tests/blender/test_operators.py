@@ -17,9 +17,9 @@ from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display import nodes  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats, set_input  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
 from stga_addon.scene.vertex_groups import closure, read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 
@@ -243,16 +243,16 @@ def test_more_bounces_where_cycles_needs_them(extension):
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.transparent_max_bounces = 8
-    assert "8 layers" in materials.few_bounces_hint(scene)
+    assert "8 layers" in materials.transparent_bounces_hint(scene)
     bpy.ops.stga.more_bounces()
     assert scene.cycles.transparent_max_bounces == 64
-    assert materials.few_bounces_hint(scene) is None
+    assert materials.transparent_bounces_hint(scene) is None
     scene.cycles.transparent_max_bounces = 200
     bpy.ops.stga.more_bounces()
     assert scene.cycles.transparent_max_bounces == 200
     scene.cycles.transparent_max_bounces = 8
     scene.render.engine = "BLENDER_WORKBENCH"
-    assert materials.few_bounces_hint(scene) is None
+    assert materials.transparent_bounces_hint(scene) is None
 
 
 def test_standard_view(extension):
@@ -283,7 +283,7 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
-    set_input(scene.stga.splats, nodes.SHOW_SELECTION, True)
+    set_input(scene.stga.splats, splat_nodes.SHOW_SELECTION, True)
     scene.frame_set(3)
     points = next(
         item.object.data
@@ -292,5 +292,5 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     )
     color = np.empty(4 * len(points.points), np.float32)
     points.attributes["stga_display_color"].data.foreach_get("color", color)
-    frozen = np.isclose(color.reshape(-1, 4), nodes.FROZEN_GREY).all(1)
+    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_GREY).all(1)
     np.testing.assert_array_equal(~frozen, read_selection(scene.stga.head)[3][avatar.splats.face])

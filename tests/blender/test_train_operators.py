@@ -15,7 +15,7 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.files import read_npz, write_json  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
 

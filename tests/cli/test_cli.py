@@ -17,10 +17,10 @@ from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.ply import read_ply
 from stga_addon.capture.open import open_capture
-from stga_addon.cli import commands
-from stga_addon.cli.parser import STRATEGIES, colour, duration, main, parser
+from stga_addon.cli import info
+from stga_addon.cli.arguments import color, duration
+from stga_addon.cli.main import main, make_parser
 from stga_addon.errors import StgaError
-from stga_addon.training import settings as training_settings
 from stga_addon.training.run.folder import read_checkpoint, read_run
 
 TIMESTEPS, CAMERAS = (0, 1, 3), range(3)
@@ -241,7 +241,7 @@ def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.C
 WITHOUT_TORCH = """
 import sys
 sys.modules.update(dict.fromkeys(("torch", "numba", "warp")))  # importing one of them fails
-from stga_addon.cli.parser import main
+from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -441,30 +441,28 @@ def test_durations_that_are_none(text: str) -> None:
         duration(text)
 
 
-def test_colours() -> None:
+def test_colors() -> None:
     """Catches channels in another order or range."""
-    assert colour("white") == (1, 1, 1)
-    assert colour("black") == (0, 0, 0)
-    assert colour("0.25,1,0") == (0.25, 1, 0)
-    assert colour("0, .5 ,1.0") == (0, 0.5, 1)
+    assert color("white") == (1, 1, 1)
+    assert color("black") == (0, 0, 0)
+    assert color("0.25,1,0") == (0.25, 1, 0)
+    assert color("0, .5 ,1.0") == (0, 0.5, 1)
 
 
 @pytest.mark.parametrize(
     "text", ["", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "-1,0,0", "nan,0,0", "0,0,inf", "a,b,c"]
 )
-def test_colours_that_are_none(text: str) -> None:
+def test_colors_that_are_none(text: str) -> None:
     """Catches 0…255 taken for 0…1, and values that would wrap around in the image."""
     with pytest.raises(argparse.ArgumentTypeError, match="is not white, black or R,G,B"):
-        colour(text)
+        color(text)
 
 
 def test_every_command_is_there() -> None:
-    """Catches a command that the parser knows and nothing does, and strategies that the trainer does not know."""
-    choices = next(a for a in parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
-    expected = {"train", "plan", "benchmark", "render", "eval", "select", "export", "info", "demo", "job"}
+    """Catches a command that the parser lost."""
+    choices = next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    expected = {"train", "presets", "benchmark", "render", "eval", "select", "export", "info", "demo", "job"}
     assert set(choices) == expected
-    assert all(callable(getattr(commands, name)) for name in choices)
-    assert training_settings.STRATEGIES == STRATEGIES
 
 
 def test_interruption_and_mistakes_have_their_codes(
@@ -473,10 +471,10 @@ def test_interruption_and_mistakes_have_their_codes(
     """Catches a traceback after Ctrl-C, and a bug of ours dressed up as the person's mistake."""
 
     def fails_with(error: BaseException) -> None:
-        def info(options: argparse.Namespace) -> None:
+        def run(options: argparse.Namespace) -> None:
             raise error
 
-        monkeypatch.setattr(commands, "info", info)
+        monkeypatch.setattr(info, "run", run)
 
     fails_with(KeyboardInterrupt())
     assert main(["info", str(root)]) == 130

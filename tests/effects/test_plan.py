@@ -6,7 +6,7 @@ import pytest
 from capture import factory
 
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.parser import main
+from stga_addon.cli.main import main
 from stga_addon.effects import decide as planning
 from stga_addon.effects.decide import decide
 from stga_addon.errors import StgaError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from capture.factory import write_mesh_capture
 
-from stga_addon.cli.parser import main
+from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
 from stga_addon.jobs import training_job

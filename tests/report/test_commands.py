@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from capture import factory
 
-from stga_addon.cli.parser import main
+from stga_addon.cli.main import main
 from stga_addon.report import preset_timing
 from stga_addon.training.run.folder import read_run
 
@@ -16,9 +16,9 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_: 0.001)
 
 
-def test_plan(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches presets that are not told, or without their time, or without what was timed."""
-    assert main(["plan", str(toy_root), "--device", "cpu"]) == 0
+    assert main(["presets", str(toy_root), "--device", "cpu"]) == 0
     device, *lines = capsys.readouterr().out.splitlines()
     assert device == "training on the CPU, as asked for"
     assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
@@ -32,7 +32,7 @@ def test_what_is_timed_is_what_will_train(
     timed: list[str] = []
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
     device = ["--device", "warp-cpu"]
-    assert main(["plan", str(toy_root), *device]) == 0
+    assert main(["presets", str(toy_root), *device]) == 0
     assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
     made = []
     monkeypatch.setattr("stga_addon.training.run.loop.train", lambda *call: made.append(call[-1]) or tmp_path)

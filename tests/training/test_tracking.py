@@ -13,7 +13,7 @@ from PIL import Image
 from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
 from stga_addon.capture.images import read_image, read_view
 from stga_addon.capture.model import Capture
-from stga_addon.cli.parser import main
+from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.sequence import read_motion, sequence_mesh

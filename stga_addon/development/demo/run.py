@@ -60,9 +60,9 @@ def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
 
 def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
     """A Blender scene with head, cameras and one vertex group a frame; the selection as Blender gives it back."""
+    from ...scene.blend_file import current_scene, new_file
     from ...scene.cameras import configure_scene, import_cameras
-    from ...scene.file import current_scene, new_file
-    from ...scene.hierarchy import capture_root
+    from ...scene.objects import capture_root
     from ...scene.rig.head import import_head
     from ...scene.vertex_groups import read_selection, write_selection
 
@@ -91,11 +91,12 @@ def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save, reopen, and return how far (metres) a splat is from where numpy puts it, at worst."""
-    from ...scene.display.splats import evaluated_splats, hide, show_avatar
-    from ...scene.file import current_scene, go_to_frame, look_through_camera, object_named, open_file, save_file
+    from ...scene.blend_file import current_scene, look_through_camera, object_named, open_file, save_file
+    from ...scene.display.splat_object import evaluated_splats, hide_object, show_avatar
+    from ...scene.timeline import go_to_frame
 
     shown = show_avatar(avatar, head)
-    hide(head, current_scene())
+    hide_object(head, current_scene())
     name = shown.name
     go_to_frame(capture.timesteps[0])
     look_through_camera()

@@ -20,12 +20,12 @@ COLOURS = (
 )
 
 
-def show_heat(head: Any, share: np.ndarray) -> None:
+def show_heat_map(head: Any, share: np.ndarray) -> None:
     """Colour the head's triangles by share (F,), leaving its own materials alone: a modifier puts the colours on.
 
     They are the active colour attribute, for solid mode, and a material, for EEVEE and Cycles.
     """
-    hide_heat(head)
+    hide_heat_map(head)
     mesh = head.data
     _attribute(mesh, SHARE, "FLOAT", "FACE", "value", share)
     scaled = share / max(share.max(initial=0.0), 1e-9)
@@ -36,8 +36,8 @@ def show_heat(head: Any, share: np.ndarray) -> None:
     head.modifiers.new(MODIFIER, "NODES").node_group = _tree()
 
 
-def hide_heat(head: Any) -> None:
-    """Show the head as it was before `show_heat`."""
+def hide_heat_map(head: Any) -> None:
+    """Show the head as it was before `show_heat_map`."""
     for modifier in [old for old in head.modifiers if old.name.startswith(MODIFIER)]:
         head.modifiers.remove(modifier)
     for name in (SHARE, HEAT):
@@ -45,7 +45,7 @@ def hide_heat(head: Any) -> None:
             head.data.attributes.remove(head.data.attributes[name])
 
 
-def is_heat_shown(head: Any) -> bool:
+def has_heat_map(head: Any) -> bool:
     return MODIFIER in head.modifiers
 
 

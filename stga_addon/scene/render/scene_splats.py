@@ -13,11 +13,12 @@ from ...avatar.splats import SH_C0, Splats
 from ...errors import StgaError
 from ...raster.posed_splats import PosedSplats
 from .. import tags
-from ..display import nodes
+from ..arrays import mesh_triangles, mesh_vertices, read_values
+from ..display import splat_nodes
+from ..display.color_nodes import FACE, SH, STRAIN_COLOR
 from ..display.colors import linear_to_srgb
 from ..display.materials import OPACITY
-from ..display.node_colors import FACE, SH, STRAIN_COLOR
-from ..display.splats import get_input
+from ..display.splat_object import get_input
 from ..vertex_groups import frame_selection
 
 
@@ -88,7 +89,7 @@ def _layer(shown: Any, place: Matrix, depsgraph: Any, stock: SplatCache) -> Pose
     to_world = np.array(place, np.float64)
     if isinstance(source, Splats):
         return PosedSplats(_as_displayed(shown, source, None, depsgraph), WORLD, to_world)
-    head = get_input(shown, nodes.HEAD)
+    head = get_input(shown, splat_nodes.HEAD)
     if head is None:
         raise StgaError(f"{shown.name}: has no head to follow; choose one in its modifier")
     frames = source.frames(_head_vertices(shown, head, len(source.faces), depsgraph))
@@ -101,7 +102,7 @@ def _head_vertices(shown: Any, head: Any, faces: int, depsgraph: Any) -> np.ndar
     if posed.type != "MESH" or len(posed.data.loops) != 3 * faces:
         raise StgaError(f"{head.name}: has other triangles than {shown.name}, which follows it; look at its modifiers")
     between = np.array(shown.evaluated_get(depsgraph).matrix_world.inverted_safe() @ posed.matrix_world, np.float64)
-    return vertices_of(posed.data) @ between[:3, :3].T + between[:3, 3]
+    return mesh_vertices(posed.data) @ between[:3, :3].T + between[:3, 3]
 
 
 def _as_displayed(shown: Any, splats: Splats, head: Any, depsgraph: Any) -> Splats:
@@ -111,17 +112,17 @@ def _as_displayed(shown: Any, splats: Splats, head: Any, depsgraph: Any) -> Spla
     def setting(name: str) -> Any:
         return get_input(posed, name)
 
-    kept = 1 / (1 + np.exp(-splats.opacity)) >= setting(nodes.OPACITY_THRESHOLD)
-    kept &= np.random.default_rng(0).random(len(splats)) * 100 < setting(nodes.PERCENTAGE)
-    greyed, only = setting(nodes.SHOW_SELECTION), setting(nodes.SELECTED_ONLY)
+    kept = 1 / (1 + np.exp(-splats.opacity)) >= setting(splat_nodes.OPACITY_THRESHOLD)
+    kept &= np.random.default_rng(0).random(len(splats)) * 100 < setting(splat_nodes.PERCENTAGE)
+    greyed, only = setting(splat_nodes.SHOW_SELECTION), setting(splat_nodes.SELECTED_ONLY)
     selected = frame_selection(head, depsgraph.scene.frame_current) if greyed or only else None
     if selected is not None:
         frozen = ~selected[splats.face]
         splats = _greyed(splats, frozen) if greyed else splats
         kept &= ~(frozen & only)
-    if splats.sh_degree > 0 and not setting(nodes.VIEW_DEPENDENT):
+    if splats.sh_degree > 0 and not setting(splat_nodes.VIEW_DEPENDENT):
         splats = replace(splats, sh=splats.sh[:, :1])
-    size = setting(nodes.SIZE)
+    size = setting(splat_nodes.SIZE)
     if size != 1:
         kept &= size > 0
         splats = replace(splats, log_scale=splats.log_scale + np.float32(np.log(max(size, 1e-6))))
@@ -131,20 +132,20 @@ def _as_displayed(shown: Any, splats: Splats, head: Any, depsgraph: Any) -> Spla
 def _greyed(splats: Splats, frozen: np.ndarray) -> Splats:
     sh, strain_color = splats.sh.copy(), splats.strain_color.copy()
     sh[frozen] = strain_color[frozen] = 0
-    sh[frozen, 0] = (linear_to_srgb(np.array(nodes.FROZEN_GREY[:3])) - 0.5) / SH_C0
+    sh[frozen, 0] = (linear_to_srgb(np.array(splat_nodes.FROZEN_GREY[:3])) - 0.5) / SH_C0
     return replace(splats, sh=sh, strain_color=strain_color)
 
 
 def stored_avatar(shown: Any) -> Avatar:
     """The avatar that `show_avatar` made a splat object of, with rotations of length one and without regions."""
-    neutral = get_input(shown, nodes.NEUTRAL)
+    neutral = get_input(shown, splat_nodes.NEUTRAL)
     if neutral is None:
         raise StgaError(f"{shown.name}: its neutral mesh is missing; show the avatar again")
     return Avatar(
         splats=stored_splats(shown.data),
         convention=shown[tags.CONVENTION],
-        neutral=vertices_of(neutral.data),
-        faces=_values(neutral.data.loops, "vertex_index", 1, np.int32).reshape(-1, 3),
+        neutral=mesh_vertices(neutral.data),
+        faces=mesh_triangles(neutral.data),
         antialiased=bool(shown[tags.ANTIALIASED]),
     )
 
@@ -157,31 +158,22 @@ def stored_splats(mesh: Any) -> Splats:
     def coefficients(name: str) -> np.ndarray:
         found: list[np.ndarray] = []
         while name.format(len(found)) in attributes:
-            found.append(_values(attributes[name.format(len(found))].data, "vector", 3))
+            found.append(read_values(attributes[name.format(len(found))].data, "vector", 3))
         return np.stack(found, 1) if found else np.zeros((count, 0, 3), np.float32)
 
-    opacity = _values(attributes[OPACITY].data, "value", 1)[:, 0].astype(np.float64)
-    scale = _values(attributes[nodes.SCALE].data, "vector", 3).astype(np.float64)
+    opacity = read_values(attributes[OPACITY].data, "value", 1)[:, 0].astype(np.float64)
+    scale = read_values(attributes[splat_nodes.SCALE].data, "vector", 3).astype(np.float64)
     embedded = FACE in attributes
     with np.errstate(divide="ignore"):  # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels know
         return Splats(
-            xyz=_values(attributes[nodes.XYZ].data, "vector", 3),
-            rotation=_values(attributes[nodes.ROTATION].data, "value", 4),
+            xyz=read_values(attributes[splat_nodes.XYZ].data, "vector", 3),
+            rotation=read_values(attributes[splat_nodes.ROTATION].data, "value", 4),
             log_scale=np.log(scale).astype(np.float32),
             opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
             sh=coefficients(SH),
-            face=_values(attributes[FACE].data, "value", 1, np.int32)[:, 0] if embedded else np.zeros(count, np.int32),
+            face=read_values(attributes[FACE].data, "value", 1, np.int32)[:, 0]
+            if embedded
+            else np.zeros(count, np.int32),
             unbound=np.zeros(count, bool),
             strain_color=coefficients(STRAIN_COLOR),
         )
-
-
-def vertices_of(mesh: Any) -> np.ndarray:
-    """(V, 3) float32 positions of a mesh's vertices."""
-    return _values(mesh.vertices, "co", 3)
-
-
-def _values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:
-    values = np.empty(len(items) * width, dtype)
-    items.foreach_get(field, values)
-    return values.reshape(-1, width)

@@ -24,7 +24,8 @@ from ...flame.motion import PARTS
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import TURN, FlameSequence, turns
 from .. import compat, tags
-from ..hierarchy import Warn, leave_edit_mode, log_warning, place, remove
+from ..animation import add_driver, write_curve, write_triangle_curves
+from ..objects import Warn, leave_edit_mode, log_warning, place, remove
 
 IDENTITY_SLIDERS = 10
 PART_JOINTS = {"jaw": ("jaw",), "eyes": ("left_eye", "right_eye"), "neck": ("neck",), "head": ("root",)}
@@ -77,7 +78,7 @@ def add_rig(
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
         _add_offset_keys(head, rig, sequence, frames, basis, warn)
-        play_offsets(head, rig, sequence, frames, sequence.timesteps)
+        key_tracked_offsets(head, rig, sequence, frames, sequence.timesteps)
     for joint in np.flatnonzero(moving).tolist():
         _drive_joint(head, rig, joint, list(sliders), directions[joint])
     return rig
@@ -124,11 +125,11 @@ def key_motion(
     for bone in bones:
         quaternions = continuous(from_axis_angle(poses[:, JOINTS.index(bone)]))
         for element in range(4):
-            compat.write_curve(curves, _rotation_path(bone), element, at, quaternions[:, element])
+            write_curve(curves, _rotation_path(bone), element, at, quaternions[:, element])
     if "head" in parts:
         translations = np.stack([frame.translation for frame in frames])
         for axis in range(3):
-            compat.write_curve(curves, ROOT_LOCATION, axis, at, translations[:, axis])
+            write_curve(curves, ROOT_LOCATION, axis, at, translations[:, axis])
 
 
 def is_of_parts(data_path: str, parts: Sequence[str]) -> bool:
@@ -146,7 +147,7 @@ def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:
     return ([rig] if bones else []) + ([head.data.shape_keys] if "expression" in parts else [])
 
 
-def play_offsets(
+def key_tracked_offsets(
     head: Any, rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], numbers: Sequence[float]
 ) -> None:
     """Keyframe the per-frame offsets of mesh and joints as they were tracked.
@@ -154,7 +155,7 @@ def play_offsets(
     sequence: the one that the head was imported from, with its frames; numbers: the Blender frame of each, ascending.
     """
     names = [f"{OFFSET_KEY}{timestep:05d}" for timestep in sequence.timesteps]
-    compat.write_hat_curves(head.data.shape_keys, names, numbers)
+    write_triangle_curves(head.data.shape_keys, names, numbers)
     moved = np.zeros((len(frames), len(JOINTS), 3))
     for row, frame in enumerate(frames):
         if frame.dynamic_offset is not None:
@@ -162,17 +163,17 @@ def play_offsets(
     curves, at = compat.action_curves(rig), np.asarray(numbers)
     for joint, name in enumerate(JOINTS):
         for axis in range(3):
-            compat.write_curve(curves, f'["{_offset_property(name)}"]', axis, at, moved[:, joint, axis])
+            write_curve(curves, f'["{_offset_property(name)}"]', axis, at, moved[:, joint, axis])
 
 
-def still_offsets(head: Any, rig: Any, frame: int) -> None:
+def key_zero_offsets(head: Any, rig: Any, frame: int) -> None:
     """Keyframe the tracked per-frame offsets of mesh and joints, where there are any, to stay zero."""
     at, nothing = np.array([frame]), np.zeros(1)
     for key in offset_keys(head):
-        compat.write_curve(compat.action_curves(head.data.shape_keys), _value_path(key.name), 0, at, nothing)
+        write_curve(compat.action_curves(head.data.shape_keys), _value_path(key.name), 0, at, nothing)
     for bone in JOINTS:
         for axis in range(3) if _offset_property(bone) in rig else ():
-            compat.write_curve(compat.action_curves(rig), f'["{_offset_property(bone)}"]', axis, at, nothing)
+            write_curve(compat.action_curves(rig), f'["{_offset_property(bone)}"]', axis, at, nothing)
 
 
 def offset_keys(head: Any) -> list[Any]:
@@ -292,7 +293,7 @@ def _key_expressions(head: Any, numbers: Sequence[int], values: np.ndarray, warn
     curves, at = compat.action_curves(head.data.shape_keys), np.asarray(numbers)
     for component, column in enumerate(values.T):
         keyed = slice(None) if column.any() else slice(1)
-        compat.write_curve(curves, _value_path(expression_key(component)), 0, at[keyed], column[keyed])
+        write_curve(curves, _value_path(expression_key(component)), 0, at[keyed], column[keyed])
     row, component = np.unravel_index(np.abs(values).argmax(), values.shape) if values.size else (0, 0)
     if values.size and abs(values[row, component]) > SLIDER:
         warn(
@@ -314,7 +315,7 @@ def _add_pose_keys(head: Any, rig: Any, model: FlameModel, basis: np.ndarray, wa
         name = f"pose_{bone}_{row}{column}"
         _new_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
         expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{NORM}"
-        compat.add_driver(head.data.shape_keys, _value_path(name), -1, expression, _rotation_of(rig, bone))
+        add_driver(head.data.shape_keys, _value_path(name), -1, expression, _rotation_of(rig, bone))
 
 
 def _add_offset_keys(
@@ -367,7 +368,7 @@ def _drive_joint(head: Any, rig: Any, joint: int, sliders: Sequence[str], direct
         weighted = zip(directions[axis, terms], TERMS, strict=False)
         expression = "".join(f"{weight:+.5e}*{letter}" for weight, letter in weighted)
         variables = dict(zip(TERMS, sources, strict=False))
-        compat.add_driver(rig, f'["{_sum_property(name)}"]', slot, expression, variables)
+        add_driver(rig, f'["{_sum_property(name)}"]', slot, expression, variables)
     for axis in range(3):
         paths = [f'["{_sum_property(name)}"][{slot}]' for slot, (of_axis, _) in enumerate(parts) if of_axis == axis]
         if _offset_property(name) in rig:
@@ -380,8 +381,8 @@ def _drive_helpers(rig: Any, joint: int, axis: int, paths: Sequence[str]) -> Non
     variables = {letter: (rig, path) for letter, path in zip(TERMS, paths, strict=False)}
     total = "+".join(variables)
     name = JOINTS[joint]
-    compat.add_driver(rig, f'pose.bones["{joint_bone(name)}"].location', axis, total, variables)
-    compat.add_driver(rig, f'pose.bones["{name}_deform"].location', axis, f"-({total})", variables)
+    add_driver(rig, f'pose.bones["{joint_bone(name)}"].location', axis, total, variables)
+    add_driver(rig, f'pose.bones["{name}_deform"].location', axis, f"-({total})", variables)
 
 
 def _sum_property(bone: str) -> str:

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from ...capture.model import Capture
-from .. import compat, tags
-from ..hierarchy import Warn, capture_root, log_warning, place, reset, triangle_mesh
+from .. import tags
+from ..animation import write_triangle_curves
+from ..arrays import mesh_triangles, triangle_mesh
+from ..objects import Warn, capture_root, log_warning, place, reset
 from .flame_rig import add_rig, remove_rig
 
 
@@ -54,9 +56,7 @@ def _place_head(capture: Capture, name: str | None) -> Any:
 
 
 def _has_triangles(mesh: Any, faces: np.ndarray) -> bool:
-    corners = np.empty(len(mesh.loops), np.int32)
-    mesh.loops.foreach_get("vertex_index", corners)
-    return np.array_equal(corners, faces.ravel())
+    return len(mesh.loops) == faces.size and np.array_equal(mesh_triangles(mesh), faces)
 
 
 def _renew_mesh(head: Any, capture: Capture) -> None:
@@ -78,4 +78,4 @@ def _add_timestep_keys(head: Any, timesteps: Sequence[int], meshes: np.ndarray) 
     names = [f"t{timestep:05d}" for timestep in timesteps]
     for key_name, mesh in zip(names, meshes, strict=True):
         head.shape_key_add(name=key_name, from_mix=False).points.foreach_set("co", mesh.ravel())
-    compat.write_hat_curves(head.data.shape_keys, names, timesteps)
+    write_triangle_curves(head.data.shape_keys, names, timesteps)

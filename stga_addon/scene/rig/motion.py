@@ -1,6 +1,6 @@
 """Motion of a FLAME head: another person's put onto it, and its own as it plays in the scene."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,9 @@ from ...flame.motion import PARTS
 from ...flame.quaternions import to_axis_angle
 from ...flame.sequence import FlameSequence
 from .. import compat
-from ..hierarchy import Warn, log_warning
+from ..arrays import evaluated_vertices
+from ..objects import Warn, log_warning
+from ..timeline import iterate_frames
 from .flame_rig import (
     EXPRESSION_KEY,
     animated_by,
@@ -22,11 +24,11 @@ from .flame_rig import (
     is_of_parts,
     joint_bone,
     key_motion,
+    key_tracked_offsets,
+    key_zero_offsets,
     offset_keys,
-    play_offsets,
     rig_of,
     slider_components,
-    still_offsets,
 )
 
 SAME_MESH = 1e-4  # metres that the mesh in the scene may be off from what FLAME makes of its parameters
@@ -66,10 +68,10 @@ def apply_motion(
     key_motion(head, rig, range(start, start + len(frames)), frames, parts, warn)
     if "expression" in parts and offset_keys(head):
         if tracked is None:
-            still_offsets(head, rig, start)
+            key_zero_offsets(head, rig, start)
         else:
             own, numbers = tracked
-            play_offsets(head, rig, own, [own.frame(timestep) for timestep in own.timesteps], numbers)
+            key_tracked_offsets(head, rig, own, [own.frame(timestep) for timestep in own.timesteps], numbers)
     for owner in owners:
         owner.animation_data.action.use_fake_user = True
         if as_strip:
@@ -97,7 +99,7 @@ def _require_fitting(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: S
             raise StgaError(f"{head.name}: has no slider {expression_key(component)}; import the head again to get all")
 
 
-def performed_motion(head: Any, own: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning) -> FlameSequence:
+def sample_motion(head: Any, own: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning) -> FlameSequence:
     """What a FLAME head does in the scene, by hand or not, in each of the frames `numbers`: timesteps from 0.
 
     own: the sequence that it was imported from, for model and identity; identity sliders count as they stand in the
@@ -107,11 +109,11 @@ def performed_motion(head: Any, own: FlameSequence, numbers: Iterable[int], warn
     rig = rig_of(head)
     frames: list[FlameFrame] = []
     shape, worst = own.shape, 0.0
-    for _ in played(numbers):
+    for _ in iterate_frames(numbers):
         frame = _performed_frame(head, rig, own.model)
         shape = shape if frames else _identity(head, own)
         made = flame_forward(own.model, shape, frame, own.static_offset)
-        worst = max(worst, float(np.abs(made - compat.evaluated_vertices(head)).max()))
+        worst = max(worst, float(np.abs(made - evaluated_vertices(head)).max()))
         frames.append(frame)
     if worst > SAME_MESH:
         warn(
@@ -119,21 +121,6 @@ def performed_motion(head: Any, own: FlameSequence, numbers: Iterable[int], warn
             " mm; the parameters leave that out"
         )
     return FlameSequence(own.model, shape, own.static_offset, tuple(range(len(frames))), frames.__getitem__)
-
-
-def played(numbers: Iterable[int]) -> Iterator[int]:
-    """Set each frame of the scene in turn, with progress at the mouse pointer; in the end the frame is what it was."""
-    scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
-    before, between = scene.frame_current, scene.frame_subframe
-    manager.progress_begin(0, max(len(numbers), 1))
-    try:
-        for done, number in enumerate(numbers):
-            scene.frame_set(number)
-            manager.progress_update(done)
-            yield number
-    finally:
-        manager.progress_end()
-        scene.frame_set(before, subframe=between)
 
 
 def _performed_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:

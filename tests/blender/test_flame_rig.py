@@ -12,7 +12,7 @@ from stga_addon.flame.model import JOINTS  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh  # noqa: E402
 from stga_addon.flame.teeth import with_teeth  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402

@@ -13,10 +13,10 @@ import bpy
 
 from ...avatar.embedding import SLIVER, UPRIGHT
 from .. import tags
+from .color_nodes import BANDS, DEFORMED, FACE, SCENE_LINEAR, STRAIN, constant, seen_from, view_direction
+from .display_modes import PARTS, POINTS, WORLD_ROTATION, WORLD_SCALE, shown_as
 from .materials import DISPLAY_COLOR, OPACITY
 from .node_builder import Nodes, Part, lay_out, made_tree, new_tree
-from .node_colors import BANDS, DEFORMED, FACE, SCENE_LINEAR, STRAIN, constant, seen_from, view_direction
-from .node_display import PARTS, POINTS, WORLD_ROTATION, WORLD_SCALE, shown_as
 
 # Attributes of the splat object that are read here; the others stand in `node_colors` and `materials`.
 XYZ = "stga_xyz"
@@ -62,7 +62,7 @@ def find_splat_tree(convention: str | None, degree: int, strained: bool) -> bpy.
     return made_tree(_name(convention, degree, strained))
 
 
-def build_slice(convention: str | None, degree: int, strained: bool) -> bool:
+def build_next_node_group(convention: str | None, degree: int, strained: bool) -> bool:
     """Build one thing that `splat_tree` needs and the file has not got yet, the tree itself last; whether one was left.
 
     Where Blender is to go on in between, call it until it answers False.

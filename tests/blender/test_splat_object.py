@@ -12,12 +12,12 @@ from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world  # no
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene.compat import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display import nodes  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.color_nodes import SH  # noqa: E402
+from stga_addon.scene.display.display_modes import ELLIPSOIDS, QUADS  # noqa: E402
 from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT, OPACITY  # noqa: E402
-from stga_addon.scene.display.node_colors import SH  # noqa: E402
-from stga_addon.scene.display.node_display import ELLIPSOIDS, QUADS  # noqa: E402
-from stga_addon.scene.display.splats import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.display.splat_object import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
 
 FRAMES = (1, 5, 9)
 
@@ -154,7 +154,9 @@ def test_attributes_hold_activated_values():
     splats = replace(avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32))
     mesh = show_avatar(replace(avatar, splats=splats), animated_head(avatar.neutral, avatar.faces)).data
     assert [item.value for item in mesh.attributes[OPACITY].data] == pytest.approx([0.5] * 50)
-    assert list(mesh.attributes[nodes.SCALE].data[3].vector) == pytest.approx(np.exp(splats.log_scale[3]), rel=1e-5)
+    assert list(mesh.attributes[splat_nodes.SCALE].data[3].vector) == pytest.approx(
+        np.exp(splats.log_scale[3]), rel=1e-5
+    )
     assert [SH.format(i) in mesh.attributes for i in range(5)] == [True, True, True, True, False]
 
 
@@ -208,7 +210,7 @@ def test_colours_follow_the_active_camera(degree):
         kernels._basis(degree, x, y, z, row)
     seen = 0.5 + np.einsum("nk,nkc->nc", basis[:, : sh.shape[1]], sh)
     np.testing.assert_allclose(displayed_colors(shown), linear(seen), atol=2e-4)
-    set_input(shown, nodes.VIEW_DEPENDENT, False)
+    set_input(shown, splat_nodes.VIEW_DEPENDENT, False)
     np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + 0.28209479177387814 * sh[:, 0]), atol=2e-6)
 
 
@@ -250,15 +252,15 @@ def test_display_inputs():
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     opacity = 1 / (1 + np.exp(-avatar.splats.opacity))
     assert len(evaluated_splats(shown)[0]) == 2000
-    set_input(shown, nodes.OPACITY_THRESHOLD, 0.4)
+    set_input(shown, splat_nodes.OPACITY_THRESHOLD, 0.4)
     assert len(evaluated_splats(shown)[0]) == (opacity >= 0.4).sum()
-    set_input(shown, nodes.OPACITY_THRESHOLD, 0.0)
-    set_input(shown, nodes.PERCENTAGE, 25.0)
+    set_input(shown, splat_nodes.OPACITY_THRESHOLD, 0.0)
+    set_input(shown, splat_nodes.PERCENTAGE, 25.0)
     assert 400 < len(evaluated_splats(shown)[0]) < 600
-    set_input(shown, nodes.PERCENTAGE, 100.0)
-    assert get_input(shown, nodes.SIZE) == 1.0
+    set_input(shown, splat_nodes.PERCENTAGE, 100.0)
+    assert get_input(shown, splat_nodes.SIZE) == 1.0
     assert get_input(shown, "Colour of the sea") is None
-    set_input(shown, nodes.DISPLAY, ELLIPSOIDS)
+    set_input(shown, splat_nodes.DISPLAY, ELLIPSOIDS)
     with pytest.raises(StgaError, match="ellipsoids"):
         evaluated_splats(shown)
 
@@ -268,8 +270,8 @@ def test_ellipsoids_are_the_splats_own_shape():
     avatar = avatar_of("stga", 200)
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
-    set_input(shown, nodes.DISPLAY, ELLIPSOIDS)
-    set_input(shown, nodes.SIZE, 2.0)
+    set_input(shown, splat_nodes.DISPLAY, ELLIPSOIDS)
+    set_input(shown, splat_nodes.SIZE, 2.0)
     bpy.context.scene.frame_set(5)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     world = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance])
@@ -291,7 +293,7 @@ def test_quads_face_the_camera_and_cover_the_ellipsoid():
     camera = active_camera((0.4, -1.0, 1.3))
     bpy.context.scene.frame_set(5)
     centre, _, _ = evaluated_splats(shown)
-    set_input(shown, nodes.DISPLAY, QUADS)
+    set_input(shown, splat_nodes.DISPLAY, QUADS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     quads = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
     to_world = np.array(shown.matrix_world, np.float64)
@@ -299,7 +301,7 @@ def test_quads_face_the_camera_and_cover_the_ellipsoid():
     # Seen from the camera each splat is a sphere in the quad's own space, right above the quad's centre.
     eye = np.linalg.solve(quads, np.broadcast_to([*camera.location, 1.0], (len(quads), 4))[..., None])[:, :3, 0]
     assert (eye[:, 2] / np.linalg.norm(eye, axis=-1)).min() > 1 - 1e-4
-    set_input(shown, nodes.DISPLAY, ELLIPSOIDS)
+    set_input(shown, splat_nodes.DISPLAY, ELLIPSOIDS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     spheres = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
     shapes = [m[:, :3, :3] @ m[:, :3, :3].transpose(0, 2, 1) for m in (quads, spheres)]
@@ -315,10 +317,10 @@ def test_selection_greys_what_the_frame_freezes():
     head.vertex_groups.new(name="stga_5").add([int(v) for v in np.unique(chosen)], 1.0, "ADD")
     selected = np.isin(avatar.faces, chosen).all(1)[avatar.splats.face]
     shown = show_avatar(avatar, head)
-    set_input(shown, nodes.SHOW_SELECTION, True)
+    set_input(shown, splat_nodes.SHOW_SELECTION, True)
 
     def grey() -> np.ndarray:
-        return np.isclose(displayed_colors(shown), nodes.FROZEN_GREY[:3]).all(1)
+        return np.isclose(displayed_colors(shown), splat_nodes.FROZEN_GREY[:3]).all(1)
 
     bpy.context.scene.frame_set(5)
     assert 0 < selected.sum() < 1000
@@ -326,9 +328,9 @@ def test_selection_greys_what_the_frame_freezes():
     bpy.context.scene.frame_set(6)
     assert not grey().any()
     bpy.context.scene.frame_set(5)
-    set_input(shown, nodes.SHOW_SELECTION, False)
+    set_input(shown, splat_nodes.SHOW_SELECTION, False)
     assert not grey().any()
-    set_input(shown, nodes.SELECTED_ONLY, True)
+    set_input(shown, splat_nodes.SELECTED_ONLY, True)
     assert len(evaluated_splats(shown)[0]) == selected.sum()
     bpy.context.scene.frame_set(6)
     assert len(evaluated_splats(shown)[0]) == 1000
@@ -367,11 +369,11 @@ def test_a_tree_is_built_in_small_slices(kind):
     """Catches what holds Blender up when a live preview first comes: a part that is built with another one, a large
     tree (the time it takes grows with the square), and parts that are built again."""
     built = []
-    while nodes.build_slice(*kind):
+    while splat_nodes.build_next_node_group(*kind):
         built.append(len(bpy.data.node_groups))
     assert built == list(range(1, len(built) + 1))
     assert max(len(tree.nodes) for tree in bpy.data.node_groups) <= 60
-    assert nodes.splat_tree(*kind) == nodes.find_splat_tree(*kind)
+    assert splat_nodes.splat_tree(*kind) == splat_nodes.find_splat_tree(*kind)
     assert len(bpy.data.node_groups) == len(built)
 
 
@@ -388,7 +390,7 @@ def test_cycles_draws_an_ellipsoid_as_a_gaussian(display, tmp_path):
         log_scale=np.log(sigma, dtype=np.float32)[None],
         opacity=logit,
     )
-    set_input(show_world_splats(splats, "one"), nodes.DISPLAY, display)
+    set_input(show_world_splats(splats, "one"), splat_nodes.DISPLAY, display)
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.type, camera.data.ortho_scale, camera.data.clip_start = "ORTHO", 0.12, 0.01

@@ -19,7 +19,7 @@ STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 LINES = 6
 
 
-def curve_picture(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | None:
+def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | None:
     """Held-out PSNR over seconds of training, with the last forecast and its error; None before two evaluations.
 
     lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the lowest row first, and what the axes

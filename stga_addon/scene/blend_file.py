@@ -30,12 +30,6 @@ def open_file(path: Path) -> None:
         raise StgaError(f"{path}: cannot be opened ({error})") from error
 
 
-def go_to_frame(frame: int) -> None:
-    """Move the open scene to a frame and evaluate it."""
-    bpy.context.scene.frame_set(frame)
-    bpy.context.view_layer.update()
-
-
 def look_through_camera() -> None:
     """Let the file open with its 3D viewports on the scene's camera, in colour.
 

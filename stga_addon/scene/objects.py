@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
 
 from . import tags
 
@@ -81,19 +80,6 @@ def remove(things: Iterable[Any]) -> None:
         data, action = thing.data, _action(thing)
         bpy.data.objects.remove(thing)
         _purge([data], [action])
-
-
-def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3); order and vertex order of the faces are kept."""
-    mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", np.asarray(vertices, np.float32).ravel())
-    mesh.loops.add(faces.size)
-    mesh.loops.foreach_set("vertex_index", np.asarray(faces, np.int32).ravel())
-    mesh.polygons.add(len(faces))
-    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
-    mesh.update(calc_edges=True)
-    return mesh
 
 
 def _action(owner: Any) -> Any:

@@ -12,58 +12,58 @@ from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import strain_basis
 from ...errors import StgaError
 from .. import tags
+from ..arrays import mesh_triangles, read_values, triangle_mesh
 from ..compat import modifier_input, set_modifier_input
-from ..hierarchy import triangle_mesh
-from . import nodes
+from . import splat_nodes
+from .color_nodes import FACE, SH, STRAIN_COLOR, strain_attributes
 from .colors import srgb_to_linear
+from .display_modes import POINTS, WORLD_ROTATION, WORLD_SCALE
 from .materials import OPACITY
 from .node_builder import is_splat_tree
-from .node_colors import FACE, SH, STRAIN_COLOR, strain_attributes
-from .node_display import POINTS, WORLD_ROTATION, WORLD_SCALE
 
 Attributes = dict[str, tuple[str, str, np.ndarray]]
 """Name -> (data type, the field to set, flat values) of attributes of a mesh."""
 
 
 @dataclass(frozen=True)
-class Prepared:
+class SplatAttributes:
     """What `show_avatar` writes into the vertices of the splat object, and into the triangles of the neutral mesh."""
 
     splats: Attributes
     neutral: Attributes
 
 
-def prepare(avatar: Avatar) -> Prepared:
+def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     """The part of showing an avatar that works without Blender, so that a thread can do it."""
     area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
     splats = {
         **_attributes(avatar.splats),
         FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
-        nodes.NEUTRAL_AREA: ("FLOAT", "value", np.ascontiguousarray(area, np.float32)),
+        splat_nodes.NEUTRAL_AREA: ("FLOAT", "value", np.ascontiguousarray(area, np.float32)),
     }
     if not avatar.splats.strain_color.shape[1]:
-        return Prepared(splats, {})
+        return SplatAttributes(splats, {})
     vectors = strain_attributes(strain_basis(avatar.neutral, avatar.faces))
     flat = {name: np.ascontiguousarray(vector, np.float32).ravel() for name, vector in vectors.items()}
-    return Prepared(splats, {name: ("FLOAT_VECTOR", "vector", values) for name, values in flat.items()})
+    return SplatAttributes(splats, {name: ("FLOAT_VECTOR", "vector", values) for name, values in flat.items()})
 
 
-def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Prepared | None = None) -> Any:
+def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None) -> Any:
     """The splat object of an avatar: it follows the evaluated mesh of the object `head`, frame by frame.
 
-    head: a mesh object with the avatar's triangles, in their order. prepared: from `prepare`, where it is there
-    already. Raises StgaError where the head has other triangles.
+    head: a mesh object with the avatar's triangles, in their order. prepared: `avatar_attributes` of the avatar,
+    computed here by default. Raises StgaError where the head has other triangles.
     """
     check_head(avatar, head)
-    prepared = prepared or prepare(avatar)
+    prepared = prepared or avatar_attributes(avatar)
     own = (collection for collection in head.users_collection if collection.library is None)  # or all are linked
     collection = next(own, bpy.context.scene.collection)
     shown = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
     shown[tags.CONVENTION], shown[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
     _add_modifier(shown, avatar.convention, avatar.splats)
-    set_input(shown, nodes.HEAD, head)
+    set_input(shown, splat_nodes.HEAD, head)
     # In no collection: it is never seen, and lives as long as the splats that point to it.
-    set_input(shown, nodes.NEUTRAL, _neutral_object(f"{shown.name} neutral", avatar, prepared.neutral))
+    set_input(shown, splat_nodes.NEUTRAL, _neutral_object(f"{shown.name} neutral", avatar, prepared.neutral))
     # A sibling of the head: the two object spaces are the same, so are the numbers in them.
     shown.parent = head.parent
     shown.matrix_parent_inverse = head.matrix_parent_inverse
@@ -71,7 +71,7 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Pr
     return shown
 
 
-def hide(head: Any, scene: Any) -> None:
+def hide_object(head: Any, scene: Any) -> None:
     """Hide the head, which would cover its splats; it still moves them. A linked one stays visible in renders."""
     if head.library is None:
         head.hide_render = True
@@ -80,36 +80,34 @@ def hide(head: Any, scene: Any) -> None:
             head.hide_set(True, view_layer=layer)
 
 
-def can_refresh(shown: Any, avatar: Avatar) -> bool:
-    """Whether a splat object shows an avatar of the same kind, so that `refresh` is all it takes to show this one."""
+def can_update(shown: Any, avatar: Avatar) -> bool:
+    """Whether `update_splats` can show the avatar in this object: same convention, color model and antialiasing."""
     try:
         tree = splat_modifier(shown).node_group
     except StgaError:
         return False
     same = (shown.get(tags.CONVENTION), shown.get(tags.ANTIALIASED)) == (avatar.convention, avatar.antialiased)
-    return same and tree == nodes.find_splat_tree(*_kind(avatar.convention, avatar.splats))
+    return same and tree == splat_nodes.find_splat_tree(*_kind(avatar.convention, avatar.splats))
 
 
-def refresh(shown: Any, prepared: Prepared) -> None:
+def update_splats(shown: Any, prepared: SplatAttributes) -> None:
     """Show other splats in the same object: display settings, name and users stay.
 
-    prepared: from `prepare` of an avatar for which `can_refresh` says yes.
+    prepared: from `avatar_attributes` of an avatar for which `can_update` says yes.
     """
     _write(shown.data, prepared.splats)
 
 
-def build_slice(avatar: Avatar) -> bool:
+def build_next_node_group(avatar: Avatar) -> bool:
     """Do a moment's work on the node tree that `show_avatar` will want; whether there was some left to do."""
-    return nodes.build_slice(*_kind(avatar.convention, avatar.splats))
+    return splat_nodes.build_next_node_group(*_kind(avatar.convention, avatar.splats))
 
 
 def check_head(avatar: Avatar, head: Any) -> None:
     """Raise StgaError unless `head` is a mesh object with the avatar's triangles, in their order."""
     if head is None or head.type != "MESH":
         raise StgaError("head: a mesh object that carries the avatar is expected")
-    faces = np.empty(len(head.data.loops), np.int32)
-    head.data.loops.foreach_get("vertex_index", faces)
-    if len(faces) != avatar.faces.size or not np.array_equal(faces, avatar.faces.ravel()):
+    if len(head.data.loops) != avatar.faces.size or not np.array_equal(mesh_triangles(head.data), avatar.faces):
         raise StgaError(
             f"head {head.name}: the avatar was trained on {len(avatar.faces)} triangles of another mesh, "
             f"this one has {len(head.data.polygons)} faces in its own order"
@@ -132,7 +130,7 @@ def splat_modifier(shown: Any) -> Any:
 
 
 def set_input(shown: Any, name: str, value: Any) -> None:
-    """Set an input of a splat object's modifier by its name, `nodes.SIZE` for one.
+    """Set an input of a splat object's modifier by its name, `splat_nodes.SIZE` for one.
 
     Raises StgaError where the splats have no such input: those in world space follow no head.
     """
@@ -168,9 +166,9 @@ def evaluated_splats(shown: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if made_by is not None and made_by.original == shown and instance.object.type == "POINTCLOUD":
             points = instance.object.data
             return (
-                _read(points, "position", "vector", 3),
-                _read(points, WORLD_ROTATION, "value", 4),
-                _read(points, WORLD_SCALE, "vector", 3),
+                read_values(points.attributes["position"].data, "vector", 3),
+                read_values(points.attributes[WORLD_ROTATION].data, "value", 4),
+                read_values(points.attributes[WORLD_SCALE].data, "vector", 3),
             )
     raise StgaError(f"{shown.name}: shows ellipsoids or nothing, expected points")
 
@@ -195,11 +193,11 @@ def _attributes(splats: Splats) -> Attributes:
     norm = np.linalg.norm(splats.rotation, axis=-1, keepdims=True)
     rotation = np.where(norm > 0, splats.rotation / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
     values = {
-        nodes.XYZ: ("FLOAT_VECTOR", "vector", splats.xyz),
-        nodes.ROTATION: ("QUATERNION", "value", rotation),
-        nodes.SCALE: ("FLOAT_VECTOR", "vector", np.exp(splats.log_scale.astype(np.float64))),
+        splat_nodes.XYZ: ("FLOAT_VECTOR", "vector", splats.xyz),
+        splat_nodes.ROTATION: ("QUATERNION", "value", rotation),
+        splat_nodes.SCALE: ("FLOAT_VECTOR", "vector", np.exp(splats.log_scale.astype(np.float64))),
         OPACITY: ("FLOAT", "value", 1 / (1 + np.exp(-splats.opacity.astype(np.float64)))),
-        nodes.COLOR: ("FLOAT_COLOR", "color", _base_color(splats.sh[:, 0])),
+        splat_nodes.COLOR: ("FLOAT_COLOR", "color", _base_color(splats.sh[:, 0])),
     }
     for name, coefficients in ((SH, splats.sh), (STRAIN_COLOR, splats.strain_color)):
         for index in range(coefficients.shape[1]):
@@ -218,7 +216,7 @@ def _base_color(dc: np.ndarray) -> np.ndarray:
 
 def _write(mesh: Any, attributes: Attributes) -> None:
     """Make the mesh's vertices and attributes these; what there is already is overwritten in place."""
-    positions = attributes[nodes.XYZ][2]
+    positions = attributes[splat_nodes.XYZ][2]
     if len(mesh.vertices) != len(positions) // 3:
         mesh.clear_geometry()
         mesh.vertices.add(len(positions) // 3)
@@ -234,18 +232,11 @@ def _write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
 
 
 def _kind(convention: str | None, splats: Splats) -> tuple[str | None, int, bool]:
-    """What decides the node tree, as `nodes.splat_tree` takes it."""
+    """What decides the node tree, as `splat_nodes.splat_tree` takes it."""
     return convention, splats.sh_degree, splats.strain_color.shape[1] > 0
 
 
 def _add_modifier(shown: Any, convention: str | None, splats: Splats) -> None:
     modifier = shown.modifiers.new("STGA Splats", "NODES")
-    modifier.node_group = nodes.splat_tree(*_kind(convention, splats))
-    set_input(shown, nodes.DISPLAY, POINTS)  # the default of a menu does not reach the modifier in every version
-
-
-def _read(points: Any, name: str, field: str, width: int) -> np.ndarray:
-    data = points.attributes[name].data
-    values = np.empty(len(data) * width, np.float32)
-    data.foreach_get(field, values)
-    return values.reshape(-1, width)
+    modifier.node_group = splat_nodes.splat_tree(*_kind(convention, splats))
+    set_input(shown, splat_nodes.DISPLAY, POINTS)  # the default of a menu does not reach the modifier in every version

@@ -1,0 +1,72 @@
+"""Arguments that several commands share, and the types of their values."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from ..capture.transforms import PRINCIPAL_POINTS
+from ..jobs.delegate import OpenHead
+from ..training.settings import DEVICES
+
+
+def add_capture(command: argparse.ArgumentParser, head: OpenHead | None) -> None:
+    """CAPTURE, --flame and --principal-point; CAPTURE may be left out where a head is open."""
+    optional: dict[str, Any] = {} if head is None else {"nargs": "?"}
+    command.add_argument("capture", type=Path, metavar="CAPTURE", help="folder of the capture", **optional)
+    command.add_argument("--flame", type=Path, metavar="FILE", help="FLAME model file (.pkl or .npz)")
+    add_principal_point(command)
+
+
+def add_principal_point(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--principal-point", choices=tuple(PRINCIPAL_POINTS), help="what cy means in the capture (default vhap)"
+    )
+
+
+def add_avatar(command: argparse.ArgumentParser, name: str, metavar: str, head: OpenHead | None) -> None:
+    """An avatar's file or run folder, which may be left out where the open file shows an avatar."""
+    optional: dict[str, Any] = {} if head is None or head.avatar is None else {"nargs": "?", "default": head.avatar}
+    command.add_argument(name, type=Path, metavar=metavar, **optional)
+
+
+def add_effects(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--effect",
+        action="append",
+        default=[],
+        metavar="NAME=on|off",
+        help="switch an effect on or off instead of deciding from the capture (docs/effects.md); may be repeated",
+    )
+
+
+def add_device(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--device",
+        choices=DEVICES,
+        default="auto",
+        help="cuda: an NVIDIA GPU; auto: the GPU where it works, else the CPU; warp-cpu: the GPU's code on the CPU",
+    )
+
+
+def duration(text: str) -> float:
+    """Seconds in "90", "90s", "10m", "1h30m". Raises argparse.ArgumentTypeError for anything else."""
+    match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    if not match or not any(match.groups()):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time such as 90s, 10m or 1h30m")
+    hours, minutes, seconds = (float(part or 0) for part in match.groups())
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def color(text: str) -> tuple[float, float, float]:
+    """ "white", "black" or three numbers in 0…1. Raises argparse.ArgumentTypeError for anything else."""
+    named = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+    if text in named:
+        return named[text]
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        red = -1.0
+    if not all(0 <= value <= 1 for value in ([red] if red < 0 else [red, green, blue])):
+        raise argparse.ArgumentTypeError(f"'{text}' is not white, black or R,G,B with numbers in 0…1")
+    return red, green, blue

@@ -1,0 +1,25 @@
+"""Carry out the training job that Blender's panel wrote into a run's folder."""
+
+import sys
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from ..jobs.delegate import OpenHead
+
+NAME, HELP = "job", "carry out the training job that Blender's panel wrote into a run's folder"
+
+
+def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    parser.add_argument("run_folder", type=Path, metavar="RUN")
+
+
+def run(options: Namespace) -> None:
+    from ..jobs.training_job import work
+
+    if not sys.stderr.isatty():  # started by Blender, which reads the status folder
+        work(options.run_folder)
+        return
+    from ..training.run.progress_bar import ProgressBar
+
+    with ProgressBar() as bar:
+        work(options.run_folder, also=bar.report)

@@ -1,0 +1,27 @@
+"""Show what each preset is for, and how long it would train on this machine."""
+
+from argparse import ArgumentParser, Namespace
+
+from ..jobs.delegate import OpenHead
+from .arguments import add_capture, add_device
+from .inputs import open_named_capture
+
+NAME, HELP = "presets", "show the presets, and how long each would train on this machine"
+
+
+def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    add_capture(parser, head)
+    add_device(parser)
+
+
+def run(options: Namespace) -> None:
+    from ..report.preset_timing import time_presets
+    from ..training.evaluate.forecast import clock
+    from ..training.optimize.device import choose_device
+
+    capture = open_named_capture(options)
+    device, why = choose_device(options.device)
+    print(why)
+    for timing in time_presets(capture, device=device):
+        time = f"about {clock(timing.seconds):<10}"
+        print(f"{timing.preset:<9} {timing.iterations:6d} iterations  {time}  {timing.purpose}")

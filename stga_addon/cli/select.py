@@ -1,0 +1,30 @@
+"""Show which triangles each frame selects for training."""
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from ..files import write_npz
+from ..jobs.delegate import OpenHead
+from ..selection import SelectionOptions, select_capture
+from .arguments import add_capture
+from .inputs import open_named_capture
+
+NAME, HELP = "select", "show which triangles each frame selects for training"
+
+
+def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    add_capture(parser, head)
+    parser.add_argument("--threshold", type=float, default=SelectionOptions.threshold, metavar="METERS")
+    parser.add_argument("--zero-pose", choices=("head", "all"), default="head")
+    parser.add_argument("--out", type=Path, metavar="NPZ", help="also write timestep -> triangles")
+
+
+def run(options: Namespace) -> None:
+    capture = open_named_capture(options)
+    selection = select_capture(capture, SelectionOptions(threshold=options.threshold, zero_pose=options.zero_pose))
+    print(f"threshold {1000 * options.threshold:g} mm, {len(capture.faces)} triangles")
+    for timestep, faces in selection.items():
+        regions = [name for name, members in capture.regions.items() if members.any() and faces[members].all()]
+        print(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
+    if options.out:
+        write_npz(options.out, {f"{t:05d}": faces for t, faces in selection.items()}, compressed=True)

@@ -1,0 +1,145 @@
+"""Train an avatar from a capture, or continue a run."""
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+from ..capture.model import Capture
+from ..capture.open import open_capture
+from ..errors import StgaError
+from ..jobs.delegate import OpenHead
+from ..selection import SelectionOptions
+from ..training.effect_plan import parse_choices
+from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, make_settings
+from .arguments import add_capture, add_device, add_effects, duration
+from .inputs import open_named_capture
+from .table import print_table
+
+NAME, HELP = "train", "train an avatar from a capture"
+
+
+def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    add_capture(parser, head)
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder of the run")
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
+    budget.add_argument("--iterations", type=int, help="number of iterations instead")
+    parser.add_argument(
+        "--strategy",
+        choices=STRATEGIES,
+        help="default: global, which measured best (docs/results.md); selective with --schedule paper",
+    )
+    parser.add_argument("--schedule", choices=SCHEDULES, help="paper: the settings of the STGA paper")
+    parser.add_argument(
+        "--preset", choices=tuple(PRESETS), help="quality and training time; `stga presets` shows the times"
+    )
+    parser.add_argument("--target-psnr", type=float, metavar="DB", help="stop when the held-out views reach it")
+    parser.add_argument(
+        "--stop-when-flat", action="store_true", default=None, help="stop when more time no longer helps"
+    )
+    parser.add_argument("--threshold", type=float, metavar="METERS", help="selection threshold")
+    add_effects(parser)
+    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
+    add_device(parser)
+    parser.add_argument("--seed", type=int, help="fixes every random choice (default 0)")
+
+
+def run(options: Namespace) -> None:
+    from ..effects.decide import decide, describe_effects
+    from ..report.run_summary import CurveDrawer, conclude
+    from ..training.optimize.device import choose_device
+    from ..training.run.folder import read_run
+    from ..training.run.loop import Progress, train
+    from ..training.run.progress_bar import ProgressBar
+
+    if not options.capture.is_dir():
+        raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
+    device, why = choose_device(options.device)
+    print(why)
+    if options.resume:
+        run = read_run(options.out)
+        _refuse_changes(options, run)
+        capture = open_capture(run.capture, options.flame or run.flame, run.principal_point)
+    else:
+        if (options.out / "run.json").exists():
+            raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
+        capture = open_named_capture(options)
+        run = decide(_new_run(options, capture, device), capture, device)
+    for warning in capture.warnings:
+        print(f"warning: {warning}")
+    print_table(describe_effects(run.plan))
+    draw = CurveDrawer(options.out)
+    with ProgressBar() as bar:
+
+        def report(progress: Progress) -> bool:
+            draw()
+            return bar.report(progress)
+
+        selection = None if options.head is None else options.head.selection()
+        avatar = train(capture, options.out, run, selection, options.resume, report, device)
+    for line in conclude(options.out):
+        print(line)
+    print(f"avatar: {avatar}")
+    if run.settings.tracking:
+        print(f"its meshes: {options.out / 'tracking.npz'}, in Blender with Apply Motion, Own Offsets")
+
+
+def _refuse_changes(options: Namespace, run: Any) -> None:
+    """Raise StgaError for an option that differs from what the run to be resumed began with."""
+    if run.capture != options.capture.resolve():
+        raise StgaError(f"{options.out}: this run trains {run.capture}, not {options.capture.resolve()}")
+    settings = run.settings
+    began_with = {
+        "budget": settings.seconds,
+        "iterations": settings.iterations,
+        "strategy": settings.strategy,
+        "schedule": settings.schedule,
+        "threshold": settings.selection.threshold,
+        "seed": settings.seed,
+        "preset": settings.preset,
+        "target_psnr": settings.target_psnr,
+        "stop_when_flat": settings.stop_when_flat,
+        "principal_point": run.principal_point,
+    }
+    for name, value in began_with.items():
+        if getattr(options, name) not in (None, value):
+            option = "--" + name.replace("_", "-")
+            raise StgaError(f"{option}: this run began with {value}, which cannot change; use another --out")
+    decided = {decision.effect: decision for decision in run.plan}
+    for name, choice in parse_choices(options.effect).items():
+        if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
+            raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
+
+
+def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
+    from ..training.run.folder import Run
+
+    changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": bool(options.stop_when_flat)}
+    if options.seed is not None:
+        changes["seed"] = options.seed
+    if options.iterations is not None:
+        changes["iterations"] = options.iterations
+    elif options.budget is not None:
+        changes["seconds"] = options.budget
+    else:
+        changes["seconds"] = 120.0 if options.preset is None else _preset_seconds(capture, options.preset, device)
+    if options.strategy is not None:
+        changes["strategy"] = options.strategy
+    if options.threshold is not None:
+        changes["selection"] = SelectionOptions(threshold=options.threshold)
+    flame = None if options.flame is None else options.flame.resolve()
+    choices = parse_choices(options.effect)
+    if choices or (options.schedule != "paper" and options.strategy != "gaussian-avatars"):
+        changes["effects"] = choices
+    settings = make_settings(schedule=options.schedule or "default", preset=options.preset, **changes)
+    return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
+
+
+def _preset_seconds(capture: Capture, preset: str, device: str) -> float:
+    """Seconds that a preset takes on this machine's device, which are printed."""
+    from ..report.preset_timing import time_presets
+    from ..training.evaluate.forecast import clock
+
+    (timing,) = time_presets(capture, [preset], device=device)
+    print(f"{preset}: {timing.iterations} iterations, {clock(timing.seconds)} on this machine")
+    return timing.seconds

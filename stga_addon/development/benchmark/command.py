@@ -1,0 +1,46 @@
+"""Train variants for the same time in turns, and print how they compare."""
+
+import sys
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from ...cli.arguments import add_capture, duration
+from ...cli.inputs import open_named_capture
+from ...errors import StgaError
+from ...jobs.delegate import OpenHead
+from ...training.settings import make_settings
+from .variants import KNOBS, MAIN, chosen
+
+NAME, HELP = "benchmark", "compare accuracy and training time of strategies and presets on the CPU"
+
+
+def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    add_capture(parser, head)
+    parser.add_argument("--budget", type=duration, default=180.0, metavar="TIME", help="of each run (default 3m)")
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each variant (default 3)")
+    parser.add_argument("--knobs", action="store_true", help="compare single settings instead")
+    parser.add_argument("--only", nargs="+", metavar="VARIANT", help="some of the variants")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmark"), metavar="DIR", help="keeps the runs, to be continued"
+    )
+
+
+def run(options: Namespace) -> None:
+    from ...training.run.folder import Run
+    from .benchmark import run_benchmark
+
+    variants = chosen(KNOBS if options.knobs else MAIN, options.only)
+    if options.seeds < 1:
+        raise StgaError(f"--seeds: {options.seeds} is not a number of runs")
+    settings = make_settings(seconds=options.budget)
+    capture = open_named_capture(options)
+    for split, purpose in (("train", "train on"), ("val", "measure with")):
+        if not capture.views.get(split):
+            raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
+    flame = None if options.flame is None else options.flame.resolve()
+    run = Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
+    print(run_benchmark(capture, run, variants, options.budget, options.seeds, options.out.resolve(), _print_progress))
+
+
+def _print_progress(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

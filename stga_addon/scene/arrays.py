@@ -1,0 +1,51 @@
+"""Bulk reads and writes of Blender's meshes, as numpy arrays."""
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+
+def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:
+    """(N, width) of one property of a collection of N items."""
+    values = np.empty(len(items) * width, dtype)
+    items.foreach_get(field, values)
+    return values.reshape(-1, width)
+
+
+def mesh_vertices(mesh: Any) -> np.ndarray:
+    """(V, 3) float32 positions of a mesh's vertices."""
+    return read_values(mesh.vertices, "co", 3)
+
+
+def mesh_triangles(mesh: Any) -> np.ndarray:
+    """(F, 3) int32 vertex indices of a mesh that has triangles only."""
+    return read_values(mesh.loops, "vertex_index", 1, np.int32).reshape(-1, 3)
+
+
+def evaluated_vertices(thing: Any) -> np.ndarray:
+    """(V, 3) float32 vertex positions of a mesh object at the current frame, in object space.
+
+    Shape keys, drivers and modifiers are applied.
+    """
+    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = evaluated.to_mesh()
+    try:
+        vertices = np.empty(len(mesh.vertices) * 3, np.float32)
+        mesh.vertices.foreach_get("co", vertices)
+    finally:
+        evaluated.to_mesh_clear()
+    return vertices.reshape(-1, 3)
+
+
+def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3); order and vertex order of the faces are kept."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", np.asarray(vertices, np.float32).ravel())
+    mesh.loops.add(faces.size)
+    mesh.loops.foreach_set("vertex_index", np.asarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    mesh.update(calc_edges=True)
+    return mesh
