@@ -30,11 +30,11 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.development.benchmark.statistics import Spread, spread_of
-from stga_addon.effects.decide import decide_effects
-from stga_addon.effects.facts import Facts
+from stga_addon.effects.facts import CaptureFacts
+from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import EFFECTS
-from stga_addon.training.evaluate.metrics import measure
-from stga_addon.training.optimize.tracking import refined
+from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.optimize.tracking import with_refined_tracking
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
@@ -106,8 +106,8 @@ def captures(root: Path, folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 def possible(capture: Capture, iterations: int) -> list[str]:
     """The effects that can be on."""
-    facts = Facts(capture, make_settings(iterations=iterations))
-    looked = {effect.name: effect.look(facts) for effect in EFFECTS if effect.name not in LEFT_TO_AUTO}
+    facts = CaptureFacts(capture, make_settings(iterations=iterations))
+    looked = {effect.name: effect.rule(facts) for effect in EFFECTS if effect.name not in LEFT_TO_AUTO}
     return [name for name, verdict in looked.items() if verdict is not None and (verdict.on or not verdict.only)]
 
 
@@ -115,12 +115,12 @@ def trained(
     capture: Capture, flame: Path | None, iterations: int, seed: int, choices: Choices
 ) -> tuple[dict[str, float], float, str]:
     """PSNR by split, milliseconds of an iteration, and the effects that were on."""
-    settings, plan = decide_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
+    settings, plan = plan_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
-        shown = refined(capture, Path(folder))
-    psnr = {split: measure(avatar, shown, split).psnr for split in ("val", "test") if shown.views.get(split)}
+        shown = with_refined_tracking(capture, Path(folder))
+    psnr = {split: evaluate_avatar(avatar, shown, split).psnr for split in ("val", "test") if shown.views.get(split)}
     return psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
 
 
@@ -217,7 +217,7 @@ def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
     row("capture", "effect", "decided", "on against off, val", "test", "ms")
     row(*["---"] * 6)
     for name, capture in opened.items():
-        _, plan = decide_effects(capture, make_settings(iterations=options.iterations, effects={}))
+        _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
         decided = {decision.effect: f"{'on' if decision.on else 'off'}: {decision.reason}" for decision in plan}
         for effect in options.switch:
             variants = {choice: {effect: choice} for choice in ("on", "off")}

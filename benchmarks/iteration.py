@@ -28,9 +28,9 @@ from stga_addon.capture.model import Capture, View
 from stga_addon.development.demo.head import synthetic_head
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
 from stga_addon.raster.cpu.project import project_backward, project_forward
-from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, camera_frames, render_forward
+from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, frames_in_camera, render_forward
 from stga_addon.raster.cpu.threads import threads
-from stga_addon.raster.cpu.tiles import PARTS, count_pairs, depth_order, fill_pairs, lay_out
+from stga_addon.raster.cpu.tiles import PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.device import choose_device, make_backend
@@ -63,7 +63,7 @@ def ellipsoid(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray,
 
 def _splats(count: int, size: np.ndarray, rng: np.random.Generator) -> Splats:
     """Splats on random triangles, in the triangles' order, as a lattice has them; size (F,): the smallest standard
-    deviation on each, metres.
+    deviation on each, meters.
     """
     face = np.sort(rng.integers(0, len(size), count)).astype(np.int32)
     sigma = size[face][:, None]
@@ -79,7 +79,7 @@ def _splats(count: int, size: np.ndarray, rng: np.random.Generator) -> Splats:
 
 
 def front_camera(width: int, height: int) -> Camera:
-    """A metre before a head that looks along +z."""
+    """A meter before a head that looks along +z."""
     view = np.diag([1.0, -1.0, -1.0, 1.0])
     view[2, 3] = 1.0
     return Camera(width, height, 2.43 * width, 2.43 * width, width / 2, height / 2, view)
@@ -102,20 +102,20 @@ def copy_bandwidth() -> float:
     return 2 * source.nbytes / (median_ms(lambda: np.copyto(target, source), 5) / 1e3)
 
 
-def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, tuple[float, int]]:
+def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, tuple[float, int]]:
     """stage -> (median ms, bytes that it must move at least)."""
-    n, camera = len(splats), seen.camera
+    n, camera = len(splats), frames.camera
     pixels, background = camera.width * camera.height, np.ones(3, np.float32)
     tiles_x, tiles_y = -(-camera.width // 16), -(-camera.height // 16)
-    state, scratch = new_state(splats), BufferPool()
+    state, buffers = new_state(splats), BufferPool()
     arrays, face = state.arrays(), state.face.numpy()
     gradients = Parameters(*(g.numpy() for g in state.gradients))
-    r = render_forward(arrays, face, seen, 3, background, scratch=scratch)
+    r = render_forward(arrays, face, frames, 3, background, buffers=buffers)
     projected, depth = np.empty_like(r.projected), np.empty(n, np.float32)
     extent_y, rect = np.empty(n, np.float32), np.empty((n, 4), np.int32)
     project = (
-        np.arange(n), np.ones((tiles_y, tiles_x), bool), *arrays, 3, face, seen.origin, seen.matrix, seen.strain,
-        seen.to_world, seen.lens, seen.size, False, False, projected, depth, extent_y, rect,
+        np.arange(n), np.ones((tiles_y, tiles_x), bool), *arrays, 3, face, frames.origin, frames.matrix, frames.strain,
+        frames.to_world, frames.intrinsics, frames.size, False, False, projected, depth, extent_y, rect,
     )  # fmt: skip
     project_forward(*project)
     order = depth_order(depth, r.visible)
@@ -123,7 +123,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
     counts = np.empty((PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts, r.pairs)
     places = counts.copy()
-    lay_out(rows, r.pairs, places, r.first_pair)
+    compute_offsets(rows, r.pairs, places, r.first_pair)
     v_image, screen = np.empty_like(r.image), np.empty(n, np.float32)
     bands = whole_image(camera.height, camera.width)
     zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
@@ -132,7 +132,7 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         "project": (lambda: project_forward(*project), n * (59 + 16) * 4),
         "sort by depth": (lambda: depth_order(depth, r.visible), len(rows) * 6 * 8),
         "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts, r.pairs), n * 24),
-        "lay out pairs": (lambda: lay_out(rows, r.pairs, counts.copy(), r.first_pair), counts.nbytes + n * 8),
+        "lay out pairs": (lambda: compute_offsets(rows, r.pairs, counts.copy(), r.first_pair), counts.nbytes + n * 8),
         "fill pairs": (
             lambda: fill_pairs(rect, order, tiles_x, places.copy(), r.first_pair, r.splat_pairs, r.pair_splat),
             pairs * 8 + n * 24,
@@ -157,7 +157,8 @@ def stages(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, 
         ),
         "project backward": (
             lambda: project_backward(
-                rows, *arrays, 3, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens, seen.size,
+                rows, *arrays, 3, face, frames.origin, frames.matrix, frames.strain, frames.to_world,
+                frames.intrinsics, frames.size,
                 False, False, r.projected, r.first_pair, r.pairs, r.splat_pairs, pair_gradients, *gradients, screen,
             ),
             pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
@@ -180,8 +181,8 @@ def device_step(
 
 def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "demo") -> np.ndarray:
     """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of the splats."""
-    centre = mesh[faces].mean(1)
-    away = np.minimum(*(np.linalg.norm(centre - p, axis=1) for p in REGIONS[head]))
+    center = mesh[faces].mean(1)
+    away = np.minimum(*(np.linalg.norm(center - p, axis=1) for p in REGIONS[head]))
     return away <= np.quantile(away[splats.face], share)
 
 
@@ -237,8 +238,8 @@ def main() -> None:
 
     whole = measure(batch)
     if device == "cpu":
-        seen = camera_frames(face_frames(mesh, faces, mesh), camera)
-        found = cpu_table(splats, seen, target, options.repeats)
+        frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
+        found = cpu_table(splats, frames, target, options.repeats)
     else:
         found = kernel_times(step, batch, options.repeats)
         for name, ms in found.items():
@@ -258,11 +259,11 @@ def main() -> None:
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def cpu_table(splats: Splats, seen, target: np.ndarray, repeats: int) -> dict[str, float]:
+def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, float]:
     """Print the stages beside their floors; returns their times."""
     bandwidth = copy_bandwidth()
     print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s")
-    found = stages(splats, seen, target, repeats)
+    found = stages(splats, frames, target, repeats)
     print(f"{'stage':<22}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, (ms, moved) in found.items():
         floor = 1e3 * moved / bandwidth

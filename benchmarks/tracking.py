@@ -20,12 +20,18 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.flame_capture import with_sequence
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.effects.decide import decide_effects
-from stga_addon.effects.facts import Facts
+from stga_addon.effects.facts import CaptureFacts
+from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import tracking
 from stga_addon.flame.forward import FlameFrame
-from stga_addon.training.evaluate.metrics import measure
-from stga_addon.training.optimize.tracking import JOINTS, PLACE, numbers_of, refined, with_numbers
+from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.optimize.tracking import (
+    POSE_SIZE,
+    TRANSLATION_SIZE,
+    parameters_of,
+    with_parameters,
+    with_refined_tracking,
+)
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
@@ -39,7 +45,7 @@ def lose_track(capture: Capture, error: float) -> Capture:
     sequence = capture.flame
     assert sequence is not None
     expressions = sequence.model.n_expression
-    sizes = np.repeat([COEFFICIENT, RADIAN, METRE], [expressions, JOINTS, PLACE])
+    sizes = np.repeat([COEFFICIENT, RADIAN, METRE], [expressions, POSE_SIZE, TRANSLATION_SIZE])
     disturbed = {view.timestep for view in capture.views["train"]}
 
     def frame(timestep: int) -> FlameFrame:
@@ -47,7 +53,7 @@ def lose_track(capture: Capture, error: float) -> Capture:
         if timestep not in disturbed:
             return tracked
         steps = np.random.default_rng(timestep).normal(0, error * sizes)
-        return with_numbers(tracked, numbers_of(tracked) + steps)
+        return with_parameters(tracked, parameters_of(tracked) + steps)
 
     return with_sequence(capture, replace(sequence, frame=frame))
 
@@ -60,11 +66,11 @@ def millimetres(capture: Capture, true: Capture) -> float:
 
 def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tuple[Capture, Mapping[str, float], float]:
     """The capture as it was refined, the PSNR by split, and the seconds of an iteration."""
-    settings, plan = decide_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
+    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
-        shown, last = refined(capture, Path(folder)), read_metrics(Path(folder))[-1]
-    quality = {split: measure(avatar, shown, split).psnr for split in ("val", "test")}
+        shown, last = with_refined_tracking(capture, Path(folder)), read_metrics(Path(folder))[-1]
+    quality = {split: evaluate_avatar(avatar, shown, split).psnr for split in ("val", "test")}
     return shown, quality, last["seconds"] / last["iteration"]
 
 
@@ -80,7 +86,7 @@ def main() -> None:
     print("|" + " --- |" * 8)
     for error in options.errors:
         capture = lose_track(true, error)
-        facts = Facts(capture, make_settings(iterations=1))
+        facts = CaptureFacts(capture, make_settings(iterations=1))
         decided = tracking(facts)
         auto = "on" if decided is not None and decided.on else "off"
         for choice in ("off", "on"):

@@ -4,10 +4,8 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.avatar.embedding import to_world
-from ..stga_addon.avatar.file import Avatar, read_avatar
-from ..stga_addon.avatar.gaussian_avatars import write_gaussian_avatars
-from ..stga_addon.avatar.ply import write_ply
+from ..stga_addon.avatar.export import export_avatar
+from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display.splat_object import check_head
@@ -62,24 +60,19 @@ class ExportAvatar(bpy.types.Operator):
         source = file_path(self.avatar or scene_settings(context).avatar, "avatar")
         avatar = read_avatar(source)
         check_head(avatar, head)
+        if self.format == "ply" and not path.suffix:
+            path = path.with_suffix(".ply")
+        motion = None
         if self.format == "gaussian-avatars":
             own = flame_of(capture_of(head), head.name)
-            write_gaussian_avatars(path, avatar, sample_motion(head, own, _frames(context), self._warn))
-        elif self.format == "ply":
-            write_ply(path if path.suffix else path.with_suffix(".ply"), _posed(avatar, head))
-        else:
-            for frame in iterate_frames(_frames(context)):
-                write_ply(path / f"{frame:05d}.ply", _posed(avatar, head))
+            motion = sample_motion(head, own, _frames(context), self._warn)
+        frames = iterate_frames(_frames(context)) if self.format == "ply-sequence" else (context.scene.frame_current,)
+        export_avatar(path, avatar, self.format, ((frame, evaluated_vertices(head)) for frame in frames), motion)
         self.report({"INFO"}, f"Exported {len(avatar.splats)} splats to {path}")
         return {"FINISHED"}
 
     def _warn(self, sentence: str) -> None:
         self.report({"WARNING"}, sentence)
-
-
-def _posed(avatar: Avatar, head: Any) -> Any:
-    frames = avatar.frames(evaluated_vertices(head))
-    return to_world(avatar.splats, frames)
 
 
 def _frames(context: Any) -> range:

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon import __version__
-from ..stga_addon.jobs.training_job import folder_of
+from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.worker import process
 from . import ids, monitor
 from .common import file_path, reporting
@@ -26,7 +26,7 @@ class CopyReport(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         run = monitor.run_of(context.scene)
-        folder = file_path(self.directory, "folder") if self.directory or run is None else folder_of(run)
+        folder = file_path(self.directory, "folder") if self.directory or run is None else job_folder(run)
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
         context.window_manager.clipboard = f"{versions}\n{process.account(folder, monitor.snapshot(folder))}"
         self.report({"INFO"}, "Copied to the clipboard")

@@ -36,7 +36,7 @@ class ImportCapture(bpy.types.Operator):
         items=(
             ("vhap", "VHAP", "cy is counted from the bottom of the image, as VHAP's exporter writes it"),
             ("opencv", "OpenCV", "cx and cy are counted from the top left corner of the image"),
-            ("centre", "Image Centre", "cx and cy are ignored, as GaussianAvatars does"),
+            ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
         ),
     )
     correctives: bpy.props.EnumProperty(

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.training_job import TrainingJob, arguments, folder_of, work, write_job
+from ..stga_addon.jobs.training_job import TrainingJob, job_folder, run_training_job, worker_arguments, write_job
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
@@ -105,9 +105,9 @@ class Train(bpy.types.Operator):
             monitor.set_job(context.scene, run)
             avatar = _work_here(context, run)
         else:
-            process = task.start(folder_of(run), python, arguments(run))
+            process = task.start(job_folder(run), python, worker_arguments(run))
             monitor.set_job(context.scene, run)
-            monitor.started(folder_of(run), process)
+            monitor.started(job_folder(run), process)
             if not waits:
                 return {"FINISHED"}
             avatar = _wait(run, process)
@@ -145,7 +145,7 @@ class CancelTraining(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = folder_of(monitor.run_of(context.scene))
+        folder = job_folder(monitor.run_of(context.scene))
         task.ask_to_stop(folder)
         monitor.follow(folder)
         return {"FINISHED"}
@@ -170,7 +170,7 @@ class DismissTraining(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = folder_of(monitor.run_of(context.scene))
+        folder = job_folder(monitor.run_of(context.scene))
         task.forget(folder)
         monitor.forget(folder)
         monitor.set_job(context.scene, None)
@@ -186,7 +186,7 @@ def _work_here(context: Any, run: Path) -> Path:
 
     manager.progress_begin(0, 100)
     try:
-        return work(run, also=show)
+        return run_training_job(run, also=show)
     finally:
         manager.progress_end()
 
@@ -194,8 +194,8 @@ def _work_here(context: Any, run: Path) -> Path:
 def _wait(run: Path, process: "subprocess.Popen[bytes]") -> Path:
     """Wait for the worker. Raises StgaError with its sentence where it failed; the traceback goes to the terminal."""
     process.wait()
-    last = task.look(folder_of(run), process)
+    last = task.look(job_folder(run), process)
     if last.state.failed:
-        print(task.account(folder_of(run), last), file=sys.stderr)
+        print(task.account(job_folder(run), last), file=sys.stderr)
         raise StgaError(last.status.error)
     return run / "avatar.npz"

@@ -12,8 +12,7 @@ from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.raster.images import to_bytes
-from stga_addon.raster.render import render_avatar
+from stga_addon.raster.render import render_avatar, to_uint8
 
 
 @pytest.fixture
@@ -53,7 +52,7 @@ def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Pat
     pose = arrays["pose"][1]
     frame = FlameFrame(arrays["expr"][1], pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:])
     mesh = flame_forward(own.model, own.shape, frame, own.static_offset)
-    expected = to_bytes(render_avatar(read_avatar(parts["avatar"]), mesh, view.camera, (1.0, 1.0, 1.0)))
+    expected = to_uint8(render_avatar(read_avatar(parts["avatar"]), mesh, view.camera, (1.0, 1.0, 1.0)))
     with Image.open(out / "00001_01.png") as image:
         drawn = np.asarray(image)
     assert np.abs(drawn.astype(int) - expected.astype(int)).max() <= 1

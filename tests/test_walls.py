@@ -18,7 +18,7 @@ HEAVY = {"torch", "numba", "warp"}
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
-    {"files"},
+    {"files", "format"},
     {"worker"},
     {"flame"},
     {"capture"},

@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 
 from ..operators.environment import has_runtime
-from ..stga_addon.raster.render_client import missing
+from ..stga_addon.raster.render_client import missing_packages
 from ..stga_addon.scene.render.engine import ENGINE
 
 
@@ -25,6 +25,6 @@ class RenderPanel(bpy.types.Panel):
         layout.use_property_split = True
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
-        if missing():
+        if missing_packages():
             drawn_by = "Drawn by the training runtime" if has_runtime(context) else "Nothing here can draw"
-            layout.label(text=f"{drawn_by}: Blender's Python lacks {', '.join(missing())}", icon="INFO")
+            layout.label(text=f"{drawn_by}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")

@@ -9,10 +9,11 @@ from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
 from ..operators.common import package, scene_settings
 from ..operators.environment import has_runtime
-from ..stga_addon.jobs.training_job import describe, folder_of
+from ..stga_addon.format import format_duration
+from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effect_plan import TRACKING
-from ..stga_addon.training.evaluate.forecast import clock
+from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.worker.process import Snapshot, State
 from .curve import draw_curve
 from .failure import draw_failure
@@ -40,7 +41,7 @@ def _draw_choices(layout: Any, context: Any) -> None:
     chosen = scene_settings(context)
     layout.prop(chosen, "run_folder", text="Folder")
     layout.prop(chosen, "preset")
-    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
+    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
     if times:
         draw_text(layout, context, f"On this machine: {times}", "TIME")
     layout.prop(chosen, "minutes")
@@ -62,7 +63,7 @@ def _draw_progress(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
     text = {State.STARTING: "starting", State.CANCELLING: "cancelling"}.get(now.state, status.message)
     layout.progress(factor=status.share, text=f"{100 * status.share:.0f} %  {text}")
     column = layout.column(align=True)
-    for line in (*describe(status.figures), status.remark):
+    for line in (*describe_figures(status.figures), status.remark):
         draw_text(column, context, line)
     draw_curve(layout, run)
     layout.prop(scene_settings(context), "live_preview")
@@ -78,11 +79,11 @@ def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
         draw_failure(box, context, f"{run}: is not there; was it moved? Choose its folder and press Resume", (), None)
     elif now.state.failed:
         row.label(text="Training failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.tail, folder_of(run))
+        draw_failure(box, context, now.status.error, now.tail, job_folder(run))
     else:
         done = {State.FINISHED: "Trained", State.CANCELLED: "Cancelled, avatar kept"}[now.state]
         row.label(text=done, icon="CHECKMARK")
-        for line in describe(now.status.figures)[1:]:
+        for line in describe_figures(now.status.figures)[1:]:
             draw_text(box, context, line)
         draw_curve(box, run)
         if (run / TRACKING).is_file():

@@ -1,9 +1,14 @@
-"""A calibrated pinhole camera."""
+"""Calibrated pinhole camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+MAX_IMAGE_PIXELS = 1 << 27
+"""No studio camera takes larger images; a file that claims more could fill the memory."""
+MIN_PROJECTION_DEPTH = 1e-6
+"""Metres: points nearer to the camera's plane, or behind it, are projected as if they were at this depth."""
 # Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks along +z).
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -14,7 +19,7 @@ class Camera:
 
     width, height  image size
     fl_x, fl_y     focal lengths
-    cx, cy         principal point from the top-left corner of the image (OpenCV; pixel centres lie at .5)
+    cx, cy         principal point from the top-left corner of the image (OpenCV; pixel centers lie at .5)
     world_to_camera  (4, 4) float64, metres, OpenCV camera axes
     """
 
@@ -28,7 +33,7 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """Camera centre (3,) in world metres."""
+        """Camera center (3,) in world metres."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return np.asarray(-rotation.T @ translation)
 
@@ -36,6 +41,17 @@ class Camera:
     def camera_to_world_gl(self) -> np.ndarray:
         """(4, 4) pose with OpenGL camera axes: what `transform_matrix` and a Blender camera hold."""
         return np.asarray(np.linalg.inv(self.world_to_camera) @ GL_TO_CV)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel positions (N, 2) and depths (N,) in metres of world points (N, 3) metres.
+
+        Positions count from the top-left corner of the image, pixel centers lie at .5. Depth is the distance along the
+        viewing axis, negative behind the camera; positions of such points mean nothing.
+        """
+        local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        flat = local[:, :2] / np.maximum(depth, MIN_PROJECTION_DEPTH)[:, None]
+        return flat * [self.fl_x, self.fl_y] + [self.cx, self.cy], depth
 
     def scaled(self, factor: float) -> "Camera":
         """The same camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
@@ -52,3 +68,27 @@ def camera_from_gl(
     """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
     return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)
+
+
+def look_at(
+    eye: Sequence[float],
+    target: Sequence[float],
+    width: int,
+    height: int,
+    focal_length: float,
+    up: Sequence[float] = (0.0, 1.0, 0.0),
+) -> Camera:
+    """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the image's center.
+
+    width, height, focal_length in pixels. up: the world direction that points up in the image; FLAME's is +y.
+    Raises ValueError where `eye` is at `target`, or `up` is parallel to the viewing direction.
+    """
+    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    right = np.cross(forward, np.asarray(up, np.float64))
+    if not np.linalg.norm(right):
+        raise ValueError(f"look_at needs a viewing direction that is not parallel to up, got {forward} and {up}")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ np.asarray(eye, np.float64)
+    return Camera(width, height, focal_length, focal_length, width / 2, height / 2, pose)

@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 
 from ..errors import StgaError
+from .camera import MAX_IMAGE_PIXELS
 from .model import View
-from .transforms import MAX_PIXELS
 
 WHITE = (255, 255, 255)
 # Pillow opens far more formats than images come in, some by running other programs.
@@ -27,8 +27,8 @@ def image_size(path: Path) -> tuple[int, int]:
                 width, height = image.size
     except Exception as error:  # Pillow's decoders raise more than they promise.
         raise _unreadable(path, error) from error
-    if width * height > MAX_PIXELS:
-        raise StgaError(f"{path}: claims {width} x {height} pixels, more than the {MAX_PIXELS} allowed")
+    if width * height > MAX_IMAGE_PIXELS:
+        raise StgaError(f"{path}: claims {width} x {height} pixels, more than the {MAX_IMAGE_PIXELS} allowed")
     return width, height
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from .images import WHITE, read_view
 from .model import View
 
-Loaded = tuple[View, np.ndarray, np.ndarray | None]
+LoadedView = tuple[View, np.ndarray, np.ndarray | None]
 
 
 class ViewLoader:
@@ -42,7 +42,7 @@ class ViewLoader:
         self._scale, self._background, self._correct = scale, background, correct
         self._queue_bytes = queue_bytes
         self._cache = _Cache(cache_bytes)
-        self._ready: deque[Loaded] = deque()
+        self._ready: deque[LoadedView] = deque()
         self._ready_bytes = 0
         self._error: BaseException | None = None
         self._finished = self._closed = False
@@ -50,10 +50,10 @@ class ViewLoader:
         self._thread = Thread(target=self._work, args=(iter(views),), name="view loader", daemon=True)
         self._thread.start()
 
-    def __iter__(self) -> Iterator[Loaded]:
+    def __iter__(self) -> Iterator[LoadedView]:
         return self
 
-    def __next__(self) -> Loaded:
+    def __next__(self) -> LoadedView:
         start = perf_counter()
         with self._changed:
             self._changed.wait_for(lambda: self._ready or self._finished or self._closed)
@@ -97,7 +97,7 @@ class ViewLoader:
                 self._finished = True
                 self._changed.notify_all()
 
-    def _offer(self, loaded: Loaded) -> bool:
+    def _offer(self, loaded: LoadedView) -> bool:
         """Wait for room, then queue; False once closed."""
         size = _size(loaded)
         with self._changed:
@@ -111,7 +111,7 @@ class ViewLoader:
             self._changed.notify_all()
             return True
 
-    def _load(self, view: View, scale: float) -> Loaded:
+    def _load(self, view: View, scale: float) -> LoadedView:
         key = (view.image, view.mask, view.timestep, view.camera_index, scale)
         kept = self._cache.get(key)
         if kept is None:
@@ -137,12 +137,12 @@ class _Cache:
 
     def __init__(self, limit: int) -> None:
         self._limit, self._held, self._scale = limit, 0, 1.0
-        self._entries: dict[Key, Loaded] = {}
+        self._entries: dict[Key, LoadedView] = {}
 
-    def get(self, key: Key) -> Loaded | None:
+    def get(self, key: Key) -> LoadedView | None:
         return self._entries.get(key)
 
-    def put(self, key: Key, loaded: Loaded) -> None:
+    def put(self, key: Key, loaded: LoadedView) -> None:
         if key[-1] != self._scale:
             self.clear()
             self._scale = key[-1]
@@ -155,6 +155,6 @@ class _Cache:
         self._held = 0
 
 
-def _size(loaded: Loaded) -> int:
+def _size(loaded: LoadedView) -> int:
     _, image, mask = loaded
     return image.nbytes + (0 if mask is None else mask.nbytes)

@@ -37,14 +37,6 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
     )
 
 
-def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (N, 2) from the top-left corner and depths (N,) of world points (N, 3) metres."""
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = local[:, 2]
-    scaled = local[:, :2] / np.where(depth > 0, depth, np.inf)[:, None]
-    return scaled * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy], depth
-
-
 def _cameras(frame: Frame) -> list[Camera]:
     return [with_principal_point(frame.view.camera, frame.principal, name) for name in PRINCIPAL_POINTS]
 
@@ -66,7 +58,7 @@ def _shares_outside(frame: Frame, mesh: Callable[[int], np.ndarray]) -> list[flo
 
 
 def _share_outside(points: np.ndarray, camera: Camera, mask: np.ndarray) -> float:
-    pixels, depth = project(points, camera)
+    pixels, depth = camera.project(points)
     column, row = np.floor(np.clip(pixels, -1, [camera.width, camera.height])).astype(int).T
     visible = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
     inside = mask[row[visible], column[visible]] > 127

@@ -13,12 +13,11 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_json
-from .camera import Camera, camera_from_gl
+from .camera import MAX_IMAGE_PIXELS, Camera, camera_from_gl
 from .model import View
 
 SPLITS = ("train", "val", "test")
-PRINCIPAL_POINTS = ("vhap", "opencv", "centre")
-MAX_PIXELS = 1 << 27  # No studio camera takes larger images; a larger claim would let a small file fill the memory.
+PRINCIPAL_POINTS = ("vhap", "opencv", "center")
 ROTATION_TOLERANCE = 1e-3  # Exporters write float32 poses, some of them rounded to a few decimals.
 MAX_NUMBER = sys.float_info.max  # JSON's whole numbers know no limit.
 MAX_NATURAL = 1 << 31
@@ -66,7 +65,7 @@ def read_transforms(path: Path, principal_point: str = "vhap") -> tuple[Frame, .
 
     A frame's own intrinsics win over those of the top level, because real exports carry wrong ones there.
     `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means: "vhap"
-    (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "centre" (cx and cy are
+    (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center" (cx and cy are
     ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave it only for a
     sibling folder (union sets of VHAP).
     Raises StgaError naming the file and the field.
@@ -95,7 +94,7 @@ def with_principal_point(camera: Camera, written: tuple[float, float], conventio
     """The camera with the principal point that the file's (cx, cy) mean under the convention (`read_transforms`)."""
     if convention not in PRINCIPAL_POINTS:
         raise StgaError(f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}")
-    if convention == "centre":
+    if convention == "center":
         return replace(camera, cx=camera.width / 2, cy=camera.height / 2)
     cx, cy = written
     return replace(camera, cx=cx, cy=camera.height - cy if convention == "vhap" else cy)
@@ -267,7 +266,7 @@ def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int
 
         return image_size(image)
     width, height = source.number("w", low=0), source.number("h", low=0)
-    if width % 1 or height % 1 or width * height > MAX_PIXELS:
+    if width % 1 or height % 1 or width * height > MAX_IMAGE_PIXELS:
         raise StgaError(f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}")
     return int(width), int(height)
 

@@ -21,8 +21,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..training.evaluate.lpips import SMALLEST
-    from ..training.evaluate.metrics import measure
+    from ..training.evaluate.lpips import MIN_SIDE_PX
+    from ..training.evaluate.metrics import evaluate_avatar
 
     folder = options.run_folder
     if not folder.is_dir():
@@ -32,14 +32,14 @@ def run(options: Namespace) -> None:
     views = capture.views.get(options.split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{options.split}'")
-    quality = measure(avatar, capture, options.split, perceptual=True)
+    quality = evaluate_avatar(avatar, capture, options.split, perceptual=True)
     print(f"{options.split}: {len(views)} views, {_describe(quality)}")
-    for region, name in (("mask", "inside the head mask"), ("selected", "in the moving region")):
+    for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region")):
         if region in quality.regions:
             print(f"  {name}: {_describe(quality.regions[region])}")
     if quality.lpips is None:
         print("LPIPS was not measured: it needs its weights, whose file STGA_LPIPS names (docs/dependencies.md),")
-        print(f"and images of at least {SMALLEST} x {SMALLEST} pixels")
+        print(f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels")
     write_json(folder / f"quality_{options.split}.json", {"views": len(views), **quality.as_json()})
 
 

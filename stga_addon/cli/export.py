@@ -1,14 +1,13 @@
 """Export an avatar as a GaussianAvatars pair, a world-space PLY or a sequence of them."""
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..avatar.embedding import to_world
+from ..avatar.export import FORMATS, export_avatar
 from ..avatar.file import Avatar
-from ..avatar.ply import write_ply
 from ..capture.model import Capture
 from ..errors import StgaError
 from ..jobs.delegate import OpenHead
@@ -20,7 +19,7 @@ NAME, HELP = "export", "write an avatar in another format"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_avatar(parser, "avatar", "RUN|AVATAR", head)
-    parser.add_argument("--format", choices=("gaussian-avatars", "ply", "ply-sequence"), required=True)
+    parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--capture", type=Path, help="whose frames to bake (default: the run's)")
     parser.add_argument("--flame", type=Path, help="FLAME model file of that capture")
     parser.add_argument("--timestep", type=int, help="frame of a single PLY (default: the neutral mesh)")
@@ -31,39 +30,18 @@ def run(options: Namespace) -> None:
     avatar, capture = open_avatar(options.avatar, options)
     if capture is not None:
         check_topology(capture, avatar)
-    export_avatar(avatar, capture, options.format, options.out, options.timestep)
+    sequence = None if capture is None else capture.flame
+    export_avatar(options.out, avatar, options.format, _posed_meshes(avatar, capture, options), sequence)
 
 
-def export_avatar(
-    avatar: Avatar, capture: Capture | None, kind: str, out: Path, timestep: int | None = None
-) -> list[Path]:
-    """Write `avatar` as "ply" (one frame, or the neutral mesh), "ply-sequence" or "gaussian-avatars".
-
-    Returns the files written.
-    Raises StgaError where the capture that holds the frames is missing or has not what the format needs.
-    """
-    if kind == "gaussian-avatars":
-        from ..avatar.gaussian_avatars import write_gaussian_avatars
-
-        if capture is None or capture.flame is None:
-            raise StgaError("the GaussianAvatars format needs the FLAME parameters of a FLAME capture; give --capture")
-        write_gaussian_avatars(out, avatar, capture.flame)
-        return [out / "point_cloud.ply", out / "flame_param.npz"]
-    if kind == "ply" and timestep is None:
-        write_ply(out, _baked(avatar, avatar.neutral))
-        return [out]
+def _posed_meshes(avatar: Avatar, capture: Capture | None, options: Namespace) -> Iterator[tuple[int, np.ndarray]]:
+    """(timestep, mesh) to export: all of a sequence, the one that was asked for, or the neutral mesh."""
+    if options.format == "ply" and options.timestep is None:
+        yield 0, avatar.neutral
+        return
     if capture is None:
         raise StgaError("frames other than the neutral mesh need a capture; give --capture")
-    wanted = capture.timesteps if kind == "ply-sequence" else (timestep,)
-    files = []
-    for number in wanted:
-        if number not in capture.timesteps:
-            raise StgaError(f"{capture.root}: has no timestep {number}")
-        path = out / f"{number:05d}.ply" if kind == "ply-sequence" else out
-        write_ply(path, _baked(avatar, capture.mesh(number)))
-        files.append(path)
-    return files
-
-
-def _baked(avatar: Avatar, mesh: np.ndarray) -> Any:
-    return to_world(avatar.splats, avatar.frames(mesh))
+    for timestep in capture.timesteps if options.format == "ply-sequence" else (options.timestep,):
+        if timestep not in capture.timesteps:
+            raise StgaError(f"{capture.root}: has no timestep {timestep}")
+        yield timestep, capture.mesh(timestep)

@@ -5,7 +5,7 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from ..jobs.delegate import OpenHead
-from ..training.effect_plan import parse_choices, plan_to_json
+from ..training.effect_plan import effect_plan_to_json, parse_choices
 from ..training.settings import make_settings
 from .arguments import add_capture, add_device, add_effects
 from .inputs import open_named_capture
@@ -24,16 +24,16 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     from ..capture.summary import describe
-    from ..effects.decide import decide_effects, describe_effects
+    from ..effects.plan import describe_effects, plan_effects
     from ..training.optimize.device import choose_device
 
     capture = open_named_capture(options)
     plan: tuple[Any, ...] = ()
     if capture.views.get("train"):
         device, _ = choose_device(options.device)
-        _, plan = decide_effects(capture, make_settings(iterations=1, effects=parse_choices(options.effect)), device)
+        _, plan = plan_effects(capture, make_settings(iterations=1, effects=parse_choices(options.effect)), device)
     if options.json:
-        found: dict[str, Any] = {"plan": plan_to_json(plan)}
+        found: dict[str, Any] = {"plan": effect_plan_to_json(plan)}
         if options.presets and plan:
             from ..report.preset_timing import time_presets
 

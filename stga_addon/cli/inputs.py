@@ -24,7 +24,7 @@ def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | Non
     """
     capture, flame = getattr(options, "capture", None), getattr(options, "flame", None)
     if source.is_dir():
-        from ..training.optimize.tracking import refined
+        from ..training.optimize.tracking import with_refined_tracking
         from ..training.run.folder import read_run
 
         run = read_run(source)
@@ -36,7 +36,7 @@ def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | Non
             print(f"warning: {source}: was trained on refined meshes, which only its run's folder has", file=sys.stderr)
     opened = None if capture is None else open_capture(capture, flame, principal_point)
     if opened is not None and source.is_dir():
-        opened = refined(opened, source)
+        opened = with_refined_tracking(opened, source)
     return avatar, opened if opened is None or options.head is None else options.head.played(opened)
 
 

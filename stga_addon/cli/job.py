@@ -14,12 +14,12 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..jobs.training_job import work
+    from ..jobs.training_job import run_training_job
 
     if not sys.stderr.isatty():  # started by Blender, which reads the status folder
-        work(options.run_folder)
+        run_training_job(options.run_folder)
         return
     from ..training.run.progress_bar import ProgressBar
 
     with ProgressBar() as bar:
-        work(options.run_folder, also=bar.report)
+        run_training_job(options.run_folder, also=bar.report)

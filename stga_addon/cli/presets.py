@@ -15,13 +15,13 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    from ..format import format_duration
     from ..report.preset_timing import time_presets
-    from ..training.evaluate.forecast import clock
     from ..training.optimize.device import choose_device
 
     capture = open_named_capture(options)
     device, why = choose_device(options.device)
     print(why)
     for timing in time_presets(capture, device=device):
-        time = f"about {clock(timing.seconds):<10}"
+        time = f"about {format_duration(timing.seconds):<10}"
         print(f"{timing.preset:<9} {timing.iterations:6d} iterations  {time}  {timing.purpose}")

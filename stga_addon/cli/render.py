@@ -43,7 +43,7 @@ def run(options: Namespace) -> None:
     from PIL import Image
     from tqdm import tqdm
 
-    from ..raster.images import to_bytes
+    from ..raster.render import to_uint8
 
     views = [frame.view for frame in read_transforms(options.cameras, options.principal_point or "vhap")]
     if options.motion is None:
@@ -53,16 +53,16 @@ def run(options: Namespace) -> None:
     names = _unique_names([view.name for view in views])
     for view, name in zip(tqdm(views, desc="Rendering", unit="image"), names, strict=True):
         with replacing(options.out / name) as partial:
-            Image.fromarray(to_bytes(render(view))).save(partial, format="PNG")
+            Image.fromarray(to_uint8(render(view))).save(partial, format="PNG")
 
 
 def _renderer(options: Namespace) -> Callable[[View], np.ndarray]:
     """View -> image (3, H, W), for an avatar with its capture or a plain world-space PLY."""
-    from ..raster.render import render_avatar, render_splats
+    from ..raster.render import render, render_avatar
 
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
-        return lambda view: render_splats(splats, view.camera, options.background)
+        return lambda view: render(splats, view.camera, options.background)
     avatar, capture = open_avatar(options.source, options)
     if capture is None:
         raise StgaError(f"{options.source}: an avatar needs the meshes of a capture to follow; give --capture")

@@ -45,11 +45,12 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..effects.decide import decide, describe_effects
-    from ..report.run_summary import CurveDrawer, conclude
+    from ..effects.plan import describe_effects, with_effect_plan
+    from ..report.run_summary import CurveUpdater, report_run
     from ..training.optimize.device import choose_device
     from ..training.run.folder import read_run
-    from ..training.run.loop import Progress, train
+    from ..training.run.loop import train
+    from ..training.run.progress import Progress
     from ..training.run.progress_bar import ProgressBar
 
     if not options.capture.is_dir():
@@ -64,11 +65,11 @@ def run(options: Namespace) -> None:
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
         capture = open_named_capture(options)
-        run = decide(_new_run(options, capture, device), capture, device)
+        run = with_effect_plan(_new_run(options, capture, device), capture, device)
     for warning in capture.warnings:
         print(f"warning: {warning}")
-    print_table(describe_effects(run.plan))
-    draw = CurveDrawer(options.out)
+    print_table(describe_effects(run.effect_plan))
+    draw = CurveUpdater(options.out)
     with ProgressBar() as bar:
 
         def report(progress: Progress) -> bool:
@@ -77,7 +78,7 @@ def run(options: Namespace) -> None:
 
         selection = None if options.head is None else options.head.selection()
         avatar = train(capture, options.out, run, selection, options.resume, report, device)
-    for line in conclude(options.out):
+    for line in report_run(options.out):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
@@ -105,7 +106,7 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
         if getattr(options, name) not in (None, value):
             option = "--" + name.replace("_", "-")
             raise StgaError(f"{option}: this run began with {value}, which cannot change; use another --out")
-    decided = {decision.effect: decision for decision in run.plan}
+    decided = {decision.effect: decision for decision in run.effect_plan}
     for name, choice in parse_choices(options.effect).items():
         if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
             raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
@@ -137,9 +138,9 @@ def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
 
 def _preset_seconds(capture: Capture, preset: str, device: str) -> float:
     """Seconds that a preset takes on this machine's device, which are printed."""
+    from ..format import format_duration
     from ..report.preset_timing import time_presets
-    from ..training.evaluate.forecast import clock
 
     (timing,) = time_presets(capture, [preset], device=device)
-    print(f"{preset}: {timing.iterations} iterations, {clock(timing.seconds)} on this machine")
+    print(f"{preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
     return timing.seconds

@@ -22,7 +22,7 @@ LARGEST = 4.0
 """Errors of more than this many median ones are not the view's doing: lids, lips, teeth."""
 
 
-class Facts:
+class CaptureFacts:
     """A capture with training views, and the settings it is to be trained with."""
 
     def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..flame.sequence import TURN
-from .facts import Facts
+from .facts import CaptureFacts
 
 FEWEST_CAMERAS = 4
 """With fewer, colour that depends on the view has nothing between the cameras to be right about."""
@@ -58,18 +58,18 @@ class Verdict:
 class Effect:
     """An effect: its name, what it costs while it is on, its rule, and the settings that switch it.
 
-    look     its rule; None where the capture has nothing that the effect could apply to
+    rule     what decides; None where the capture has nothing that the effect could apply to
     on, off  what it sets of `TrainingSettings`
     """
 
     name: str
     cost: str
-    look: Callable[[Facts], Verdict | None]
+    rule: Callable[[CaptureFacts], Verdict | None]
     on: Mapping[str, Any] = field(default_factory=dict)
     off: Mapping[str, Any] = field(default_factory=dict)
 
 
-def view_color(facts: Facts) -> Verdict:
+def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "one camera sees everything from one direction only", only=True)
     if facts.cameras < FEWEST_CAMERAS:
@@ -79,7 +79,7 @@ def view_color(facts: Facts) -> Verdict:
     return Verdict(found.gain >= VIEW_LEVELS, says)
 
 
-def exposure(facts: Facts) -> Verdict:
+def exposure(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "one camera has no other to differ from", only=True)
     found, colors = facts.camera_difference, facts.camera_colors
@@ -91,9 +91,9 @@ def exposure(facts: Facts) -> Verdict:
     return Verdict(found.gain >= CAMERA_LEVELS, says, changes={"exposure": rows})
 
 
-def antialiasing(facts: Facts) -> Verdict:
+def antialiasing(facts: CaptureFacts) -> Verdict:
     settings, widest = facts.settings, facts.pixel_range
-    if settings.scale < 1 or settings.coarse_span > 0:
+    if settings.scale < 1 or settings.coarse_share > 0:
         return Verdict(True, "images are trained on at less than the size that they are drawn at")
     if widest > PIXEL_RANGE:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
@@ -103,7 +103,7 @@ def antialiasing(facts: Facts) -> Verdict:
     )
 
 
-def background(facts: Facts) -> Verdict:
+def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
     backdrops = samples.backdrop
     if np.isnan(backdrops).any():
@@ -118,7 +118,7 @@ def background(facts: Facts) -> Verdict:
     return Verdict(True, f"masks everywhere, and one colour behind the head ({red}, {green}, {blue})", changes=changes)
 
 
-def hull_points(facts: Facts) -> Verdict:
+def hull_points(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "one camera cannot tell how far away something beside the mesh is", only=True)
     if np.isnan(facts.beside):
@@ -126,12 +126,12 @@ def hull_points(facts: Facts) -> Verdict:
     return Verdict(facts.beside > BESIDE, f"{facts.beside:.1%} of the foreground lies beside the mesh")
 
 
-def density(facts: Facts) -> Verdict:
+def density(facts: CaptureFacts) -> Verdict:
     pixels = facts.pixels_per_splat(90)
     return Verdict(pixels > PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
 
 
-def selection(facts: Facts) -> Verdict:
+def selection(facts: CaptureFacts) -> Verdict:
     threshold = 1000 * facts.settings.selection.threshold
     if facts.selected == 0:
         return Verdict(False, f"no triangle moves by more than {threshold:g} mm in any frame", only=True)
@@ -140,7 +140,7 @@ def selection(facts: Facts) -> Verdict:
     return Verdict(asked, says + ("" if asked else ", but training all of them measured best"))
 
 
-def strain_color(facts: Facts) -> Verdict:
+def strain_color(facts: CaptureFacts) -> Verdict:
     if facts.strain < STILL:
         return Verdict(False, "the mesh has the same shape in every training frame", only=True)
     if facts.timesteps < 3:
@@ -150,7 +150,7 @@ def strain_color(facts: Facts) -> Verdict:
     return Verdict(found.gain >= STRAIN_LEVELS, says)
 
 
-def teeth(facts: Facts) -> Verdict | None:
+def teeth(facts: CaptureFacts) -> Verdict | None:
     if not facts.has_teeth:
         return None
     jaw, lips = facts.turns(2), facts.lips
@@ -161,16 +161,16 @@ def teeth(facts: Facts) -> Verdict | None:
 def joint(name: str, *joints: int) -> Effect:
     """Bones of Blender's rig that move, and the shape keys that correct the mesh where they do."""
 
-    def look(facts: Facts) -> Verdict | None:
+    def rule(facts: CaptureFacts) -> Verdict | None:
         if not facts.frames:
             return None
         turn = facts.turns(*joints)
         return Verdict(turn > TURN, f"turns by up to {turn:.1f}°")
 
-    return Effect(name, f"{9 * len(joints)} shape keys and drivers in Blender", look)
+    return Effect(name, f"{9 * len(joints)} shape keys and drivers in Blender", rule)
 
 
-def dynamic_offsets(facts: Facts) -> Verdict | None:
+def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
     if not facts.frames:
         return None
     count = sum(frame.dynamic_offset is not None for frame in facts.frames)
@@ -179,7 +179,7 @@ def dynamic_offsets(facts: Facts) -> Verdict | None:
     return Verdict(True, f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them", only=True)
 
 
-def tracking(facts: Facts) -> Verdict | None:
+def tracking(facts: CaptureFacts) -> Verdict | None:
     if not facts.frames:
         return None
     if facts.device != "cpu":
@@ -214,7 +214,7 @@ EFFECTS = (
         on={"hull_points": True},
         off={"hull_points": False},
     ),
-    Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_every": 0}),
+    Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
     Effect(
         "selection",
         "none: local iterations are cheaper than global ones",

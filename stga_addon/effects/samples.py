@@ -112,7 +112,7 @@ def _look(capture: Capture, view: View, faces: np.ndarray) -> dict[str, np.ndarr
     scale = HEIGHT / view.camera.height
     small, image, mask = read_view(view, scale if scale < 2 / 3 else 1.0)
     camera, mesh = small.camera, np.asarray(capture.mesh(view.timestep))
-    corners, depth = in_image(mesh, camera)
+    corners, depth = camera.project(mesh)
     depths = depth[capture.faces].mean(1)
     towards = _facing(mesh, capture.faces, camera)
     nearest = _nearest(corners[capture.faces], depths, (towards > 0) & (depth[capture.faces] > 0.01).all(1), camera)
@@ -132,13 +132,6 @@ def _look(capture: Capture, view: View, faces: np.ndarray) -> dict[str, np.ndarr
         "ground": np.array(np.median(depth) / view.camera.fl_x),  # of the image as it was taken
         **_around(image, mask, nearest >= 0, grown),
     }
-
-
-def in_image(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2) in pixels, and depths (N,), of points (N, 3)."""
-    p = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = p[:, :2] / np.maximum(p[:, 2:], 1e-6) * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
-    return pixels, p[:, 2]
 
 
 def _facing(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:

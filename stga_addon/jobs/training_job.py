@@ -19,12 +19,11 @@ from ..avatar.file import Avatar, write_avatar
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..files import read_json, write_json, write_npz
-from ..training.evaluate.forecast import clock
 from ..training.settings import TrainingSettings, from_json, to_json
 from ..worker import process
 
 if TYPE_CHECKING:
-    from ..training.run.loop import Progress, Report
+    from ..training.run.progress import Progress, Report
 
 FORMAT, VERSION = "stga-job", 1
 JOB, SELECTION, PREVIEW = "job.json", "selection.npz", "preview.npz"
@@ -42,7 +41,7 @@ class TrainingJob:
     settings: TrainingSettings | None
 
 
-def folder_of(run: Path) -> Path:
+def job_folder(run: Path) -> Path:
     """The job's folder, inside that of the run: they move together."""
     return run / "job"
 
@@ -53,7 +52,7 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
     selection: timestep -> (F,) bool, to be trained instead of what the rule selects.
     Raises StgaError while a worker is there, where there is a run already (none, to continue), or on a full disk.
     """
-    folder = folder_of(run)
+    folder = job_folder(run)
     has_run = (run / "run.json").exists()
     if has_run and job.settings is not None:
         raise StgaError(f"{run}: already holds a run; resume it, or choose another folder")
@@ -79,7 +78,7 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
 
 def read_job(run: Path) -> TrainingJob:
     """Raises StgaError where the run's folder holds no job, or a damaged one."""
-    path = folder_of(run) / JOB
+    path = job_folder(run) / JOB
     values = read_json(path)
     if not isinstance(values, dict) or (values.get("format"), values.get("version")) != (FORMAT, VERSION):
         raise StgaError(f"{path}: is not a job that this version reads (format '{FORMAT}', version {VERSION})")
@@ -95,23 +94,23 @@ def read_job(run: Path) -> TrainingJob:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
 
 
-def arguments(run: Path) -> list[str]:
+def worker_arguments(run: Path) -> list[str]:
     """What a worker's interpreter runs, after `-m`."""
     return ["stga_addon", "job", str(run.resolve())]
 
 
-def work(run: Path, also: "Report | None" = None) -> Path:
+def run_training_job(run: Path, also: "Report | None" = None) -> Path:
     """Carry out the run's job, telling in its folder how far it is; returns the path of the avatar.
 
     also: called as well after every iteration.
     Raises what training raises; the sentence is in the folder, too.
     """
-    folder = folder_of(run)
+    folder = job_folder(run)
     if not (folder / JOB).is_file():  # before anything is written into a folder that is none of ours
         raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
     with process.telling(folder) as teller:
-        teller.tell(0.0, "starting")
-        from ..effects.decide import decide
+        teller.tell(0.0, "Starting")
+        from ..effects.plan import with_effect_plan
         from ..training.optimize.device import choose_device
         from ..training.run.folder import Run, read_run, read_selection
         from ..training.run.loop import train
@@ -126,8 +125,8 @@ def work(run: Path, also: "Report | None" = None) -> Path:
         if job.settings is None:
             wanted = read_run(run)
         else:
-            teller.tell(0.0, "looking at the capture")
-            wanted = decide(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
+            teller.tell(0.0, "Analyzing the capture")
+            wanted = with_effect_plan(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
         report = _Report(teller, also)
         return train(capture, run, wanted, selection, job.settings is None, report, device)
 
@@ -140,7 +139,7 @@ class _Report:
         self.previewed = time.monotonic()
 
     def __call__(self, progress: "Progress") -> bool:
-        stop = self.teller.tell(progress.share, progress.message, progress.forecast_text, lambda: figures_of(progress))
+        stop = self.teller.tell(progress.share, progress.message, progress.forecast_text, progress.figures)
         if progress.avatar is not None and time.monotonic() - self.previewed > PREVIEW_S:
             self._preview(progress.avatar())
             self.previewed = time.monotonic()
@@ -149,34 +148,3 @@ class _Report:
     def _preview(self, avatar: Avatar) -> None:
         with suppress(StgaError):  # training goes on without; where the disk is full, it will say so itself
             write_avatar(self.teller.folder / PREVIEW, avatar)
-
-
-def figures_of(progress: "Progress") -> dict[str, float]:
-    """What the panel shows of a progress, as numbers."""
-    from ..training.evaluate.metrics import peak_memory_mb
-
-    values = {
-        "iteration": progress.iteration,
-        "per_second": progress.per_second,
-        "left_s": progress.left_s,
-        "loss": progress.loss,
-        "psnr": progress.psnr,
-        "splats": progress.splats,
-        "memory_mb": peak_memory_mb(),
-    }
-    return {name: float(value) for name, value in values.items() if value is not None}
-
-
-def describe(figures: Mapping[str, float]) -> list[str]:
-    """The figures of a status as short lines for a narrow panel; what is not known yet is left out."""
-    pairs = (
-        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
-        (("psnr", "PSNR {:.2f} dB"), ("loss", "loss {:.4f}")),
-        (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
-    )
-    lines = []
-    for pair in pairs:
-        known = [(text, figures[name], name) for name, text in pair if figures.get(name)]
-        parts = [text.format(clock(value) if name == "left_s" else value) for text, value, name in known]
-        lines.append("   ".join(parts).replace(",", "\u202f"))
-    return [line for line in lines if line]

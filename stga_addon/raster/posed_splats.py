@@ -26,7 +26,7 @@ class PosedSplats:
 class ComposedImage:
     """A picture of splats on nothing.
 
-    rgb (3, H, W) float32: display values, premultiplied; alpha (H, W); depth (H, W) metres along the view axis, the
+    rgb (3, H, W) float32: display values, premultiplied; alpha (H, W); depth (H, W) meters along the view axis, the
     mean over what a pixel shows, 0 where it shows nothing, or None where nobody asked for it.
     """
 

@@ -28,10 +28,10 @@ def render(
     low_pass: float = 0.3,
     antialiased: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image of world-space splats: colour (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight · z.
+    """Image of world-space splats: color (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight · z.
 
-    xyz (N, 3) metres, rotation (N, 4) wxyz of any length, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3) of
-    which the first (sh_degree + 1)² are used. near in metres, low_pass in square pixels, z the camera's.
+    xyz (N, 3) meters, rotation (N, 4) wxyz of any length, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3) of
+    which the first (sh_degree + 1)² are used. near in meters, low_pass in square pixels, z the camera's.
     antialiased: opacity loses what low_pass adds to the projected area (Mip-Splatting, 2D filter).
     Splats closer than `near` are dropped; the rest are blended front to back by z, in input order where z ties.
     A pixel ends before the splat that would leave it a transmittance of MIN_TRANSMITTANCE or less
@@ -45,18 +45,18 @@ def render(
 
     covariance = view[:3, :3] @ _covariance(rotation[order], log_scale[order]) @ view[:3, :3].T
     position = torch.as_tensor(camera.position, dtype=xyz.dtype, device=xyz.device)
-    colour = sh_colour(sh[order], xyz[order] - position, sh_degree)
-    centre, projected = _project(in_camera[order], covariance, camera, low_pass)
+    color = sh_color(sh[order], xyz[order] - position, sh_degree)
+    center, projected = _project(in_camera[order], covariance, camera, low_pass)
     visible = torch.sigmoid(opacity[order])
     if antialiased:
         blur = low_pass * torch.eye(2, dtype=xyz.dtype, device=xyz.device)
         visible = visible * (torch.linalg.det(projected - blur) / torch.linalg.det(projected)).clamp_min(0).sqrt()
-    alpha = _alpha(centre, projected, visible, camera)
-    return _composite(alpha, colour, in_camera[order, 2])
+    alpha = _alpha(center, projected, visible, camera)
+    return _composite(alpha, color, in_camera[order, 2])
 
 
-def sh_colour(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
-    """Colour (N, 3) ≥ 0 of coefficients sh (N, K, 3) seen along `direction` (N, 3), of any length."""
+def sh_color(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
+    """Color (N, 3) ≥ 0 of coefficients sh (N, K, 3) seen along `direction` (N, 3), of any length."""
     count = (degree + 1) ** 2
     basis = sh_basis(torch.nn.functional.normalize(direction, dim=-1))[:, :count]
     return (0.5 + torch.einsum("nk,nkc->nc", basis, sh[:, :count])).clamp_min(0)
@@ -106,7 +106,7 @@ def _covariance(rotation: Tensor, log_scale: Tensor) -> Tensor:
 
 
 def _project(points: Tensor, covariance: Tensor, camera: Camera, low_pass: float) -> tuple[Tensor, Tensor]:
-    """Centre (N, 2) in pixels and 2D covariance (N, 2, 2) in square pixels of splats given in camera space."""
+    """Center (N, 2) in pixels and 2D covariance (N, 2, 2) in square pixels of splats given in camera space."""
     x, y, z = points.unbind(-1)
     fx, fy = camera.fl_x, camera.fl_y
     slope_x = _clamp_to_frustum(x / z, camera.width, fx, camera.cx)
@@ -120,35 +120,35 @@ def _project(points: Tensor, covariance: Tensor, camera: Camera, low_pass: float
         dim=-2,
     )
     blur = low_pass * torch.eye(2, dtype=points.dtype, device=points.device)
-    centre = torch.stack([fx * x / z + camera.cx, fy * y / z + camera.cy], dim=-1)
-    return centre, jacobian @ covariance @ jacobian.mT + blur
+    center = torch.stack([fx * x / z + camera.cx, fy * y / z + camera.cy], dim=-1)
+    return center, jacobian @ covariance @ jacobian.mT + blur
 
 
 def _clamp_to_frustum(slope: Tensor, size: int, focal: float, principal: float) -> Tensor:
-    """Far outside the image the linearised projection explodes, so its slope stays near the image's borders."""
+    """Far outside the image the linearized projection explodes, so its slope stays near the image's borders."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     return slope.clamp(-principal / focal - margin, (size - principal) / focal + margin)
 
 
-def _alpha(centre: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
-    """Opacity (N, H, W) of every splat at every pixel centre."""
-    px = torch.arange(camera.width, dtype=centre.dtype, device=centre.device) + 0.5
-    py = torch.arange(camera.height, dtype=centre.dtype, device=centre.device) + 0.5
-    dx = px[None, None, :] - centre[:, 0, None, None]
-    dy = py[None, :, None] - centre[:, 1, None, None]
+def _alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
+    """Opacity (N, H, W) of every splat at every pixel center."""
+    px = torch.arange(camera.width, dtype=center.dtype, device=center.device) + 0.5
+    py = torch.arange(camera.height, dtype=center.dtype, device=center.device) + 0.5
+    dx = px[None, None, :] - center[:, 0, None, None]
+    dy = py[None, :, None] - center[:, 1, None, None]
     xx, xy, yy = (covariance[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
     alpha = (opacity[:, None, None] * torch.exp(-distance / 2)).clamp_max(MAX_ALPHA)
     return torch.where(alpha >= MIN_ALPHA, alpha, 0)
 
 
-def _composite(alpha: Tensor, colour: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend splats given front to back: alpha (N, H, W), colour (N, 3), z (N,)."""
+def _composite(alpha: Tensor, color: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Blend splats given front to back: alpha (N, H, W), color (N, 3), z (N,)."""
     shape = alpha.shape[1:]
     transmittance = alpha.new_ones(shape)
     running = torch.ones(shape, dtype=torch.bool, device=alpha.device)
     rgb, depth = alpha.new_zeros(3, *shape), alpha.new_zeros(shape)
-    for a, c, distance in zip(alpha, colour, z, strict=True):
+    for a, c, distance in zip(alpha, color, z, strict=True):
         remaining = transmittance * (1 - a)
         running = running & (remaining > MIN_TRANSMITTANCE)
         weight = torch.where(running, transmittance * a, 0)

@@ -1,4 +1,19 @@
-"""Pictures of a finished avatar: what `render` and `eval` show."""
+"""Render splats or an avatar with a camera.
+
+From a PLY file to a picture:
+
+    >>> from pathlib import Path
+    >>> from PIL import Image
+    >>> from stga_addon.avatar.ply import read_ply
+    >>> from stga_addon.capture.camera import look_at
+    >>> from stga_addon.raster.render import render, to_uint8
+    >>> splats = read_ply(Path("splats.ply"))
+    >>> camera = look_at(eye=(0, 0, 1), target=(0, 0, 0), width=640, height=480, focal_length=800)
+    >>> image = render(splats, camera, background=(1, 1, 1))
+    >>> Image.fromarray(to_uint8(image)).save("splats.png")
+
+`cpu.autograd.render_differentiable` renders torch tensors that require gradients.
+"""
 
 import numpy as np
 
@@ -6,26 +21,40 @@ from ..avatar.embedding import WORLD, FaceFrames
 from ..avatar.file import Avatar
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
-from .cpu.rasterize import Parameters, camera_frames, render_forward
+from .cpu.rasterize import Parameters, frames_in_camera, render_forward
+
+WHITE = (1.0, 1.0, 1.0)
 
 
-def render_avatar(
-    avatar: Avatar, mesh: np.ndarray, camera: Camera, background: tuple[float, float, float]
-) -> np.ndarray:
-    """The avatar driven by a mesh (V, 3) in world metres: (3, H, W) float32 sRGB in 0…1."""
-    return render_splats(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased)
-
-
-def render_splats(
+def render(
     splats: Splats,
     camera: Camera,
-    background: tuple[float, float, float],
+    background: tuple[float, float, float] = WHITE,
     frames: FaceFrames = WORLD,
     antialiased: bool = False,
 ) -> np.ndarray:
-    """Splats in the frames of their triangles (or in world space): (3, H, W) float32 sRGB in 0…1."""
-    arrays = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
-    seen = camera_frames(frames, camera)
-    colour = np.array(background, np.float32)
-    rendering = render_forward(arrays, splats.face, seen, splats.sh_degree, colour, antialiased=antialiased)
-    return np.clip(rendering.image, 0, 1)
+    """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
+
+    splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH coefficients);
+    positions in the frames of their triangles (`avatar.embedding.face_frames`), or in world meters with `WORLD`.
+    camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether splats narrower than a
+    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained.
+    """
+    parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
+    output = render_forward(
+        parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
+        np.array(background, np.float32), antialiased=antialiased,
+    )  # fmt: skip
+    return np.clip(output.image, 0, 1)
+
+
+def render_avatar(
+    avatar: Avatar, mesh: np.ndarray, camera: Camera, background: tuple[float, float, float] = WHITE
+) -> np.ndarray:
+    """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of `render`."""
+    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased)
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Rendered image (3, H, W) in 0…1 as pixels (H, W, 3) uint8, as image files hold them."""
+    return np.asarray(np.rint(np.clip(image, 0, 1).transpose(1, 2, 0) * 255), np.uint8)

@@ -17,14 +17,15 @@ from ..worker import process as task
 from .posed_splats import ComposedImage, PosedSplats
 from .render_protocol import pack_layers, receive, send
 
-NEEDED = ("numba", "platformdirs")
+REQUIRED_PACKAGES = ("numba", "platformdirs")
 """What drawing needs beside numpy, as pip calls it."""
 
 
 class RenderClient:
     """Draws layers, from any thread, one picture at a time.
 
-    find_python: the interpreter that draws where this one lacks NEEDED; raises StgaError where there is none.
+    find_python: the interpreter that draws where this one lacks REQUIRED_PACKAGES; raises StgaError where there is
+    none.
     """
 
     def __init__(self, find_python: Callable[[], str]) -> None:
@@ -36,7 +37,7 @@ class RenderClient:
     def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
         """`compose.compose`, here or in the worker. Raises StgaError where neither can draw."""
         with self._lock:
-            if not missing():
+            if not missing_packages():
                 from .cpu.compose import compose
 
                 return compose(layers, camera, with_depth)
@@ -89,11 +90,11 @@ class RenderClient:
         except StgaError as error:
             own = f"{sys.executable}, {sys.version.split()[0]}"
             raise StgaError(
-                f"drawing splats needs {' and '.join(missing())} in Blender's own Python ({own}), "
+                f"drawing splats needs {' and '.join(missing_packages())} in Blender's own Python ({own}), "
                 "or a training runtime, which the add-on's preferences make or take"
             ) from error
 
 
-def missing() -> list[str]:
-    """The packages of NEEDED that this interpreter lacks."""
-    return [name for name in NEEDED if find_spec(name) is None]
+def missing_packages() -> list[str]:
+    """The packages of REQUIRED_PACKAGES that this interpreter lacks."""
+    return [name for name in REQUIRED_PACKAGES if find_spec(name) is None]

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..training.evaluate.forecast import clock, curve_of
+from ..format import format_duration
+from ..training.evaluate.forecast import curve_of
 
 SIZE = 256
 """Pixels of a side: Blender's icons are square."""
@@ -43,7 +44,7 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | 
         picture.band(x, y - error, y + error, COMING)
         picture.line(x, y, COMING)
     picture.line(t, psnr, LINE)
-    return picture.pixels, f"{low:g} to {high:g} dB, 0 to {clock(end)}"
+    return picture.pixels, f"{low:g} to {high:g} dB, 0 to {format_duration(end)}"
 
 
 class _Picture:

@@ -8,15 +8,14 @@ from time import perf_counter
 import numpy as np
 
 from ..capture.images import read_view
-from ..capture.loader import Loaded
+from ..capture.loader import LoadedView
 from ..capture.model import Capture, View
-from ..effects.decide import decide_effects
+from ..effects.plan import plan_effects
 from ..errors import StgaError
 from ..selection import select_capture
 from ..training.optimize.precompile import precompile_kernels
 from ..training.optimize.trainer import Trainer
-from ..training.run.loop import COARSE
-from ..training.schedule import view_order
+from ..training.schedule import image_scale, view_order
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 
 SECONDS = 2.0
@@ -54,7 +53,7 @@ def time_presets(
     plans = []
     for name in names:
         iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
-        settings, _ = decide_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
+        settings, _ = plan_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
         pace = seconds_per_iteration(capture, settings, seconds, device)
         plans.append(PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace))
     return plans
@@ -72,20 +71,19 @@ def seconds_per_iteration(
     wanted = settings.strategy == "selective"
     trainer = Trainer(capture, settings, select_capture(capture, settings.selection) if wanted else {}, device=device)
     views = list(islice(view_order(capture.views["train"], settings.views_per_visit, settings.seed), VIEWS))
-    sizes = {settings.scale, settings.scale * COARSE} if settings.coarse_span else {settings.scale}
+    sizes = {image_scale(settings, share) for share in (0.0, 1.0)}
     images = {size: cycle([_ready(view, size, settings.background) for view in views]) for size in sizes}
     times: list[float] = []
     while sum(times[SETTLING:]) < seconds and len(times) < MOST_ITERATIONS:
         share = min(1.0, sum(times[SETTLING:]) / seconds)
-        size = settings.scale * (COARSE if share < settings.coarse_span else 1.0)
-        view, image, mask = next(images[size])
+        view, image, mask = next(images[image_scale(settings, share)])
         begin = perf_counter()
         trainer.step(view, image, share, mask)
         times.append(perf_counter() - begin)
     return float(np.mean(times[SETTLING:]))
 
 
-def _ready(view: View, size: float, background: tuple[float, ...]) -> Loaded:
+def _ready(view: View, size: float, background: tuple[float, ...]) -> LoadedView:
     """A view as the loader gives it: read-only arrays, for which the kernels are compiled."""
     red, green, blue = (round(255 * c) for c in background)
     small, image, mask = read_view(view, size, (red, green, blue))

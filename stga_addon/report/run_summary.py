@@ -1,83 +1,88 @@
-"""How a run goes and what it came to, in a picture and a few lines, read from its metrics."""
+"""Summary of a training run and its curve as a picture, from its metrics."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from ..errors import StgaError
 from ..files import replacing
-from ..training.evaluate.forecast import clock, curve_of, hits, level_since, missed
+from ..format import format_duration
+from ..training.evaluate.forecast import checked_forecasts, curve_of, explain_missed_target, plateau_start
 from ..training.run.folder import read_run
 from ..training.run.metrics_log import METRICS, read_metrics
 from .charts import run_chart
 
 CURVE = "curve.png"
-DRAWING_SHARE = 0.01
-"""Largest share of the time that goes into drawing the curve again while a run trains."""
+MAX_DRAWING_SHARE = 0.01
+"""Largest share of the time that drawing the curve may take while a run trains."""
 
 
-class CurveDrawer:
-    """Keeps the curve in a run's folder up to date, with the last forecast; to be called now and then."""
+class CurveUpdater:
+    """Keeps the curve in a run's folder up to date; call it as often as convenient."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._drawn, self._wait_until = folder, -1, 0.0
+        self._folder, self._drawn_size, self._next_update = folder, -1, 0.0
 
     def __call__(self) -> None:
         now = perf_counter()
-        if now < self._wait_until:
+        if now < self._next_update:
             return
         path = self._folder / METRICS
         size = path.stat().st_size if path.exists() else 0
-        if size != self._drawn:
-            with suppress(StgaError):  # training goes on without; where the disk is full, it will say so itself
-                draw_curve(self._folder)
-            self._drawn = size
+        if size != self._drawn_size:
+            with suppress(StgaError):  # a curve that cannot be written must not end the training
+                write_curve(self._folder)
+            self._drawn_size = size
         spent = perf_counter() - now
-        self._wait_until = now + spent / DRAWING_SHARE
+        self._next_update = now + spent / MAX_DRAWING_SHARE
 
 
-def draw_curve(folder: Path) -> None:
-    """Replace the picture of the curve in a run's folder; nothing before the first evaluation."""
+def write_curve(folder: Path) -> None:
+    """Write curve.png of the run in `folder`, if there is an evaluation to draw and matplotlib to draw it."""
     metrics = read_metrics(folder)
-    if curve_of(metrics):
+    if curve_of(metrics) and find_spec("matplotlib") is not None:
         with replacing(folder / CURVE) as partial:
-            run_chart(metrics).save(partial, format="PNG")
+            run_chart(metrics).savefig(partial, format="png")
 
 
-def conclude(folder: Path) -> list[str]:
-    """The lines for a person whose run has ended; leaves the curve as a picture in the run's folder."""
-    draw_curve(folder)
-    return describe_run(read_metrics(folder), read_run(folder).settings.target_psnr)
+def report_run(folder: Path) -> list[str]:
+    """Write the curve of a finished run and return the lines of its summary."""
+    write_curve(folder)
+    lines = summarize_run(read_metrics(folder), read_run(folder).settings.target_psnr)
+    return lines if (folder / CURVE).exists() else [*lines, f"{CURVE} was not drawn: matplotlib is not installed"]
 
 
-def describe_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
-    """Accuracy, where it was reached, the forecasts checked, and what evaluation and memory came to."""
+def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
+    """Lines on accuracy, the target (dB), checked forecasts, and the cost of evaluation and memory."""
     if not metrics:
         return []
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
         best = max((line for line in metrics if "psnr" in line), key=lambda line: line["psnr"])
         parts = [f"{best['psnr']:.2f} dB", f"SSIM {best['ssim']:.4f}"]
-        named = (("psnr_mask", "in the head mask"), ("psnr_selected", "in what moves"))
+        named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
-        lines.append(f"held-out views: {', '.join(parts)}, after {clock(best['seconds'])}, which the avatar shows")
+        when = format_duration(best["seconds"])
+        lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
     if target is not None and curve:
         reached = any(psnr >= target for _, psnr in curve)
-        lines.append(f"{target:g} dB was reached" if reached else missed(curve, target))
-    level = level_since(curve)
-    if level is not None:
-        lines.append(f"nothing was gained after {clock(level)}: more time does not help with these settings")
-    hit, checked = hits(metrics)
+        lines.append(f"{target:g} dB was reached" if reached else explain_missed_target(curve, target))
+    plateau = plateau_start(curve)
+    if plateau is not None:
+        since = format_duration(plateau)
+        lines.append(f"nothing was gained after {since}: more time does not help with these settings")
+    held, checked = checked_forecasts(metrics)
     if checked:
-        lines.append(f"forecasts: {hit} of {checked} came true within their error")
+        lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
-    lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, on top of it{memory}")
+    lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}")
     return lines
 
 
 def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:
-    """Seconds of evaluation while training over seconds of training; the last evaluation comes after it."""
+    """Seconds of evaluation during training over seconds of training; the final evaluation does not count."""
     spent: float = sum(line["evaluation_s"] for line in lines[:-1])
     return spent / max(float(lines[-1]["seconds"]), 1e-9)

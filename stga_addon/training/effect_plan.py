@@ -63,12 +63,12 @@ def parse_choices(texts: Sequence[str]) -> dict[str, str]:
     return choices
 
 
-def plan_to_json(plan: Sequence[EffectDecision]) -> list[dict[str, Any]]:
+def effect_plan_to_json(plan: Sequence[EffectDecision]) -> list[dict[str, Any]]:
     return [dict(vars(decision)) for decision in plan]
 
 
-def plan_from_json(values: Any) -> tuple[EffectDecision, ...]:
-    """Raises TypeError or ValueError for anything but what `plan_to_json` gave."""
+def effect_plan_from_json(values: Any) -> tuple[EffectDecision, ...]:
+    """Raises TypeError or ValueError for anything but what `effect_plan_to_json` gave."""
     if not isinstance(values, list):
         raise TypeError("plan is no list")
     plan = tuple(EffectDecision(**value) for value in values)

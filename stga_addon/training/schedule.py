@@ -7,6 +7,9 @@ import numpy as np
 from ..capture.model import View
 from .settings import Rates, TrainingSettings
 
+COARSE_SCALE = 0.5
+"""Size of the images during `TrainingSettings.coarse_share`, as a share of the size trained at afterwards."""
+
 
 def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:
     """Endless random order of views, from position `start` on.
@@ -36,10 +39,10 @@ def _epoch(views: Sequence[View], per_visit: int, seed: int, epoch: int) -> list
 
 def trains_globally(settings: TrainingSettings, iteration: int, visit: int, progress: float) -> bool:
     """Whether this iteration trains all splats; `visit` counts frame visits, `progress` is the share of budget."""
-    if settings.strategy != "selective" or progress < settings.warm_up:
+    if settings.strategy != "selective" or progress < settings.warm_up_share:
         return True
     count = iteration if settings.global_unit == "iteration" else visit
-    return count % (settings.global_every + 1) == settings.global_every
+    return count % (settings.global_interval + 1) == settings.global_interval
 
 
 def sh_degree(settings: TrainingSettings, progress: float) -> int:
@@ -53,3 +56,8 @@ def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
     initial = {name: getattr(rates, name) for name in names}
     ends = {name: rates.position_end if name == "xyz" else rates.end for name in initial}
     return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}
+
+
+def image_scale(settings: TrainingSettings, progress: float) -> float:
+    """Size of the images trained on at a share of the budget, as a share of the captured size."""
+    return settings.scale * (COARSE_SCALE if progress < settings.coarse_share else 1.0)

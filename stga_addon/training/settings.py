@@ -48,29 +48,30 @@ class TrainingSettings:
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA, embedding)
     convention     embedding convention
     views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the paper's batches)
-    global_every, global_unit   a global iteration after every so many local iterations, or "frame" visits
-    warm_up        share of the budget trained globally before the first local iteration
+    global_interval, global_unit   a global iteration after every so many local iterations, or "frame" visits
+    warm_up_share        share of the budget trained globally before the first local iteration
     selection      which triangles a frame trains
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     distance_weight, distance_limit   the same for the distance from the triangle's origin
-    averaging      the avatar is made of each splat's running average over its steps, in which the latest has this
+    ema_share      the avatar is made of each splat's running average over its steps, in which the latest has this
                    share; 1: of the splats as they are
-    stray_every, stray_limit, stray_to    every so many iterations (0: never), a splat farther than the limit from its
-                   triangle's origin is put back to this share of the limit; 0: onto the origin, as in the paper
+    stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a splat farther than the
+                   limit from its triangle's origin is put back to this share of the limit; 0: onto the origin, as in
+                   the paper
                    All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
                    for "gaussian_avatars"
     sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
     hull_points    add hull points for what the mesh does not cover
-    density_every  iterations between density control, 0 never; it works during `density_span` of the budget
+    density_interval  iterations between density control, 0 never; it works during `density_span` of the budget
     growth         most splats that density control may add, as a share of the initial number
     background     colour behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put another random colour behind the head in every iteration, so that
                    splats in the background's colour cannot hide in it and alpha becomes right
-    scale, coarse_span   size of the images trained on, as a share of the captured ones; during the first
-                   `coarse_span` of the budget half of that
+    scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
+                   `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
-    stop_when_flat  stop when more time no longer helps (`forecast.level_since`)
+    stop_when_flat  stop when more time no longer helps (`forecast.plateau_start`)
     preset         the preset that these settings began with, or none
     strain_color   splats carry colour that follows how their triangle deforms (`avatar.strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
@@ -90,9 +91,9 @@ class TrainingSettings:
     lattice: int = 2
     convention: str = "stga"
     views_per_visit: int = 1
-    global_every: int = 1
+    global_interval: int = 1
     global_unit: str = "iteration"
-    warm_up: float = 0.6
+    warm_up_share: float = 0.6
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     rates: Rates = field(default_factory=Rates)
     ssim_weight: float = 0.2
@@ -100,20 +101,20 @@ class TrainingSettings:
     scale_limit: float = 4.0
     distance_weight: float = 0.0
     distance_limit: float = 1.0
-    averaging: float = 0.05
-    stray_every: int = 200
+    ema_share: float = 0.05
+    stray_reset_interval: int = 200
     stray_limit: float = 6.0
-    stray_to: float = 1.0
+    stray_reset_share: float = 1.0
     sh_degree: int = 3
     sh_steps: tuple[float, ...] = (0.3, 0.5, 0.7)
     hull_points: bool = True
-    density_every: int = 200
+    density_interval: int = 200
     density_span: tuple[float, float] = (0.1, 0.6)
     growth: float = 0.25
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     random_background: bool = True
     scale: float = 1.0
-    coarse_span: float = 0.0
+    coarse_share: float = 0.0
     target_psnr: float | None = None
     stop_when_flat: bool = False
     preset: str | None = None
@@ -127,12 +128,12 @@ class TrainingSettings:
 
 PAPER_SETTINGS = {
     "views_per_visit": 0,
-    "global_every": 20,
-    "warm_up": 0.0,
+    "global_interval": 20,
+    "warm_up_share": 0.0,
     "scale_limit": 1.0,
     "stray_limit": 1.0,
-    "stray_to": 0.0,
-    "averaging": 1.0,
+    "stray_reset_share": 0.0,
+    "ema_share": 1.0,
     "lattice": 4,
     "hull_points": False,
     "random_background": False,
@@ -140,7 +141,7 @@ PAPER_SETTINGS = {
 }
 """The paper's letter, where it differs from the defaults, which are what measured best (docs/results.md)."""
 
-GAUSSIAN_AVATARS = {
+GAUSSIAN_AVATARS_SETTINGS = {
     "convention": "gaussian_avatars",
     "lattice": 0,
     "rates": Rates(
@@ -148,8 +149,8 @@ GAUSSIAN_AVATARS = {
     ),
     "scale_limit": 0.6,
     "distance_weight": 0.01,
-    "stray_every": 0,
-    "averaging": 1.0,
+    "stray_reset_interval": 0,
+    "ema_share": 1.0,
     "hull_points": False,
     "random_background": False,
     "growth": 8.0,
@@ -204,7 +205,7 @@ def make_settings(
     if schedule == "paper":
         base.update(PAPER_SETTINGS)
     if strategy == "gaussian-avatars":
-        base.update(GAUSSIAN_AVATARS)
+        base.update(GAUSSIAN_AVATARS_SETTINGS)
     settings = TrainingSettings(**{**base, "strategy": strategy, "schedule": schedule, **changes})
     if (settings.seconds is None) == (settings.iterations is None):
         raise StgaError("give a budget in wall time (--budget) or in iterations (--iterations), one of the two")

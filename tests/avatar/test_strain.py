@@ -12,7 +12,7 @@ from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.strain import face_strain, strain_basis
 from stga_addon.capture.camera import Camera
-from stga_addon.raster.render import render_avatar, render_splats
+from stga_addon.raster.render import render, render_avatar
 
 FACES = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]], np.int32)
 
@@ -115,7 +115,7 @@ def test_baking_keeps_the_picture() -> None:
     drawn = render_avatar(avatar, posed, camera, white)
     baked = to_world(avatar.splats, avatar.frames(posed))
     assert baked.strain_color.shape[1] == 0
-    np.testing.assert_allclose(render_splats(baked, camera, white), drawn, atol=2e-5)
+    np.testing.assert_allclose(render(baked, camera, white), drawn, atol=2e-5)
     plain = replace(avatar, splats=replace(avatar.splats, strain_color=np.zeros_like(avatar.splats.strain_color)))
     assert np.abs(render_avatar(plain, posed, camera, white) - drawn).max() > 0.05
     undeformed = face_frames(posed, FACES, neutral)

@@ -44,7 +44,7 @@ def test_the_plan_reaches_the_run(chosen, extension, tmp_path):
     run = read_run(out)
     assert run.settings.strain_color
     assert (run.settings.preset, run.settings.lattice) == ("draft", PRESETS["draft"].changes["lattice"])
-    assert {decision.effect: decision.choice for decision in run.plan}["strain-color"] == "on"
+    assert {decision.effect: decision.choice for decision in run.effect_plan}["strain-color"] == "on"
 
 
 def test_another_head_has_another_plan(chosen):

@@ -20,7 +20,7 @@ from stga_addon.flame.sequence import read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
-from stga_addon.training.optimize.tracking import Tracking, refined, write_tracking  # noqa: E402
+from stga_addon.training.optimize.tracking import Tracking, with_refined_tracking, write_tracking  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
@@ -91,7 +91,7 @@ def test_a_runs_refined_tracking(scene, tmp_path):
     tracking = Tracking(scene.own, scene.own.timesteps)
     tracking.state.change[:] = np.random.default_rng(0).normal(0, 0.05, tracking.tracked.shape)
     write_tracking(tmp_path, tracking)
-    shown = refined(open_capture(scene.folder, scene.model_file), tmp_path)
+    shown = with_refined_tracking(open_capture(scene.folder, scene.model_file), tmp_path)
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3
     assert bpy.ops.stga.apply_motion(filepath=str(tmp_path / "tracking.npz"), start=0) == {"FINISHED"}
     for timestep in scene.own.timesteps:
@@ -111,7 +111,7 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     tracking = Tracking(own.flame, own.flame.timesteps)
     tracking.state.change[:] = rng.normal(0, 0.05, tracking.tracked.shape)
     write_tracking(tmp_path, tracking)
-    shown = refined(own, tmp_path)
+    shown = with_refined_tracking(own, tmp_path)
     path = str(tmp_path / "tracking.npz")
     bpy.ops.stga.apply_motion(filepath=path, start=0, place=place)
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without

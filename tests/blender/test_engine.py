@@ -16,7 +16,8 @@ from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.raster.cpu.project import _basis  # noqa: E402
-from stga_addon.raster.render import render_avatar, render_splats  # noqa: E402
+from stga_addon.raster.render import render as render_splats  # noqa: E402
+from stga_addon.raster.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402

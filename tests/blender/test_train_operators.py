@@ -43,7 +43,7 @@ def worker(extension, head, tmp_path):
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
         job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
         watch.set_job(bpy.context.scene, run)
-        teller = stack.enter_context(task.telling(job.folder_of(run)))
+        teller = stack.enter_context(task.telling(job.job_folder(run)))
         teller.tell(0.25, "training")
         teller.run, teller.leave = run, stack.close
         yield teller

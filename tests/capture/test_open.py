@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 import stga_addon
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.open import open_capture
-from stga_addon.capture.principal_point import project
 from stga_addon.capture.summary import describe, spans
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import flame_forward
@@ -218,7 +217,7 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
     """Catches a capture of the other convention opened without a word, and a warning where all is well."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     assert open_capture(root, principal_point="vhap").warnings == ()
-    for wrong in ("opencv", "centre"):
+    for wrong in ("opencv", "center"):
         (warning,) = open_capture(root, principal_point=wrong).warnings
         assert f"read as '{wrong}'" in warning
         assert "with 'vhap'" in warning
@@ -255,7 +254,7 @@ def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) ->
 
     each_split(root, shift)
     (warning,) = open_capture(root, principal_point="opencv").warnings
-    assert "with 'centre'" in warning
+    assert "with 'center'" in warning
 
 
 def test_studio_head(shared_data: Path) -> None:
@@ -267,7 +266,7 @@ def test_studio_head(shared_data: Path) -> None:
     for view in (capture.views["train"][0], capture.views["val"][-1], capture.views["test"][-1]):
         mask = read_mask(view)
         assert mask is not None
-        column, row = project(capture.mesh(view.timestep), view.camera)[0].astype(int).T
+        column, row = view.camera.project(capture.mesh(view.timestep))[0].astype(int).T
         assert (mask[row, column] > 0).mean() > 0.99
 
 
@@ -461,7 +460,7 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
     with pytest.raises(StgaError, match=r"give your FLAME model file .* with --flame, or in the add-on"):
         open_capture(root)
-    with pytest.raises(StgaError, match="'left' is not one of vhap, opencv, centre"):
+    with pytest.raises(StgaError, match="'left' is not one of vhap, opencv, center"):
         open_capture(root, model_file, "left")
     with pytest.raises(StgaError, match="is not a folder"):
         open_capture(root / "transforms_train.json")

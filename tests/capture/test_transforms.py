@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stga_addon.capture.principal_point import project
 from stga_addon.capture.transforms import Frame, inside, read_splits, read_transforms
 from stga_addon.errors import StgaError
 
@@ -27,7 +26,7 @@ def test_projection_is_that_of_an_opengl_camera(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(scale=0.1, size=(50, 3))
     x, y, z, _ = np.linalg.inv(factory.pose(2)) @ np.c_[points, np.ones(50)].T
     u, v = factory.CX + factory.FOCAL * x / -z, factory.CY - factory.FOCAL * y / -z
-    pixels, depth = project(points, camera)
+    pixels, depth = camera.project(points)
     np.testing.assert_allclose(pixels, np.c_[u, v], atol=1e-9)
     np.testing.assert_allclose(depth, -z, atol=1e-12)
     np.testing.assert_allclose(camera.camera_to_world_gl, factory.pose(2), atol=1e-12)
@@ -60,7 +59,7 @@ def test_shared_intrinsics_and_field_of_view(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("convention", "expected"),
-    [("vhap", (19.0, 36.0)), ("opencv", (19.0, 24.0)), ("centre", (20.0, 30.0))],
+    [("vhap", (19.0, 36.0)), ("opencv", (19.0, 24.0)), ("center", (20.0, 30.0))],
 )
 def test_principal_point(tmp_path: Path, convention: str, expected: tuple[float, float]) -> None:
     """Catches a convention mixed up: the file holds cx 19 and cy 24 of a 40 x 60 image."""

@@ -93,7 +93,7 @@ def test_train(trained: Path, root: Path) -> None:
     run = read_run(trained)
     assert run.capture == root.resolve()
     assert (run.settings.iterations, run.settings.seconds) == (10, None)
-    assert run.settings.global_every == 20
+    assert run.settings.global_interval == 20
     assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
 
 

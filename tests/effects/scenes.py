@@ -112,13 +112,13 @@ def _camera(number: int, count: int) -> Camera:
 
 def _draw(mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Picture (SIZE, SIZE, 3) float and mask (SIZE, SIZE) uint8, drawn large and shrunk."""
-    p = mesh @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = SUPERSAMPLED * (p[:, :2] / p[:, 2:] * FOCAL + SIZE / 2) - 0.5
+    pixels, depth = camera.project(mesh)
+    pixels = SUPERSAMPLED * pixels - 0.5
     large = (SUPERSAMPLED * SIZE, SUPERSAMPLED * SIZE)
     picture, mask = Image.new("RGB", large), Image.new("L", large)
     draw, cover = ImageDraw.Draw(picture), ImageDraw.Draw(mask)
     levels = np.clip(colors, 0, 255).round().astype(int)
-    for face in np.argsort(-p[faces, 2].mean(1)).tolist():
+    for face in np.argsort(-depth[faces].mean(1)).tolist():
         corners = pixels[faces[face]].ravel().tolist()
         draw.polygon(corners, fill=tuple(levels[face].tolist()))
         cover.polygon(corners, fill=255)

@@ -9,10 +9,10 @@ import pytest
 from training.heads import write_head
 
 from stga_addon.capture.images import read_view
-from stga_addon.effects.decide import decide_effects
+from stga_addon.effects.plan import plan_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
 from stga_addon.training.optimize import cpu_backend, frames, trainer
-from stga_addon.training.optimize.exposure import even_exposure
+from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.optimize.trainer import initial_splats
 from stga_addon.training.run import loop
 from stga_addon.training.run.folder import Run, read_checkpoint
@@ -34,10 +34,10 @@ ITERATIONS = 12
 def train(capture, folder, monkeypatch, choice):
     """Train with all effects on or off; how often each was called, and the checkpoint."""
     names = dict.fromkeys((*CALLS, "view-color", "antialiasing"), choice)
-    wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up=0.0)
-    settings, plan = decide_effects(capture, wanted)
-    if settings.density_every:
-        settings = replace(settings, density_every=2, density_span=(0.0, 1.0))
+    wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up_share=0.0)
+    settings, plan = plan_effects(capture, wanted)
+    if settings.density_interval:
+        settings = replace(settings, density_interval=2, density_span=(0.0, 1.0))
     calls: Counter[str] = Counter()
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
@@ -75,7 +75,7 @@ def test_on_calls_all(painted, tmp_path, monkeypatch):
 def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
     """Catches parameters that are read, differentiated or written where nobody asked for it, or not where one did."""
     capture, _ = write_head(tmp_path / "head")
-    settings, _ = decide_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
+    settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
     calls: Counter[str] = Counter()
     for module, name in ((trainer, "track"), (cpu_backend, "frame_backward"), (loop, "write_tracking")):
         monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
@@ -94,7 +94,7 @@ def test_exposure_is_taken_away(painted):
     """Catches gains and offsets applied the wrong way round, to the background, or to a camera they are not of."""
     gain, offset = unlike_cameras()
     rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
-    correct = even_exposure(make_settings(iterations=1, exposure=rows))
+    correct = exposure_correction(make_settings(iterations=1, exposure=rows))
     assert correct is not None
     alike, unlike = painted(), painted(gain=gain, offset=offset)
     for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
@@ -109,7 +109,7 @@ def test_exposure_is_taken_away(painted):
 
 def test_no_exposure_is_no_pass():
     """Catches images that are copied for nothing."""
-    assert even_exposure(make_settings(iterations=1)) is None
+    assert exposure_correction(make_settings(iterations=1)) is None
 
 
 def test_no_splats_on_teeth(painted):
@@ -131,5 +131,5 @@ def test_no_splats_on_teeth(painted):
 @pytest.mark.parametrize("choice", ["on", "off"])
 def test_antialiasing_reaches_the_kernels(painted, choice):
     """Catches an effect that is decided and then forgotten."""
-    settings, _ = decide_effects(painted(), make_settings(iterations=1, effects={"antialiasing": choice}))
+    settings, _ = plan_effects(painted(), make_settings(iterations=1, effects={"antialiasing": choice}))
     assert settings.antialiased == (choice == "on")

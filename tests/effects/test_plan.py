@@ -7,8 +7,8 @@ from capture import factory
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.effects import decide as planning
-from stga_addon.effects.decide import decide
+from stga_addon.effects import plan as planning
+from stga_addon.effects.plan import with_effect_plan
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.run.folder import Run, read_run, write_run
@@ -31,7 +31,7 @@ def trained(root, tmp_path_factory):
 def test_the_run_keeps_its_plan(trained):
     """Catches decisions or their reasons that are lost in run.json, and settings that do not follow them."""
     run = read_run(trained)
-    plan = {decision.effect: decision for decision in run.plan}
+    plan = {decision.effect: decision for decision in run.effect_plan}
     assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == ("on", True, True)
     assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == ("off", False, False)
     assert plan["exposure"].choice == "auto"
@@ -40,7 +40,7 @@ def test_the_run_keeps_its_plan(trained):
 
 def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr(planning, "decide_effects", None)
+    monkeypatch.setattr(planning, "plan_effects", None)
     before = read_run(trained)
     train = ["train", str(root), "--out", str(trained), "--resume"]
     assert main([*train, "--effect", "strain-color=on"]) == 0
@@ -81,7 +81,7 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         out = tmp_path / options[1]
         assert main(["train", str(root), "--out", str(out), "--iterations", "2", *options]) == 0
         run = read_run(out)
-        assert (run.plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
+        assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
         again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
         assert main([*again, "--effect", "strain-color=on"]) == 2
         assert "--effect: " in capsys.readouterr().err
@@ -90,7 +90,7 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
 def test_settings_that_ask_for_nothing(root):
     """Catches `make_settings` whose settings are not final: benchmarks and tests rely on them."""
     run = Run(root, None, "vhap", make_settings(iterations=5))
-    assert decide(run, open_capture(root)) is run
+    assert with_effect_plan(run, open_capture(root)) is run
 
 
 def test_a_damaged_plan(tmp_path):
@@ -99,7 +99,7 @@ def test_a_damaged_plan(tmp_path):
     whole = read_json(tmp_path / "run.json")
     good = {"effect": "jaw", "choice": "auto", "on": True, "reason": "", "cost": ""}
     for plan in (7, [7], [{**good, "on": "yes"}], [{**good, "choice": "maybe"}], [{"effect": "jaw"}]):
-        write_json(tmp_path / "run.json", {**whole, "plan": plan})
+        write_json(tmp_path / "run.json", {**whole, "effect_plan": plan})
         with pytest.raises(StgaError, match=r"run\.json: "):
             read_run(tmp_path)
     for row in ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0]):

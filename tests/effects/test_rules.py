@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stga_addon.effects import rules
-from stga_addon.effects.decide import decide_effects
 from stga_addon.effects.evidence import calm, fit_cameras
-from stga_addon.effects.facts import Facts
+from stga_addon.effects.facts import CaptureFacts
+from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.samples import MOST_VIEWS, sample_views, take_samples
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
@@ -22,7 +22,7 @@ from .scenes import gloss, wrinkles
 def planned(capture, **choices):
     """effect -> decision, and the settings that follow."""
     names = {name.replace("_", "-"): choice for name, choice in choices.items()}
-    settings, plan = decide_effects(capture, make_settings(iterations=1, effects=names))
+    settings, plan = plan_effects(capture, make_settings(iterations=1, effects=names))
     return {decision.effect: decision for decision in plan}, settings
 
 
@@ -105,7 +105,7 @@ def test_background(painted):
 
 def test_a_room_behind_the_head(painted):
     """Catches a background of many colours that is exchanged as if it had one."""
-    facts = Facts(painted(), make_settings(iterations=1))
+    facts = CaptureFacts(painted(), make_settings(iterations=1))
     facts.samples = replace(facts.samples, unevenness=np.full(len(facts.samples.camera), 40.0))
     verdict = rules.background(facts)
     assert (verdict.on, verdict.only) == (False, True)
@@ -127,27 +127,27 @@ def test_different_pixels(painted):
         replace(view, camera=replace(view.camera, fl_x=840.0, fl_y=840.0)) if view.camera_index == 0 else view
         for view in capture.views["train"]
     ]
-    facts = Facts(replace(capture, views={"train": tuple(views)}), make_settings(iterations=1, lattice=0))
+    facts = CaptureFacts(replace(capture, views={"train": tuple(views)}), make_settings(iterations=1, lattice=0))
     assert facts.pixel_range == pytest.approx(2.0, abs=0.1)
     assert rules.antialiasing(facts).on
-    assert not rules.antialiasing(Facts(painted(), make_settings(iterations=1, lattice=0))).on
-    assert rules.antialiasing(Facts(painted(), make_settings(iterations=1))).on  # six splats a triangle are fine ones
+    assert not rules.antialiasing(CaptureFacts(painted(), make_settings(iterations=1, lattice=0))).on
+    assert rules.antialiasing(CaptureFacts(painted(), make_settings(iterations=1))).on
 
 
 def test_many_splats_a_pixel(painted):
     """Catches density control where the first splats are already finer than the images."""
-    settings, plan = decide_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
+    settings, plan = plan_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
     assert not next(decision.on for decision in plan if decision.effect == "density")
-    assert settings.density_every == 0
+    assert settings.density_interval == 0
 
 
 def test_selection_follows_the_strategy(painted):
     """Catches a strategy that was asked for and is dropped, or one that was not and is taken."""
-    settings, _ = decide_effects(painted(), make_settings("selective", iterations=1, effects={}))
+    settings, _ = plan_effects(painted(), make_settings("selective", iterations=1, effects={}))
     assert settings.strategy == "selective"
     _, settings = planned(painted(), selection="on")
     assert settings.strategy == "selective"
-    settings, plan = decide_effects(
+    settings, plan = plan_effects(
         painted(timesteps=1, deformed=0.0), make_settings("selective", iterations=1, effects={})
     )
     assert settings.strategy == "global"
@@ -164,11 +164,11 @@ def with_frames(*frames):
     model = SimpleNamespace(v_template=np.zeros((10, 3)))
     flame = SimpleNamespace(timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model)
     capture = SimpleNamespace(views={"train": ()}, flame=flame)
-    return Facts(capture, make_settings(iterations=1))
+    return CaptureFacts(capture, make_settings(iterations=1))
 
 
 def looked(facts, name):
-    return next(effect for effect in rules.EFFECTS if effect.name == name).look(facts)
+    return next(effect for effect in rules.EFFECTS if effect.name == name).rule(facts)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_dynamic_offsets():
 def off_track(capture, metres, device="cpu"):
     """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
     meshes = {timestep: capture.mesh(timestep) + np.array([metres, 0, 0]) for timestep in capture.timesteps}
-    facts = Facts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
+    facts = CaptureFacts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
     facts.frames = [frame()]
     return facts
 
@@ -230,7 +230,7 @@ def test_overrides(painted):
     """Catches a choice that does not reach the settings, or whose reason is lost."""
     plan, settings = planned(painted(), strain_color="on", view_color="on", background="off", density="off")
     assert (settings.strain_color, settings.sh_degree, settings.random_background) == (True, 3, False)
-    assert settings.density_every == 0
+    assert settings.density_interval == 0
     assert plan["strain-color"].choice == "on"
     assert "as asked" in str(plan["strain-color"])
     assert "0.0 of 255 levels" in plan["strain-color"].reason

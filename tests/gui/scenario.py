@@ -62,7 +62,7 @@ def splats() -> int:
 
 
 def job_folder() -> Path:
-    return watch.folder_of(watch.run_of(bpy.context.scene))
+    return watch.job_folder(watch.run_of(bpy.context.scene))
 
 
 def first() -> Iterator[Callable[[], bool]]:

@@ -14,7 +14,8 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
 from stga_addon.jobs import training_job
 from stga_addon.jobs.delegate import FOLDER
-from stga_addon.jobs.training_job import TrainingJob, describe, folder_of, read_job, work, write_job
+from stga_addon.jobs.training_job import TrainingJob, job_folder, read_job, run_training_job, write_job
+from stga_addon.training.run.progress import describe_figures
 from stga_addon.training.settings import make_settings
 from stga_addon.worker import process as task
 from stga_addon.worker.process import State
@@ -35,7 +36,7 @@ def painted() -> dict[int, np.ndarray]:
 
 
 def start(run: Path) -> "subprocess.Popen[bytes]":
-    return task.start(folder_of(run), sys.executable, training_job.arguments(run))
+    return task.start(job_folder(run), sys.executable, training_job.worker_arguments(run))
 
 
 def test_round_trip(tmp_path, capture):
@@ -43,13 +44,13 @@ def test_round_trip(tmp_path, capture):
     wanted = new_job(capture)
     write_job(tmp_path / "run", wanted, painted())
     assert read_job(tmp_path / "run") == wanted
-    read = read_npz(folder_of(tmp_path / "run") / training_job.SELECTION)
+    read = read_npz(job_folder(tmp_path / "run") / training_job.SELECTION)
     assert {int(name): mask.tolist() for name, mask in read.items()} == {t: m.tolist() for t, m in painted().items()}
 
 
 def test_the_next_job_forgets_the_last(tmp_path, capture):
     """Catches yesterday's selection, preview or wish to cancel in today's training."""
-    run, folder = tmp_path / "run", folder_of(tmp_path / "run")
+    run, folder = tmp_path / "run", job_folder(tmp_path / "run")
     write_job(run, new_job(capture), painted())
     for name in (training_job.PREVIEW, task.CANCEL, task.STATUS):
         (folder / name).write_text("{}")
@@ -68,7 +69,7 @@ def test_refusals(tmp_path, capture):
         write_job(run, new_job(capture))
     write_job(run, TrainingJob(capture, None, "vhap", None))
     assert read_job(run).settings is None
-    with task.telling(folder_of(run)), pytest.raises(StgaError, match="another worker is at work"):
+    with task.telling(job_folder(run)), pytest.raises(StgaError, match="another worker is at work"):
         write_job(run, TrainingJob(capture, None, "vhap", None))
 
 
@@ -82,16 +83,16 @@ def test_refusals(tmp_path, capture):
 )
 def test_damaged_jobs(tmp_path, values):
     """Catches a traceback where a job was damaged or comes from another version."""
-    write_json(_made(folder_of(tmp_path)) / training_job.JOB, values)
+    write_json(_made(job_folder(tmp_path)) / training_job.JOB, values)
     with pytest.raises(StgaError, match=r"job\.json"):
         read_job(tmp_path)
 
 
 def test_figures_in_short_lines():
     """Catches a panel that shows what is not known yet, or numbers that nobody can read."""
-    assert describe({}) == []
+    assert describe_figures({}) == []
     figures = {"iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0}
-    assert describe(figures) == ["12.3 it/s   2.1 min left", "PSNR 30.00 dB", "61\u202f234 splats"]
+    assert describe_figures(figures) == ["12.3 it/s   2.1 min left", "PSNR 30.00 dB", "61\u202f234 splats"]
 
 
 @pytest.mark.slow
@@ -101,10 +102,10 @@ def test_a_worker_trains_what_this_process_would(tmp_path, capture):
     here, there, plain = tmp_path / "here", tmp_path / "there", tmp_path / "plain"
     for run in (here, there):
         write_job(run, new_job(capture), painted())
-    assert work(here) == here / "avatar.npz"
+    assert run_training_job(here) == here / "avatar.npz"
     process = start(there)
-    assert process.wait(300) == 0, task.log_lines(folder_of(there), 50)
-    seen = task.look(folder_of(there), process)
+    assert process.wait(300) == 0, task.log_lines(job_folder(there), 50)
+    seen = task.look(job_folder(there), process)
     assert seen.state == State.FINISHED
     assert seen.status.figures["splats"] > 0
     assert {"psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
@@ -123,7 +124,7 @@ def test_a_worker_trains_what_this_process_would(tmp_path, capture):
 def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path, capture):
     """Catches a cancel that throws work away, and a resumed run that begins anew."""
     pytest.importorskip("torch")
-    run, folder = tmp_path / "run", folder_of(tmp_path / "run")
+    run, folder = tmp_path / "run", job_folder(tmp_path / "run")
     write_job(run, new_job(capture, iterations=40))
 
     def cancel(progress):
@@ -132,12 +133,12 @@ def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path, capture):
         assert progress.iteration <= 6
         return False
 
-    work(run, also=cancel)
+    run_training_job(run, also=cancel)
     assert task.look(folder).state == State.CANCELLED
     assert (run / "avatar.npz").exists()
     write_job(run, TrainingJob(capture, None, "opencv", None))
     first = []
-    work(run, also=lambda progress: first.append(progress.iteration))
+    run_training_job(run, also=lambda progress: first.append(progress.iteration))
     assert min(n for n in first if n) > 5
     assert max(first) == 40
     assert task.look(folder).state == State.FINISHED
@@ -154,18 +155,18 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     previews = []
 
     def look(progress):
-        path = folder_of(run) / training_job.PREVIEW
+        path = job_folder(run) / training_job.PREVIEW
         if path.exists():
             previews.append(len(read_avatar(path).splats))
         return False
 
     write_job(run, new_job(capture))
-    work(run, also=look)
+    run_training_job(run, also=look)
     assert len(previews) > 5
     monkeypatch.setattr(training_job, "PREVIEW_S", 1e9)
     write_job(quiet, new_job(capture))
-    work(quiet)
-    assert not (folder_of(quiet) / training_job.PREVIEW).exists()
+    run_training_job(quiet)
+    assert not (job_folder(quiet) / training_job.PREVIEW).exists()
     np.testing.assert_array_equal(read_npz(run / "avatar.npz")["xyz"], read_npz(quiet / "avatar.npz")["xyz"])
 
 
@@ -180,7 +181,7 @@ def test_a_preview_that_cannot_be_written_costs_nothing_else(tmp_path, capture, 
     monkeypatch.setattr(training_job, "PREVIEW_S", 0.0)
     monkeypatch.setattr(training_job, "write_avatar", full)
     write_job(tmp_path / "run", new_job(capture))
-    assert work(tmp_path / "run").exists()
+    assert run_training_job(tmp_path / "run").exists()
 
 
 @pytest.mark.slow
@@ -193,7 +194,7 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     write_job(run, new_job(capture))
     (capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
     assert main(["job", str(run)]) == 2
-    seen = task.look(folder_of(run))
+    seen = task.look(job_folder(run))
     assert seen.state == State.FAILED
     assert "00003.obj" in seen.status.error
     assert seen.status.traceback == ""
@@ -204,9 +205,9 @@ def test_an_interpreter_without_anything_is_named(tmp_path, capture):
     write_job(tmp_path / "run", new_job(capture))
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv/bin/python"
-    process = task.start(folder_of(tmp_path / "run"), str(python), training_job.arguments(tmp_path / "run"))
+    process = task.start(job_folder(tmp_path / "run"), str(python), training_job.worker_arguments(tmp_path / "run"))
     assert process.wait(60) == 2
-    seen = task.look(folder_of(tmp_path / "run"), process)
+    seen = task.look(job_folder(tmp_path / "run"), process)
     assert seen.status.error == f"the worker ended with exit status 2: stga: {python} lacks the package 'numpy'"
 
 

@@ -1,4 +1,4 @@
-"""Triangles that are hardly any: by name, as corners (3, 3) at the scale of a head's, in metres."""
+"""Triangles that are hardly any: by name, as corners (3, 3) at the scale of a head's, in meters."""
 
 import numpy as np
 

@@ -15,7 +15,7 @@ IMAGES = "rgb", "alpha", "depth"
 def facing(
     count: int, seed: int = 0, size: tuple[int, int] = (37, 29), focal: float = 40.0, degree: int = 1, **changes: object
 ) -> Scene:
-    """`count` splats two metres before a camera at the origin that looks along +z; `changes` replaces parameters."""
+    """`count` splats two meters before a camera at the origin that looks along +z; `changes` replaces parameters."""
     rng = np.random.default_rng(seed)
     width, height = size
     splats = {
@@ -57,15 +57,15 @@ def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
     order = torch.argsort(points[:, 2], stable=True)
     order = order[points[order, 2] >= 0.0099]
     covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
-    centre, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    center, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
     shape = (scene.camera.height, scene.camera.width)
     steady, transmittance = torch.ones(shape, dtype=torch.bool), torch.ones(shape, dtype=torch.float64)
     running = torch.ones(shape, dtype=torch.bool)
     # The same with the cut-offs moved by the margin, by making each splat a little more or less opaque.
     logit = torch.sigmoid(opacity[order])
-    kept = reference._alpha(centre, projected, logit, scene.camera)
+    kept = reference._alpha(center, projected, logit, scene.camera)
     for other in (logit * (1 - margin), logit * (1 + margin)):
-        moved = reference._alpha(centre, projected, other, scene.camera)
+        moved = reference._alpha(center, projected, other, scene.camera)
         steady &= (((moved > 0) == (kept > 0)) & ((moved < 0.999) == (kept < 0.999))).all(0)
     for alpha in kept:
         after = transmittance * (1 - alpha)
@@ -78,7 +78,7 @@ def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
 def compare(scene: Scene, near: float = 0.01, roundings: int = 0) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Largest differences between kernels and reference on steady pixels, and the kernels' gradients.
 
-    Images: absolute for rgb and alpha, relative to the largest for depth and for colours above one. Gradients: under
+    Images: absolute for rgb and alpha, relative to the largest for depth and for colors above one. Gradients: under
     random cotangents, over the largest of the quantity. Fails if anything is not finite.
     roundings: how often the scene's numbers are rounded otherwise to see what that alone does to the float64 result;
     only a difference beyond ten times as much counts, because what hangs on the last bit of its input, such as the

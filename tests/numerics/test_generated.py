@@ -43,23 +43,23 @@ def scenes(draw: st.DrawFn) -> Scene:
     )
 
 
-def steady_colours(scene: Scene) -> bool:
-    """Whether no colour lies so near zero, where it is cut, that float32 may take the other side."""
+def steady_colors(scene: Scene) -> bool:
+    """Whether no color lies so near zero, where it is cut, that float32 may take the other side."""
     direction = torch.from_numpy(scene.splats["xyz"]).double()
     basis = reference.sh_basis(torch.nn.functional.normalize(direction, dim=-1))[:, : (scene.degree + 1) ** 2]
     sh = torch.from_numpy(scene.splats["sh"]).double()
-    colour = 0.5 + torch.einsum("nk,nkc->nc", basis, sh)
-    return bool((colour.abs() > 1e-5 * (0.5 + sh.abs().sum((1,)))).all())
+    color = 0.5 + torch.einsum("nk,nkc->nc", basis, sh)
+    return bool((color.abs() > 1e-5 * (0.5 + sh.abs().sum((1,)))).all())
 
 
 def steady_order(scene: Scene) -> bool:
-    """Whether no two depths round to neighbouring float32 values in another order."""
+    """Whether no two depths round to neighboring float32 values in another order."""
     depths = np.sort(scene.splats["xyz"][:, 2].astype(np.float64))
     return bool((np.diff(depths) > 1e-6 * depths[1:]).all())
 
 
 def check(scene: Scene) -> None:
-    if not (steady_colours(scene) and steady_order(scene)):
+    if not (steady_colors(scene) and steady_order(scene)):
         return
     errors, _ = compare(scene, near=float(np.float32(0.01)), roundings=2)
     # What shows through a splat of opacity 0.999 is known to 3e-5, the rounding of 0.999 over 1 - 0.999; through
@@ -94,7 +94,7 @@ WILD = st.sampled_from([0.0, 1e-45, 1e-38, 1e-20, 1.0, 50.0, 90.0, 1e4, 1e8, 1e2
 def test_any_number_in_any_place_harms_only_its_splat(places: list[tuple[int, str, int, bool, float]]) -> None:
     """Catches overflow, 0/0 and NaN from any combination of extreme entries in up to a dozen places.
 
-    The image and every gradient stay finite, except that a colour beyond float32 may exceed it where it is blended:
+    The image and every gradient stay finite, except that a color beyond float32 may exceed it where it is blended:
     so harmonics beyond 1e20 are left out.
     """
     scene = facing(20)

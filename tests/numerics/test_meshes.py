@@ -14,7 +14,7 @@ from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
 from stga_addon.flame.forward_torch import flame_forward as torch_forward
 from stga_addon.raster import reference
-from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.rasterize import Parameters
 
 from .meshes import DEGENERATE, WHOLE, mesh_of
@@ -35,7 +35,7 @@ def assert_proper(rotation: np.ndarray) -> None:
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_a_line_in_the_neutral_mesh_does_not_grow(convention: str, name: str, dtype: type) -> None:
     """Catches a ratio of areas whose denominator is rounding: three corners on a line, in float32 as in a file, have
-    1e-13 m², and when the triangle opens its splats would be drawn 20,000 times too large, a hundred metres away."""
+    1e-13 m², and when the triangle opens its splats would be rendered 20,000 times too large, a hundred meters away."""
     neutral = DEGENERATE[name].astype(dtype).astype(float)
     splats = lattice_splats(neutral, FACES, convention=convention)
     frames = face_frames(WHOLE, FACES, neutral, convention)
@@ -96,7 +96,7 @@ def test_collapsed_triangles_render_and_train_in_float32() -> None:
         cotangents = random_cotangents(camera)
 
         tensors = [torch.from_numpy(values[name]).clone().requires_grad_() for name in NAMES]
-        images = render(Parameters(*tensors), camera, frames, splats.face, degree=1)
+        images = render_differentiable(Parameters(*tensors), camera, frames, splats.face, degree=1)
         gradients = torch.autograd.grad(
             sum((i * v.float()).sum() for i, v in zip(images, cotangents, strict=True)), tensors
         )

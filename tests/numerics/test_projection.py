@@ -10,8 +10,8 @@ from raster.test_kernels import embed
 from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.cpu.autograd import render
-from stga_addon.raster.cpu.rasterize import Parameters, camera_frames, render_forward
+from stga_addon.raster.cpu.autograd import render_differentiable
+from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera, render_forward
 
 from .scenes import (
     NAMES,
@@ -69,7 +69,7 @@ SCENES = {
     "opacity logits of 12": facing(60, opacity=np.full(60, 12.0)),
     # Catches exp(50)², and σ(−50) / σ(−50) of a splat that nobody sees.
     "opacity logits of ±50": facing(60, opacity=np.array([50, -50, 0] * 20)),
-    # Catches a colour that is clamped above or kept in fewer bits.
+    # Catches a color that is clamped above or kept in fewer bits.
     "harmonics of 1e4": facing(60, sh=RNG.normal(0, 1e4, (60, 4, 3))),
     # Catches tile bounds that are not cut at the image.
     "each covers everything": facing(12, log_scale=log_normal(12, 30), opacity=np.full(12, -2.0)),
@@ -173,7 +173,7 @@ def test_a_broken_splat_is_dropped_and_counted(name: str) -> None:
         np.testing.assert_array_equal(gradients[parameter][others], expected[parameter], err_msg=parameter)
         assert not gradients[parameter][3].any(), parameter
     splats = Parameters(*(scene.splats[n] for n in NAMES))
-    rendering = render_forward(splats, np.zeros(20, np.int32), camera_frames(WORLD, scene.camera), 1)
+    rendering = render_forward(splats, np.zeros(20, np.int32), frames_in_camera(WORLD, scene.camera), 1)
     np.testing.assert_array_equal(np.flatnonzero(rendering.rect[:, 0] < 0), [3])
 
 
@@ -236,7 +236,7 @@ def draw(
     splats: dict[str, np.ndarray], face: np.ndarray, frames: FaceFrames, camera: Camera
 ) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
     tensors = [torch.from_numpy(splats[name]).clone().requires_grad_() for name in NAMES]
-    images = render(Parameters(*tensors), camera, frames, face, degree=1)
+    images = render_differentiable(Parameters(*tensors), camera, frames, face, degree=1)
     cotangents = random_cotangents(camera)
     loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
     gradients = torch.autograd.grad(loss, tensors)
@@ -251,7 +251,7 @@ def head_camera(distance: float = 0.8, focal: float = 90.0) -> Camera:
 
 @pytest.mark.parametrize("shift", [[100.0, 0, 0], [-60.0, 70, 40], [1e4, 1e4, 1e4]])
 def test_a_head_far_from_the_origin_is_the_same_head(shift: list[float]) -> None:
-    """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a millimetre."""
+    """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a millimeter."""
     posed, neutral, faces = triangles()
     splats, face = embedded()
     camera = head_camera()
@@ -279,7 +279,7 @@ def test_a_mesh_a_thousand_times_too_large_or_small(size: float, distance: float
     splats, face = embedded()
     camera = head_camera(distance, focal)
     camera.world_to_camera[:2, 3] *= size
-    frames = face_frames(posed * size, faces, neutral)  # the splats stay in metres of the neutral mesh
+    frames = face_frames(posed * size, faces, neutral)  # the splats stay in meters of the neutral mesh
     images, gradients = draw(splats, face, frames, camera)
     tensors = [torch.from_numpy(splats[name]).double().requires_grad_() for name in NAMES]
     expected_images = reference.render(*embed(tensors, frames, face), camera, sh_degree=1)

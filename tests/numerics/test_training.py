@@ -1,4 +1,4 @@
-"""Losses and the optimiser at the edge of float32, against their formulas in float64."""
+"""Losses and the optimizer at the edge of float32, against their formulas in float64."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,9 @@ from training.toys import bits, random_splats
 
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit
-from stga_addon.raster.cpu.rasterize import Parameters, camera_frames, render_backward, render_forward
+from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera, render_backward, render_forward
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.losses import REACH, image_gradient, tile_rectangles, whole_image
+from stga_addon.training.optimize.losses import LOSS_REACH_PX, image_gradient, tile_rectangles, whole_image
 from stga_addon.training.optimize.state import new_state
 
 from .scenes import NAMES, facing, random_cotangents
@@ -107,13 +107,13 @@ def test_nothing_and_everything_selected() -> None:
     """Catches an empty list of tiles, rectangles or rows, and a full selection that is not a global iteration."""
     scene = facing(40, size=(70, 50), focal=60.0)
     splats, face = Parameters(*(scene.splats[n] for n in NAMES)), np.zeros(40, np.int32)
-    seen = camera_frames(WORLD, scene.camera)
+    camera_frames = frames_in_camera(WORLD, scene.camera)
     v_image = random_cotangents(scene.camera)[0].float().numpy()
     results = []
     for focus in (None, np.ones(40, bool), np.zeros(40, bool)):
-        rendering = render_forward(splats, face, seen, 1, focus=focus, reach=REACH)
+        rendering = render_forward(splats, face, camera_frames, 1, focus=focus, reach=LOSS_REACH_PX)
         gradients = Parameters(*(np.full_like(a, 7) for a in splats if a is not None))
-        rows, _ = render_backward(rendering, splats, face, seen, v_image, gradients)
+        rows, _ = render_backward(rendering, splats, face, camera_frames, v_image, gradients)
         results.append((rows, gradients))
     np.testing.assert_array_equal(results[0][0], results[1][0])
     for name in NAMES:
@@ -193,7 +193,7 @@ def test_adam_after_a_spike_whose_square_overflows(spike: float) -> None:
 
 def test_a_row_that_is_stepped_once_in_ten_thousand() -> None:
     """Catches bias correction by iterations instead of the row's own steps: after three rare ones its moments are
-    still corrected by 1 − β³, while its neighbour's are not any more."""
+    still corrected by 1 − β³, while its neighbor's are not any more."""
     state = new_state(random_splats(2, 3))
     state.parameters.opacity[:] = 0
     for tensor in state.gradients:

@@ -6,7 +6,7 @@ import torch
 
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.rasterize import Parameters
 
 TOLERANCE = 2e-5  # gsplat computes in float32
@@ -34,5 +34,5 @@ def test_reference_reproduces_gsplat(gsplat_case):
 def test_kernels_reproduce_gsplat(gsplat_case):
     """Catches the same in the kernels, independently of our own reference."""
     splats, camera, expected = gsplat_case
-    rgb, alpha, _ = render(Parameters(*splats), camera)
+    rgb, alpha, _ = render_differentiable(Parameters(*splats), camera)
     assert (torch.cat([rgb, alpha[None]]) - expected).abs().max() < TOLERANCE

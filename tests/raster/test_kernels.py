@@ -11,17 +11,17 @@ from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
-from stga_addon.raster.cpu.autograd import render
-from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, camera_frames, render_backward, render_forward
+from stga_addon.raster.cpu.autograd import render_differentiable
+from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, frames_in_camera, render_backward, render_forward
 from stga_addon.raster.cpu.threads import set_threads, threads
 
 NAMES = Parameters._fields[:5]
 # Kernels compute in float32 with a polynomial exp; a pixel sums up to a hundred terms below 1.
 IMAGE_TOLERANCE = 1e-5
-# Depth is that sum times distances of a few metres.
+# Depth is that sum times distances of a few meters.
 DEPTH_TOLERANCE = 4e-5
 # Gradients: largest error over the largest gradient of that quantity in the scene.
-# Colour is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the inverse 2D
+# Color is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the inverse 2D
 # covariance, whose float32 conditioning worsens with the splats' anisotropy.
 GRADIENT_TOLERANCE = {"sh": 1e-5, "opacity": 2e-5, "xyz": 2e-5, "rotation": 2e-5, "log_scale": 5e-5}
 
@@ -34,7 +34,7 @@ class Scene:
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
-    """(4, 4) world to camera: any rotation, the world's origin four metres ahead."""
+    """(4, 4) world to camera: any rotation, the world's origin four meters ahead."""
     axes, upper = np.linalg.qr(rng.normal(size=(3, 3)))
     axes *= np.sign(np.diag(upper))
     axes[0] *= np.linalg.det(axes)
@@ -80,7 +80,7 @@ SCENES = {
     "one column": cloud(8, size=(1, 50)),
     "exact tiles": cloud(9, size=(32, 16)),
     "one more than a tile": cloud(10, size=(17, 33)),
-    "off centre": cloud(11, shift=(13.3, -9.1)),
+    "off center": cloud(11, shift=(13.3, -9.1)),
     "around the camera": cloud(12, spread=4.0),
     "mostly off screen": cloud(13, spread=1.5, zoom=2.0, log_scale=-1.0),
     "covering everything": cloud(14, count=12, log_scale=0.7, logit=-2.0),
@@ -101,7 +101,7 @@ def reference_gradients(scene: Scene, cotangents: list[torch.Tensor]) -> tuple[l
 
 def kernel_gradients(scene: Scene, cotangents: list[torch.Tensor]) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
     tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
-    images = render(Parameters(*tensors), scene.camera, degree=scene.degree)
+    images = render_differentiable(Parameters(*tensors), scene.camera, degree=scene.degree)
     return finish(images, cotangents, tensors)
 
 
@@ -145,7 +145,7 @@ def test_image_and_gradients_are_the_references(name):
 
 @pytest.mark.parametrize("quantity", [0, 1, 2])
 def test_each_image_alone_has_the_references_gradient(quantity):
-    """Catches colour, alpha and depth gradients that are only right in sum, or one that is dropped."""
+    """Catches color, alpha and depth gradients that are only right in sum, or one that is dropped."""
     scene = SCENES["plain"]
     cotangents = [v * (i == quantity) for i, v in enumerate(random_cotangents(scene.camera, 1))]
     _, gradients = kernel_gradients(scene, cotangents)
@@ -182,7 +182,9 @@ def test_embedded_splats_render_and_train_in_their_frames(convention):
     cotangents = random_cotangents(scene.camera, 2)
 
     tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
-    images, gradients = finish(render(Parameters(*tensors), scene.camera, frames, face), cotangents, tensors)
+    images, gradients = finish(
+        render_differentiable(Parameters(*tensors), scene.camera, frames, face), cotangents, tensors
+    )
     tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
     expected_images = reference.render(*embed(tensors, frames, face), scene.camera)
     expected_images, expected = finish(expected_images, cotangents, tensors)
@@ -190,18 +192,18 @@ def test_embedded_splats_render_and_train_in_their_frames(convention):
     assert_gradients_agree(gradients, expected)
 
 
-def raw_gradients(scene: Scene, fill: float = 0.0, scratch: BufferPool | None = None, **options):
+def raw_gradients(scene: Scene, fill: float = 0.0, buffers: BufferPool | None = None, **options):
     """Forward and backward through the array door: rendering, gradients whose untouched rows keep `fill`, and rows.
 
-    background, focus and reach are `render_forward`'s. The cotangents are of colour and alpha.
+    background, focus and reach are `render_forward`'s. The cotangents are of color and alpha.
     """
     splats = Parameters(*(scene.splats[name] for name in NAMES))
     face = np.zeros(len(splats.xyz), np.int32)
-    seen = camera_frames(WORLD, scene.camera)
-    rendering = render_forward(splats, face, seen, scene.degree, scratch=scratch, **options)
+    camera_frames = frames_in_camera(WORLD, scene.camera)
+    rendering = render_forward(splats, face, camera_frames, scene.degree, buffers=buffers, **options)
     v_image, v_alpha, _ = (v.float().numpy() for v in random_cotangents(scene.camera, 3))
     gradients = Parameters(*(np.full_like(a, fill) for a in splats if a is not None))
-    rows, screen = render_backward(rendering, splats, face, seen, v_image, gradients, -v_alpha, scratch)
+    rows, screen = render_backward(rendering, splats, face, camera_frames, v_image, gradients, -v_alpha, buffers)
     return rendering, gradients, rows, screen
 
 
@@ -219,7 +221,7 @@ def test_background_shows_through_and_pulls_on_the_splats():
     assert_gradients_agree(gradients._asdict(), dict(zip(NAMES, (g.numpy() for g in expected), strict=True)))
 
 
-def test_screen_gradient_is_that_of_the_projected_centre():
+def test_screen_gradient_is_that_of_the_projected_center():
     """Catches density control fed with pixels, or with the gradient of something else: half images, by both axes."""
     scene = cloud(25, count=40, size=(60, 35))
     xyz, rotation, log_scale, opacity, sh = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
@@ -227,15 +229,15 @@ def test_screen_gradient_is_that_of_the_projected_centre():
     points = xyz @ view[:3, :3].T + view[:3, 3]
     order = torch.argsort(points[:, 2])
     covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
-    centre, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
-    centre.requires_grad_()
-    colour = reference.sh_colour(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
+    center, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    center.requires_grad_()
+    color = reference.sh_color(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
     opacity = torch.sigmoid(opacity[order])
     rgb, alpha, _ = reference._composite(
-        reference._alpha(centre, projected, opacity, scene.camera), colour, points[order, 2]
+        reference._alpha(center, projected, opacity, scene.camera), color, points[order, 2]
     )
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
-    gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), centre)[0]
+    gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), center)[0]
     expected = np.zeros(40)
     expected[order] = np.hypot(gradient[:, 0] * 60 / 2, gradient[:, 1] * 35 / 2)
     _, _, rows, screen = raw_gradients(scene)
@@ -243,7 +245,7 @@ def test_screen_gradient_is_that_of_the_projected_centre():
     np.testing.assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
 
 
-def test_colour_follows_strain_with_the_right_gradient():
+def test_color_follows_strain_with_the_right_gradient():
     """Catches strain of the wrong triangle, a coefficient in the wrong unit, and a gradient that misses the clamp."""
     scene, rng = SCENES["dark"], np.random.default_rng(31)
     count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
@@ -256,7 +258,7 @@ def test_colour_follows_strain_with_the_right_gradient():
     cotangents = random_cotangents(scene.camera, 5)
 
     tensors = [torch.from_numpy(a).clone().requires_grad_() for a in (*map(scene.splats.get, NAMES), color)]
-    images = render(Parameters(*tensors), scene.camera, frames, face)
+    images = render_differentiable(Parameters(*tensors), scene.camera, frames, face)
     loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
     gradient = torch.autograd.grad(loss, tensors)[-1].numpy()
     local = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
@@ -278,7 +280,7 @@ def test_antialiasing_takes_what_the_low_pass_adds(name):
     scene = SCENES[name]
     cotangents = random_cotangents(scene.camera, 6)
     tensors = [torch.from_numpy(scene.splats[n]).clone().requires_grad_() for n in NAMES]
-    images = render(Parameters(*tensors), scene.camera, degree=scene.degree, antialiased=True)
+    images = render_differentiable(Parameters(*tensors), scene.camera, degree=scene.degree, antialiased=True)
     images, gradients = finish(images, cotangents, tensors)
     tensors = [torch.from_numpy(scene.splats[n]).double().requires_grad_() for n in NAMES]
     expected_images = reference.render(*tensors, scene.camera, sh_degree=scene.degree, antialiased=True)
@@ -300,11 +302,11 @@ def test_gradients_are_overwritten():
 
 def test_reused_buffers_change_nothing():
     """Catches results that depend on what an earlier, larger or smaller, rendering left in the buffers."""
-    scratch = BufferPool()
+    buffers = BufferPool()
     for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
         scene = SCENES[name]
         expected, wanted, rows, screen = raw_gradients(scene)
-        rendering, gradients, same_rows, same_screen = raw_gradients(scene, scratch=scratch)
+        rendering, gradients, same_rows, same_screen = raw_gradients(scene, buffers=buffers)
         np.testing.assert_array_equal(rendering.image, expected.image, err_msg=name)
         np.testing.assert_array_equal(same_rows, rows)
         np.testing.assert_array_equal(same_screen[rows], screen[rows])

@@ -24,7 +24,7 @@ def splats(kind: str, count: int = 400) -> np.ndarray:
 
 
 def reached(splat: np.ndarray, left: int, width: int, rows: int, spare: float = 0.0) -> np.ndarray:
-    """(rows,) bool: whether a pixel of the row has its centre inside the outline, made larger by a share `spare`."""
+    """(rows,) bool: whether a pixel of the row has its center inside the outline, made larger by a share `spare`."""
     mean_x, mean_y, precision_x, shear, precision_y, extent_y = splat.astype(np.float64)
     dy = np.arange(rows)[:, None] + 0.5 - mean_y
     dx = left + np.arange(width) + 0.5 - mean_x - shear * dy
@@ -43,7 +43,7 @@ def test_no_pixel_is_lost_and_few_rows_are_idle(kind: str, left: int, width: int
         rows = reached(splat, left, width, 16, spare=-1e-5)
         assert not (rows & ~covered).any(), (splat, first, past)
         found += int(rows.sum())
-        # Between pixels no centre is reached, so that a row or two may be idle where a needle passes.
+        # Between pixels no center is reached, so that a row or two may be idle where a needle passes.
         idle += int((covered & ~reached(splat, left, width, 16, spare=0.02)).sum())
     assert found > 0
     assert idle <= (0.6 if kind == "needles" or width == 1 else 0.1) * found + 20, (idle, found)
@@ -55,4 +55,4 @@ def test_what_lies_beside_reaches_no_row():
     first, past = rows_within(outline(*diagonal), np.float32(12), np.float32(4), np.float32(4))
     assert first >= past
     first, past = rows_within(outline(*diagonal), np.float32(0), np.float32(4), np.float32(16))
-    assert (first, past) == (0, 6)  # centres of columns up to 3.5, of rows up to 5.5
+    assert (first, past) == (0, 6)  # centers of columns up to 3.5, of rows up to 5.5

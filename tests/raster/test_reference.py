@@ -13,8 +13,8 @@ def camera_on_axis(width: int, height: int, focal: float) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
-def one_splat(z: float, logit: float, log_sigma: float, raw_colour: float = 0.0) -> list[torch.Tensor]:
-    columns = [[[0, 0, z]], [[1, 0, 0, 0]], [[log_sigma] * 3], [logit], [[[raw_colour] * 3]]]
+def one_splat(z: float, logit: float, log_sigma: float, raw_color: float = 0.0) -> list[torch.Tensor]:
+    columns = [[[0, 0, z]], [[1, 0, 0, 0]], [[log_sigma] * 3], [logit], [[[raw_color] * 3]]]
     return [torch.tensor(column, dtype=torch.float64) for column in columns]
 
 
@@ -23,7 +23,7 @@ def stacked(*splats: list[torch.Tensor]) -> list[torch.Tensor]:
 
 
 def test_isotropic_splat_has_the_closed_form():
-    """Catches a wrong focal length, pixel centre, low-pass or depth: on the axis the projection is exact."""
+    """Catches a wrong focal length, pixel center, low-pass or depth: on the axis the projection is exact."""
     z, sigma, logit, focal = 4.0, 0.3, 0.7, 20.0
     rgb, alpha, depth = reference.render(*one_splat(z, logit, np.log(sigma)), camera_on_axis(9, 7, focal), sh_degree=0)
     columns, rows = np.meshgrid(np.arange(9) + 0.5 - 4.5, np.arange(7) + 0.5 - 3.5)
@@ -51,7 +51,7 @@ def test_harmonics_are_scipys():
 
 
 def test_rotation_matrix_is_scipys():
-    """Catches a quaternion read as xyzw, or not normalised."""
+    """Catches a quaternion read as xyzw, or not normalized."""
     rotation = pytest.importorskip("scipy.spatial.transform").Rotation
     quaternion = np.random.default_rng(1).normal(size=(20, 4)) * 3
     expected = rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
@@ -77,19 +77,19 @@ def test_splats_nearer_than_near_are_dropped():
         assert not image.any()
 
 
-def test_colour_is_never_negative():
-    """Catches a missing clamp of the harmonics' colour at zero."""
-    splats = one_splat(2.0, 2.0, -1.0, raw_colour=-4.0)
+def test_color_is_never_negative():
+    """Catches a missing clamp of the harmonics' color at zero."""
+    splats = one_splat(2.0, 2.0, -1.0, raw_color=-4.0)
     rgb, alpha, _ = reference.render(*splats, camera_on_axis(5, 4, 5.0), sh_degree=0)
     assert alpha.max() > 0.5
     assert not rgb.any()
 
 
-def test_centred_frustum_limit_is_1_3_half_fields_of_view():
-    """Catches a limit that is not symmetric on a centred camera, or ignores an off-centre principal point."""
+def test_centerd_frustum_limit_is_1_3_half_fields_of_view():
+    """Catches a limit that is not symmetric on a centerd camera, or ignores an off-center principal point."""
     slope = torch.tensor([-9.0, 9.0])
-    centred = reference._clamp_to_frustum(slope, 100, 50.0, 50.0)
-    np.testing.assert_allclose(centred, [-1.3, 1.3], rtol=1e-6)
+    centerd = reference._clamp_to_frustum(slope, 100, 50.0, 50.0)
+    np.testing.assert_allclose(centerd, [-1.3, 1.3], rtol=1e-6)
     shifted = reference._clamp_to_frustum(slope, 100, 50.0, 60.0)
     np.testing.assert_allclose(shifted, [-1.5, 1.1], rtol=1e-6)
 

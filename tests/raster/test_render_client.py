@@ -1,4 +1,4 @@
-"""Layers drawn together, here and by a worker in another interpreter."""
+"""Layers rendered together, here and by a worker in another interpreter."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from stga_addon.errors import StgaError
 from stga_addon.raster import render_client
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
-from stga_addon.raster.render import render_splats
+from stga_addon.raster.render import render
 from stga_addon.raster.render_client import RenderClient
 from stga_addon.raster.render_protocol import pack_layers, unpack_layers
 
@@ -51,10 +51,10 @@ def embedded() -> PosedSplats:
 
 
 def test_one_layer_is_drawn_as_ever():
-    """Catches a second rasteriser that parts from the first."""
+    """Catches a second rasterizer that parts from the first."""
     splats = cloud()
     picture = compose([world(splats)], CAMERA)
-    expected = render_splats(splats, CAMERA, (1.0, 0.5, 0.0))
+    expected = render(splats, CAMERA, (1.0, 0.5, 0.0))
     behind = (1 - picture.alpha) * np.array([1.0, 0.5, 0.0])[:, None, None]
     np.testing.assert_allclose(np.clip(picture.rgb + behind, 0, 1), expected, atol=2e-6)
     assert picture.depth is None
@@ -72,7 +72,7 @@ def test_layers_are_sorted_together():
 
 
 def test_turning_the_scene_turns_nothing():
-    """Catches colours that follow the scene's directions instead of the layer's own."""
+    """Catches colors that follow the scene's directions instead of the layer's own."""
     turn = np.eye(4)
     turn[:3, :3] = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     turn[:3, :3] *= np.sign(np.linalg.det(turn[:3, :3]))
@@ -110,7 +110,7 @@ def test_layers_survive_the_wire():
 @pytest.mark.slow
 def test_a_worker_draws_the_same(monkeypatch):
     """Catches a worker that draws something else, forgets its layers, or stays behind."""
-    monkeypatch.setattr(render_client, "missing", lambda: ["numba"])
+    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     remote = RenderClient(lambda: sys.executable)
     layers = [embedded(), world(cloud())]
     for camera in (CAMERA, CAMERA.scaled(0.5)):
@@ -136,7 +136,7 @@ def test_nobody_who_can_draw_is_one_sentence(monkeypatch):
     def nobody() -> str:
         raise StgaError("no runtime")
 
-    monkeypatch.setattr(render_client, "missing", lambda: ["numba", "platformdirs"])
+    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
     with pytest.raises(StgaError, match=r"drawing splats needs numba and platformdirs in Blender's own .*runtime"):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):

@@ -87,7 +87,7 @@ def spin(begin, end, times, out):
 
 
 def test_python_goes_on_meanwhile() -> None:
-    """Catches kernels that hold Python's lock: Blender's window would stand still while a picture is drawn."""
+    """Catches kernels that hold Python's lock: Blender's window would stand still while a picture is rendered."""
     out = np.zeros(1)
     spin(0, 1, 1, out)
     ticks = []

@@ -31,24 +31,24 @@ from stga_addon.avatar.embedding import CONVENTIONS, WORLD, face_frames
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.raster import reference
 from stga_addon.raster.cpu import autograd as cpu
-from stga_addon.raster.cpu.image_loss import REACH, change_background
+from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from stga_addon.raster.cpu.optimizer import adam_rows
-from stga_addon.raster.cpu.rasterize import Parameters, camera_frames
-from stga_addon.raster.gpu import blend, embed, image_loss, optimizer, trial
-from stga_addon.raster.gpu.autograd import render, shared
-from stga_addon.raster.gpu.rasterize import DeviceFrames, Rasteriser, lens_of
+from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera
+from stga_addon.raster.gpu import blend, embed, image_loss, optimizer, self_test
+from stga_addon.raster.gpu.autograd import render_differentiable, shared
+from stga_addon.raster.gpu.rasterize import DeviceFrames, Rasterizer, device_camera
 from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
 from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
 
 DEVICE = "cpu"
-MODULES = trial.MODULES
+MODULES = self_test.MODULES
 
 
 @pytest.fixture(autouse=True)
 def other_back_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever test of the CPU's kernels is called from here draws with Warp."""
     for module in (test_kernels, gsplat, test_projection):
-        monkeypatch.setattr(module, "render", render)
+        monkeypatch.setattr(module, "render_differentiable", render_differentiable)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -122,20 +122,20 @@ def test_a_broken_splat_is_dropped(name: str) -> None:
 
 
 def strained(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colours per strain (N, 3, 3), and a strain (1, 3) of the one frame."""
+    """Colors per strain (N, 3, 3), and a strain (1, 3) of the one frame."""
     rng = np.random.default_rng(seed)
     return rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32), rng.normal(0, 1, (1, 3)).astype(np.float32)
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_strain_colour_and_antialiasing_are_the_other_back_ends(antialiased: bool) -> None:
-    """Catches a colour that does not follow strain, opacity not compensated, and either left out of the gradient."""
+def test_strain_color_and_antialiasing_are_the_other_back_ends(antialiased: bool) -> None:
+    """Catches a color that does not follow strain, opacity not compensated, and either left out of the gradient."""
     scene = cloud(31, log_scale=-4.0)
-    colour, strain = strained(60, 0)
+    color, strain = strained(60, 0)
     frames = replace(WORLD, strain=strain)
     results = []
-    for back_end in (cpu.render, render):
-        given = [*(scene.splats[name] for name in NAMES), colour]
+    for back_end in (cpu.render_differentiable, render_differentiable):
+        given = [*(scene.splats[name] for name in NAMES), color]
         tensors = [torch.from_numpy(value).clone().requires_grad_() for value in given]
         images = back_end(Parameters(*tensors), scene.camera, frames, antialiased=antialiased)
         cotangents = random_cotangents(scene.camera)
@@ -152,30 +152,34 @@ def test_strain_colour_and_antialiasing_are_the_other_back_ends(antialiased: boo
 class Raw:
     """A scene through the array door: renderings, and gradients whose untouched rows keep `fill`."""
 
-    def __init__(self, scene: Scene, rasteriser: Rasteriser | None = None) -> None:
-        self.rasteriser = rasteriser or Rasteriser(DEVICE)
+    def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None) -> None:
+        self.rasterizer = rasterizer or Rasterizer(DEVICE)
         self.count = len(scene.splats["xyz"])
         tensors = [torch.from_numpy(scene.splats[name]) for name in NAMES]
         self.tensors = Parameters(*tensors, torch.zeros(self.count, 0, 3))
         self.face = wp.zeros(self.count, wp.int32, device=DEVICE)
-        seen = camera_frames(WORLD, scene.camera)
+        camera_frames = frames_in_camera(WORLD, scene.camera)
         arrays = [
             wp.array(value, dtype=kind, device=DEVICE)
-            for value, kind in ((seen.origin, wp.vec3), (seen.matrix, wp.mat33), (seen.strain, wp.float32))
+            for value, kind in (
+                (camera_frames.origin, wp.vec3),
+                (camera_frames.matrix, wp.mat33),
+                (camera_frames.strain, wp.float32),
+            )
         ]
-        self.frames = DeviceFrames(*arrays, lens_of(scene.camera, scene.degree, 0))
+        self.frames = DeviceFrames(*arrays, device_camera(scene.camera, scene.degree, 0))
         v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
         self.v_image, self.v_transmittance = v_image.float(), -v_alpha.float()
 
     def forward(self, focus: np.ndarray | None = None, reach: int = 0, **options):
         marked = None if focus is None else wp.array(focus.astype(np.uint8), dtype=wp.uint8, device=DEVICE)
         splats = shared(self.tensors)
-        return self.rasteriser.forward(splats, self.face, self.frames, focus=marked, reach=reach, **options)
+        return self.rasterizer.forward(splats, self.face, self.frames, focus=marked, reach=reach, **options)
 
     def gradients(self, rendering, fill: float = 0.0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         """Gradients by name, the rows written, and those rows' screen gradient."""
         gradients = Parameters(*(torch.full_like(t, fill) for t in self.tensors))
-        screen = self.rasteriser.backward(
+        screen = self.rasterizer.backward(
             rendering, shared(self.tensors), self.face, wp.from_torch(self.v_image), shared(gradients),
             wp.from_torch(self.v_transmittance),
         )  # fmt: skip
@@ -218,8 +222,8 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient() -> Non
     full, _, full_screen = raw.gradients(rendering)
     image = rendering.image.numpy().copy()
     part = raw.forward(focus, reach=10)
-    drawn = part.drawn.numpy().reshape(5, 7).astype(bool)
-    assert 0 < drawn.sum() < drawn.size
+    rendered = part.rendered.numpy().reshape(5, 7).astype(bool)
+    assert 0 < rendered.sum() < rendered.size
     gradients, written, screen = raw.gradients(part, fill=123.0)
     assert len(written) > 0
     assert set(written) <= {3, 17, 40}
@@ -227,7 +231,7 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient() -> Non
         np.testing.assert_array_equal(gradient[written], full[name][written], err_msg=name)
         assert (np.delete(gradient, written, axis=0) == 123).all(), name
     np.testing.assert_array_equal(screen, full_screen[np.isin(np.flatnonzero(raw.forward().wanted.numpy()), written)])
-    pixels = np.kron(drawn, np.ones((16, 16), bool))[:70, :100]
+    pixels = np.kron(rendered, np.ones((16, 16), bool))[:70, :100]
     part = raw.forward(focus, reach=10)
     np.testing.assert_array_equal(part.image.numpy()[:, pixels], image[:, pixels])
 
@@ -242,9 +246,9 @@ def test_coefficients_above_the_degree_are_overwritten() -> None:
 
 def test_the_same_bits_twice_and_from_used_buffers() -> None:
     """Catches sums in the order of chance, and results that depend on what an earlier image left in the buffers."""
-    rasteriser = Rasteriser(DEVICE)
+    rasterizer = Rasterizer(DEVICE)
     for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
-        fresh, used = Raw(SCENES[name]), Raw(SCENES[name], rasteriser)
+        fresh, used = Raw(SCENES[name]), Raw(SCENES[name], rasterizer)
         expected, rendering = fresh.forward(), used.forward()
         np.testing.assert_array_equal(rendering.image.numpy(), expected.image.numpy(), err_msg=name)
         wanted, rows_written, _ = fresh.gradients(expected)
@@ -258,16 +262,16 @@ def test_what_does_not_fit_is_not_drawn_and_told(monkeypatch: pytest.MonkeyPatch
     """Catches pairs that are dropped in silence, written past the buffers' end, or gradients of half a rendering."""
     scene = SCENES["plain"]
     expected = Raw(scene).forward().image.numpy().copy()
-    monkeypatch.setattr("stga_addon.raster.gpu.rasterize.FIRST_CAPACITY", 10)
+    monkeypatch.setattr("stga_addon.raster.gpu.rasterize.INITIAL_PAIR_CAPACITY", 10)
     raw = Raw(scene)
     rendering = raw.forward(wait=False)
     assert not rendering.image.numpy().any()
     gradients, written, _ = raw.gradients(rendering, fill=7.0)
     assert not len(written)
     assert all((gradient == 7).all() for gradient in gradients.values())
-    assert not raw.rasteriser.complete()
+    assert not raw.rasterizer.pairs_fit()
     np.testing.assert_array_equal(raw.forward(wait=False).image.numpy(), expected)
-    assert raw.rasteriser.complete()
+    assert raw.rasterizer.pairs_fit()
     # With waiting, there is room at once.
     np.testing.assert_array_equal(Raw(scene).forward().image.numpy(), expected)
 
@@ -289,18 +293,18 @@ def test_image_loss_is_the_other_back_ends(kind: str) -> None:
     raw = Raw(scene)
     if kind == "restricted":
         focus = np.arange(80) == 17
-    rendering = raw.forward(focus, REACH)
+    rendering = raw.forward(focus, LOSS_REACH_PX)
     if focus is not None:
         pixels = [np.kron(marks.numpy().reshape(5, 7), np.ones((16, 16)))[:70, :100] for marks in tiles_of(rendering)]
-        touched, drawn = (marks > 0 for marks in pixels)
+        touched, rendered = (marks > 0 for marks in pixels)
         rectangles = tile_rectangles(rendering.touched.numpy().reshape(5, 7) > 0, 70, 100)
     else:
-        touched = drawn = np.ones((70, 100), bool)
+        touched = rendered = np.ones((70, 100), bool)
     expected = np.empty_like(image)
     l1, ssim = image_gradient(image, target, rectangles, 0.2, expected)
-    seen = np.where(drawn, image, np.nan)
-    rendering = replace(rendering, image=wp.array(seen, dtype=wp.float32, device=DEVICE))
-    gradient, loss = image_loss.differentiate(raw.rasteriser, rendering, wp.array(target, device=DEVICE), 0.2)
+    visible = np.where(rendered, image, np.nan)
+    rendering = replace(rendering, image=wp.array(visible, dtype=wp.float32, device=DEVICE))
+    gradient, loss = image_loss.image_loss_gradient(raw.rasterizer, rendering, wp.array(target, device=DEVICE), 0.2)
     got, want = gradient.numpy()[:, touched], expected[:, touched]
     # In flat regions both lose digits to the same cancellation, each in its own order of summation.
     tolerance = 5e-4 if kind == "bright and flat" else 2e-5
@@ -310,7 +314,7 @@ def test_image_loss_is_the_other_back_ends(kind: str) -> None:
 
 
 def tiles_of(rendering) -> tuple[wp.array, wp.array]:
-    return rendering.touched, rendering.drawn
+    return rendering.touched, rendering.rendered
 
 
 def test_background_is_exchanged_as_on_the_cpu() -> None:
@@ -381,9 +385,9 @@ def test_frames_and_strain_are_numpys(convention: str, mesh: str) -> None:
         shift = np.array([1e4, -1e4, 1e4])
         posed, camera.world_to_camera[:3, 3] = posed + shift, -camera.world_to_camera[:3, :3] @ shift
     basis = strain_basis(neutral, faces)
-    expected = camera_frames(face_frames(posed, faces, neutral, convention, basis), camera)
+    expected = frames_in_camera(face_frames(posed, faces, neutral, convention, basis), camera)
     step = embed.Embedding(wp.get_device(DEVICE), neutral, faces, convention, basis)
-    origin, matrix, strain = step.place(wp.array(posed, dtype=wp.vec3d, device=DEVICE), camera)
+    origin, matrix, strain = step.frames(wp.array(posed, dtype=wp.vec3d, device=DEVICE), camera)
     np.testing.assert_allclose(origin.numpy(), expected.origin, atol=1e-6)
     np.testing.assert_allclose(matrix.numpy(), expected.matrix, atol=1e-6)
     # On a line of 1 cm, strain is a difference of squares over an area that is hardly there.
@@ -393,23 +397,23 @@ def test_frames_and_strain_are_numpys(convention: str, mesh: str) -> None:
 
 
 def test_without_strain_there_is_none() -> None:
-    """Catches a strain computed, or colours that follow it, where nobody asked for it."""
+    """Catches a strain computed, or colors that follow it, where nobody asked for it."""
     posed, neutral, faces = bent_ball()
     step = embed.Embedding(wp.get_device(DEVICE), neutral, faces, "stga")
-    assert step.place(wp.array(posed, dtype=wp.vec3d, device=DEVICE), cloud(1).camera)[2].shape == (len(faces), 0)
+    assert step.frames(wp.array(posed, dtype=wp.vec3d, device=DEVICE), cloud(1).camera)[2].shape == (len(faces), 0)
 
 
 def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a trial that passes whatever a device computes."""
-    assert trial.passes(DEVICE)
-    backward = Rasteriser.backward
+    assert self_test.passes(DEVICE)
+    backward = Rasterizer.backward
 
     def loses_a_tile(self, rendering, *arguments):
         rendering.touched.numpy()[0] = 0
         return backward(self, rendering, *arguments)
 
-    monkeypatch.setattr(Rasteriser, "backward", loses_a_tile)
-    assert not trial.passes(DEVICE)
+    monkeypatch.setattr(Rasterizer, "backward", loses_a_tile)
+    assert not self_test.passes(DEVICE)
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__.rpartition(".")[2])

@@ -14,7 +14,7 @@ import pytest
 
 from stga_addon.raster.gpu import blend
 
-THREADS, LANES = 64, 32
+THREADS, WARP_LANES = 64, 32
 """A block of the backward kernel is two warps."""
 SOURCE = """
 #include <algorithm>
@@ -61,7 +61,7 @@ def gpu(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     if compiler is None:
         pytest.skip("there is no g++ to compile the functions of a warp with")
     folder: Path = tmp_path_factory.mktemp("lanes")
-    functions = (blend._over_warp, blend._largest_of_warp, blend._leads)
+    functions = (blend._warp_sum, blend._warp_max, blend._is_warp_leader)
     (folder / "lanes.cpp").write_text(SOURCE % tuple(function.native_snippet for function in functions))
     command = [compiler, "-std=c++20", "-O1", "-shared", "-fPIC", "-pthread", "lanes.cpp", "-o", "lanes.so"]
     subprocess.run(command, cwd=folder, check=True, capture_output=True)
@@ -69,10 +69,10 @@ def gpu(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 
 def run(function: ctypes._CFuncPtr, values: np.ndarray) -> np.ndarray:
-    """(2, LANES) by warp."""
+    """(2, WARP_LANES) by warp."""
     result = values.copy()
     function(result.ctypes.data_as(ctypes.c_void_p))
-    return result.reshape(-1, LANES)
+    return result.reshape(-1, WARP_LANES)
 
 
 def blocks(count: int) -> list[np.ndarray]:
@@ -88,7 +88,7 @@ def test_sums(gpu: ctypes.CDLL) -> None:
     for values in blocks(20):
         found = run(gpu.sums, values.astype(np.float32))
         assert (found == found[:, :1]).all()  # the same bits in all lanes
-        np.testing.assert_allclose(found[:, 0], values.reshape(-1, LANES).sum(1), rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(found[:, 0], values.reshape(-1, WARP_LANES).sum(1), rtol=1e-5, atol=1e-4)
 
 
 def test_largest(gpu: ctypes.CDLL) -> None:
@@ -96,10 +96,12 @@ def test_largest(gpu: ctypes.CDLL) -> None:
     for values in (*blocks(20), *(values - 1000 for values in blocks(3))):
         whole = values.astype(np.int32)
         found = run(gpu.largest, whole)
-        np.testing.assert_array_equal(found, np.repeat(whole.reshape(-1, LANES).max(1), LANES).reshape(-1, LANES))
+        np.testing.assert_array_equal(
+            found, np.repeat(whole.reshape(-1, WARP_LANES).max(1), WARP_LANES).reshape(-1, WARP_LANES)
+        )
 
 
 def test_one_lane_leads_each_warp(gpu: ctypes.CDLL) -> None:
     """Catches a block in which one warp writes nothing, and rows that are written 32 times."""
     found = run(gpu.leading, np.full(THREADS, -1, np.int32))
-    np.testing.assert_array_equal(found, np.eye(LANES, dtype=np.int32)[[0, 0]])
+    np.testing.assert_array_equal(found, np.eye(WARP_LANES, dtype=np.int32)[[0, 0]])

@@ -43,7 +43,7 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 def test_the_mean_over_the_whole_course(toy: Capture, shares: list[float]) -> None:
     """Catches a calibration of the cheap beginning only: images of 40 x 60 pixels, a third of the time at half size."""
-    settings = make_settings(iterations=100, coarse_span=1 / 3)
+    settings = make_settings(iterations=100, coarse_share=1 / 3)
     pace = seconds_per_iteration(toy, settings, 2.4)
     fine, coarse = 0.024, 0.006
     steps = [0.8 / coarse, 1.6 / fine]  # seconds at each size over the time of a step

@@ -7,7 +7,7 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.report import run_summary
-from stga_addon.report.run_summary import CURVE, CurveDrawer, conclude, describe_run
+from stga_addon.report.run_summary import CURVE, CurveUpdater, report_run, summarize_run
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.settings import make_settings
@@ -22,21 +22,21 @@ def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
 
 def test_what_a_person_reads() -> None:
     """Catches the last evaluation given for the best one, and figures that were not measured."""
-    lines = describe_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
+    lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
     assert lines[0] == (
-        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, after 20 s, which the avatar shows"
+        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, after 20 s (the saved avatar)"
     )
-    assert lines[-1] == "evaluation took 1.3% of the training time, on top of it, peak memory 1,234 MB"
+    assert lines[-1] == "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB"
     assert len(lines) == 2
-    assert describe_run([], None) == []
+    assert summarize_run([], None) == []
 
 
 def test_targets_and_levels() -> None:
     """Catches a target that is reached and said to be missed, or the other way round."""
-    assert "30 dB was reached" in describe_run(metrics([20.0, 31.0, 29.0]), 30.0)
-    missed = describe_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
-    assert missed.startswith("30 dB was not reached (best 28.00 dB): as the curve goes, it would take about")
-    level = describe_run(metrics([20.0, 25.0, *[24.0] * 10]), 30.0)
+    assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), 30.0)
+    missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
+    assert missed.startswith("30 dB was not reached (best 28.00 dB): extrapolating the curve, it would take about")
+    level = summarize_run(metrics([20.0, 25.0, *[24.0] * 10]), 30.0)
     assert "nothing was gained after 20 s, so more time would not help" in level[1]
     assert "nothing was gained after 20 s" in level[2]
 
@@ -44,7 +44,7 @@ def test_targets_and_levels() -> None:
 def test_a_run_is_concluded(toy: Capture, tmp_path: Path) -> None:
     """Catches metrics that a run writes and the summary cannot read, and a missing picture."""
     train(toy, tmp_path, Run(toy.root, None, "vhap", make_settings(iterations=12, hull_points=False, lattice=0)))
-    assert conclude(tmp_path)[0].startswith("held-out views: ")
+    assert report_run(tmp_path)[0].startswith("held-out views: ")
     assert (tmp_path / CURVE).stat().st_size > 1000
 
 
@@ -57,8 +57,8 @@ def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.M
         now[0] += 0.05
 
     monkeypatch.setattr(run_summary, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(run_summary, "draw_curve", draw)
-    keep = CurveDrawer(tmp_path)
+    monkeypatch.setattr(run_summary, "write_curve", draw)
+    keep = CurveUpdater(tmp_path)
     for second in range(21):
         now[0] = float(second)
         if second in (0, 1, 2, 16):

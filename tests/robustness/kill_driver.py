@@ -43,7 +43,13 @@ class Driver:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.capture = open_capture(factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4)))
-        busy = {"density_every": 5, "density_span": (0.0, 1.0), "stray_every": 4, "stray_limit": 0.3, "lattice": 1}
+        busy = {
+            "density_interval": 5,
+            "density_span": (0.0, 1.0),
+            "stray_reset_interval": 4,
+            "stray_limit": 0.3,
+            "lattice": 1,
+        }
         self.run = Run(self.capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, **busy))
         self.reached = mmap.mmap(-1, 8)  # the child's last iteration, readable after its death
 

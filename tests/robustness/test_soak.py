@@ -59,8 +59,9 @@ def soak(capture: Capture, until: int, on: int, seed: int = 0) -> Soak:
     """Train `until` of ITERATIONS steps, each with another view and another random choice of triangles."""
     set_threads(on)
     settings = quick_settings(
-        "selective", iterations=ITERATIONS, seed=seed, lattice=1, warm_up=0.02, stray_every=STRAYS, stray_limit=0.5,
-        density_every=DENSITY, density_span=(0.0, 1.0), growth=0.5, scale_limit=1.0,
+        "selective", iterations=ITERATIONS, seed=seed, lattice=1, warm_up_share=0.02,
+        stray_reset_interval=STRAYS, stray_limit=0.5, density_interval=DENSITY,
+        density_span=(0.0, 1.0), growth=0.5, scale_limit=1.0,
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     trainer = Trainer(capture, settings, {})

@@ -12,8 +12,7 @@ from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.raster.images import to_bytes
-from stga_addon.raster.render import render_splats
+from stga_addon.raster.render import render, to_uint8
 
 TIMESTEPS, CAMERAS = (0, 2, 3, 5, 6), range(5)
 """The last timestep is `test`, the last camera `val`."""
@@ -68,7 +67,7 @@ def _paint(capture: Capture) -> None:
     blank = replace(splats, sh=np.full_like(shown.sh, 9.0))
     for view in (view for views in capture.views.values() for view in views):
         frames = face_frames(capture.mesh(view.timestep), capture.faces, capture.neutral)
-        Image.fromarray(to_bytes(render_splats(shown, view.camera, (1.0, 1.0, 1.0), frames))).save(view.image)
-        alpha = to_bytes(render_splats(blank, view.camera, (0.0, 0.0, 0.0), frames))[..., 0]
+        Image.fromarray(to_uint8(render(shown, view.camera, (1.0, 1.0, 1.0), frames))).save(view.image)
+        alpha = to_uint8(render(blank, view.camera, (0.0, 0.0, 0.0), frames))[..., 0]
         assert view.mask is not None
         Image.fromarray(np.where(alpha > 127, 255, 0).astype(np.uint8)).save(view.mask)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
-from stga_addon.raster.cpu.autograd import render
+from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.optimize.density import FAINT, control_density
 from stga_addon.training.optimize.state import TrainState, keep_rows, new_state, tensors_of
@@ -98,7 +98,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     camera = Camera(64, 64, 128.0, 128.0, 32.0, 32.0, pose)
 
     def cover(state: TrainState) -> np.ndarray:
-        return render(Parameters(*state.parameters), camera, degree=0)[1].numpy()
+        return render_differentiable(Parameters(*state.parameters), camera, degree=0)[1].numpy()
 
     state = new_state(splats)
     parent = cover(state)

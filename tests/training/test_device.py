@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.raster.gpu import trial
+from stga_addon.raster.gpu import self_test
 from stga_addon.training.optimize import device as device_module
-from stga_addon.training.optimize.device import LEAST_FREE, choose_device
+from stga_addon.training.optimize.device import MIN_FREE_BYTES, choose_device
 
 warp = pytest.importorskip("warp")
 
@@ -29,8 +29,8 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Gpu:
     monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
     monkeypatch.setattr(warp, "is_cuda_available", lambda: True)
     monkeypatch.setattr(warp, "get_cuda_device", lambda: card)
-    monkeypatch.setattr(trial, "compile_kernels", lambda name: None)
-    monkeypatch.setattr(trial, "passes", lambda name: True)
+    monkeypatch.setattr(self_test, "compile_kernels", lambda name: None)
+    monkeypatch.setattr(self_test, "passes", lambda name: True)
     return card
 
 
@@ -54,9 +54,12 @@ WRONG = {
     "no package": ((device_module, "find_spec", lambda name: None), "warp-lang, .* is not installed"),
     "no driver": ((ctypes, "CDLL", no_driver), "no NVIDIA driver"),
     "no card": ((warp, "is_cuda_available", lambda: False), "finds no GPU"),
-    "no memory": ((warp, "get_cuda_device", lambda: Gpu(free_memory=LEAST_FREE // 2)), "512 MiB .* 1024 are needed"),
-    "no compiler": ((trial, "compile_kernels", broken), r"failed \(nvrtc: too old\)$"),
-    "wrong numbers": ((trial, "passes", lambda name: False), "wrong numbers"),
+    "no memory": (
+        (warp, "get_cuda_device", lambda: Gpu(free_memory=MIN_FREE_BYTES // 2)),
+        "512 MiB .* 1024 are needed",
+    ),
+    "no compiler": ((self_test, "compile_kernels", broken), r"failed \(nvrtc: too old\)$"),
+    "wrong numbers": ((self_test, "passes", lambda name: False), "wrong numbers"),
 }
 
 

@@ -8,7 +8,12 @@ from capture import factory
 from PIL import Image
 
 from stga_addon.capture.model import Capture
-from stga_addon.training.evaluate.evaluation_views import MOST_VIEWS, choose_evaluation_views, look, visible_pixels
+from stga_addon.training.evaluate.evaluation_views import (
+    MAX_EVALUATION_VIEWS,
+    choose_evaluation_views,
+    read_evaluation_view,
+    visible_pixels,
+)
 
 
 def test_watched_views_are_spread(toy: Capture) -> None:
@@ -16,7 +21,7 @@ def test_watched_views_are_spread(toy: Capture) -> None:
     view = toy.views["val"][0]
     many = tuple(replace(view, timestep=t) for t in range(100))
     watched = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
-    assert len(watched) == MOST_VIEWS
+    assert len(watched) == MAX_EVALUATION_VIEWS
     assert (watched[0], watched[-1]) == (0, 99)
     assert set(np.diff(watched)) <= {6, 7}
     assert list(choose_evaluation_views(toy)) == list(toy.views["val"])
@@ -24,10 +29,10 @@ def test_watched_views_are_spread(toy: Capture) -> None:
 
 def test_regions_of_a_view(toy: Capture) -> None:
     """Catches a mask that is inverted, and a view in which nothing moves with a region for it."""
-    still, *_, moving = (look(toy, view) for view in toy.views["val"])
+    still, *_, moving = (read_evaluation_view(toy, view) for view in toy.views["val"])
     np.testing.assert_array_equal(still.regions["mask"], factory.silhouette())
-    assert "selected" not in still.regions  # timestep 0 is the neutral one
-    where = moving.regions["selected"]
+    assert "moving" not in still.regions  # timestep 0 is the neutral one
+    where = moving.regions["moving"]
     assert where.any()
     # The ball's lower part moves, which is below in the image, and only the ball does.
     rows = np.flatnonzero(where.any(1))
@@ -55,4 +60,4 @@ def test_a_view_without_mask_has_no_head(toy: Capture, tmp_path: Path) -> None:
     path = tmp_path / "plain.png"
     Image.fromarray(factory.picture(0, 0)).save(path)
     view = replace(toy.views["val"][0], image=path, mask=None)
-    assert "mask" not in look(toy, view).regions
+    assert "mask" not in read_evaluation_view(toy, view).regions

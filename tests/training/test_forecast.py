@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from stga_addon.format import format_duration
 from stga_addon.training.evaluate.forecast import (
-    FEWEST,
+    MIN_EVALUATIONS,
     Forecast,
-    clock,
+    checked_forecasts,
     curve_of,
+    explain_missed_target,
     forecast,
-    hits,
-    horizon,
-    level_since,
-    missed,
+    forecast_horizon,
+    plateau_start,
 )
 
 TIMES = np.arange(1, 31) * 4.0
@@ -29,7 +29,7 @@ def curve(times: np.ndarray, psnr: np.ndarray) -> list[tuple[float, float]]:
 
 def test_a_curve_of_the_models_own_kind_is_continued_exactly() -> None:
     """Catches a gain over the wrong span, and a slope that is not the curve's."""
-    for count in (FEWEST, 9, 20):
+    for count in (MIN_EVALUATIONS, 9, 20):
         seen = curve(TIMES[:count], rising(TIMES[:count]))
         for ahead in (5.0, 30.0):
             told = forecast(seen, ahead)
@@ -86,20 +86,20 @@ def test_nothing_is_said_too_early_or_of_nonsense() -> None:
 
 def test_horizon() -> None:
     """Catches forecasts beyond the budget, or farther ahead than what was seen allows."""
-    assert horizon(240, 1000) == 120
-    assert horizon(1000, 65) == 60
-    assert horizon(9, 1000) is None
-    assert horizon(1000, 4) is None
+    assert forecast_horizon(240, 1000) == 120
+    assert forecast_horizon(1000, 65) == 60
+    assert forecast_horizon(9, 1000) is None
+    assert forecast_horizon(1000, 4) is None
 
 
 def test_level_since() -> None:
     """Catches a run called finished while it rises, and one that falls and is not."""
-    assert level_since(curve(TIMES, rising(TIMES))) is None
+    assert plateau_start(curve(TIMES, rising(TIMES))) is None
     fell = np.where(TIMES < 50, rising(TIMES), rising(np.array([48.0])) - (TIMES - 50) / 100)
-    assert level_since(curve(TIMES, fell)) == 48.0
-    assert level_since(curve(TIMES[:12], fell[:12])) is None
-    assert level_since([]) is None
-    assert level_since(curve(TIMES[:3], np.full(3, 30.0))) is None
+    assert plateau_start(curve(TIMES, fell)) == 48.0
+    assert plateau_start(curve(TIMES[:12], fell[:12])) is None
+    assert plateau_start([]) is None
+    assert plateau_start(curve(TIMES[:3], np.full(3, 30.0))) is None
 
 
 def test_hits() -> None:
@@ -113,9 +113,9 @@ def test_hits() -> None:
         {"seconds": 20.0, "psnr": 32.0, "forecast": told(30.0, 32.5)},  # 33.0 came: false
         {"seconds": 30.0, "psnr": 33.0, "forecast": told(40.0, 33.0)},  # not yet known
     ]
-    assert hits(lines) == (1, 2)
-    assert hits([]) == (0, 0)
-    assert hits([{"seconds": 1.0}]) == (0, 0)
+    assert checked_forecasts(lines) == (1, 2)
+    assert checked_forecasts([]) == (0, 0)
+    assert checked_forecasts([{"seconds": 1.0}]) == (0, 0)
 
 
 def test_the_curve_leaves_out_what_was_evaluated_twice() -> None:
@@ -128,15 +128,17 @@ def test_the_curve_leaves_out_what_was_evaluated_twice() -> None:
 def test_why_a_target_was_missed() -> None:
     """Catches "train longer" where that does not help, and another time than the curve will take."""
     risen = curve(TIMES, rising(TIMES))  # in 120 s; 36 − 20/√400 = 35
-    assert missed(risen, 35).endswith("as the curve goes, it would take about 4.7 min more")
-    assert missed(risen, 34.18).endswith("would take about 12 s more")
-    assert missed(risen, 40).endswith("levels off at about 36.0 dB; more time alone would not reach it")
+    assert explain_missed_target(risen, 35).endswith("extrapolating the curve, it would take about 4.7 min more")
+    assert explain_missed_target(risen, 34.18).endswith("would take about 12 s more")
+    assert explain_missed_target(risen, 40).endswith("levels off at about 36.0 dB; more time alone would not reach it")
     for near in (35.99, 37):  # 1.8 dB are still to come, which may be off by as much as a forecast
-        assert missed(risen, near).endswith("levels off at about 36.0 dB; only a much longer budget might reach it")
+        assert explain_missed_target(risen, near).endswith(
+            "levels off at about 36.0 dB; only a much longer budget might reach it"
+        )
     fell = np.where(TIMES < 50, rising(TIMES), 30.0)
-    assert "nothing was gained after 48 s" in missed(curve(TIMES, fell), 40)
-    assert "does not rise steadily" in missed(curve(TIMES[:6], -rising(TIMES[:6])), 40)
-    assert missed([(1.0, 20.0)], 40) == (
+    assert "nothing was gained after 48 s" in explain_missed_target(curve(TIMES, fell), 40)
+    assert "does not rise steadily" in explain_missed_target(curve(TIMES[:6], -rising(TIMES[:6])), 40)
+    assert explain_missed_target([(1.0, 20.0)], 40) == (
         "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it would take"
     )
 
@@ -155,7 +157,7 @@ def test_why_a_target_was_missed() -> None:
 )
 def test_clock(seconds: float, text: str) -> None:
     """Catches "2.0 min" and "133 min"."""
-    assert clock(seconds) == text
+    assert format_duration(seconds) == text
 
 
 def test_forecasts_read_as_people_speak() -> None:

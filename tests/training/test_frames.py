@@ -7,7 +7,7 @@ import pytest
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.model import Capture
-from stga_addon.training.optimize.frames import KEPT, FrameStore
+from stga_addon.training.optimize.frames import CACHED_TIMESTEPS, FrameStore
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -33,10 +33,10 @@ def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
     for _ in range(3):
         store.of(1)
     assert read == [1]
-    for timestep in range(2, KEPT + 2):
+    for timestep in range(2, CACHED_TIMESTEPS + 2):
         store.of(timestep)
     store.of(1)
-    assert read == [1, *range(2, KEPT + 2), 1]
+    assert read == [1, *range(2, CACHED_TIMESTEPS + 2), 1]
     store.forget()
     store.mesh(1)
     store.of(1)

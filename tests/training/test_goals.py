@@ -12,11 +12,12 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.training.evaluate.forecast import hits
+from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
-from stga_addon.training.run.loop import EVALUATION_SHARE, Progress, train
+from stga_addon.training.run.loop import EVALUATION_SHARE, train
+from stga_addon.training.run.progress import Progress
 
 from .toys import quick_settings
 
@@ -78,7 +79,7 @@ def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock
     train(toy, tmp_path, run_of(toy, iterations=200), report=lambda progress: bool(told.append(progress)))
     lines = read_metrics(tmp_path)
     assert [line["iteration"] for line in lines if "forecast" in line] == [80, 100, 120, 140, 160, 180]
-    hit, checked = hits(lines)
+    hit, checked = checked_forecasts(lines)
     assert 0 < hit <= checked == 6
     assert any("another" in progress.forecast_text for progress in told)
 
@@ -140,5 +141,5 @@ def test_images_grow_where_settings_say_so(toy: Capture, tmp_path: Path, monkeyp
         return step(trainer, view, target, *rest)
 
     monkeypatch.setattr(run_module.Trainer, "step", note)
-    train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_span=0.25))
+    train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_share=0.25))
     assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

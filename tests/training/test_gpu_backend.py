@@ -128,12 +128,12 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     part = batch_of(toy, settings, view=view, target=target, selected=toy.regions["mouth"])
     (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
     first.train(whole)
-    second.draw(view, np.ones(3, np.float32), 3)  # takes the buffers
-    for buffer in second._rasteriser.scratch._buffers.values():
-        if buffer.dtype in warp_render.TYPES:
+    second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
+    for buffer in second._rasterizer.buffers._buffers.values():
+        if buffer.dtype in warp_render.PARAMETER_TYPES:
             buffer.fill_(np.nan)
     second.train(part)
-    assert 0 < second._rasteriser.scratch.take("drawn", 8 * 12, warp_render.wp.uint8).numpy().mean() < 0.8
+    assert 0 < second._rasterizer.buffers.get("rendered", 8 * 12, warp_render.wp.uint8).numpy().mean() < 0.8
     rows = np.flatnonzero(second.state.steps.numpy() != disturbed(toy, settings).steps.numpy())
     assert 20 < len(rows) < 0.5 * len(second)
     for name, want in moments(first).items():
@@ -179,9 +179,9 @@ def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
     state = step.state
     state.average.opacity.fill_(-20.0)  # which is what is drawn
     white = np.ones(3, np.float32)
-    assert step.draw(view_of(toy, 1), white, 3).min() < 0.9
+    assert step.render(view_of(toy, 1), white, 3).min() < 0.9
     step.state = state
-    assert step.draw(view_of(toy, 1), white, 3).min() == 1
+    assert step.render(view_of(toy, 1), white, 3).min() == 1
 
 
 @pytest.fixture(scope="module")

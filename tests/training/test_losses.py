@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import conv2d
 
 from stga_addon.raster.cpu.layout import TILE
-from stga_addon.training.optimize.losses import REACH, image_gradient, similarity, tile_rectangles, whole_image
+from stga_addon.training.optimize.losses import LOSS_REACH_PX, image_gradient, similarity, tile_rectangles, whole_image
 
 # float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.
 TOLERANCE = 5e-4
@@ -87,14 +87,14 @@ RECTANGLES = {
 
 @pytest.mark.parametrize("name", RECTANGLES)
 def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
-    """Catches pixels further than REACH being read (they are NaN here), and pixels outside being written."""
+    """Catches pixels further than LOSS_REACH_PX being read (they are NaN here), and pixels outside being written."""
     image, target = random_pair(59, 71, seed=1)
     rectangles = np.array(RECTANGLES[name], np.int64)
     expected, absolute, ssim = reference(image, target, 0.2)
     inside, near = np.zeros((59, 71), bool), np.zeros((59, 71), bool)
     for x0, y0, x1, y1 in rectangles:
         inside[y0:y1, x0:x1] = True
-        near[max(0, y0 - REACH) : y1 + REACH, max(0, x0 - REACH) : x1 + REACH] = True
+        near[max(0, y0 - LOSS_REACH_PX) : y1 + LOSS_REACH_PX, max(0, x0 - LOSS_REACH_PX) : x1 + LOSS_REACH_PX] = True
     assert not near.all()
     partial = np.where(near, image, np.float32(np.nan))
     out = np.full_like(image, 7.0)
@@ -106,12 +106,12 @@ def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
 
 
 def test_too_short_a_reach_would_be_noticed() -> None:
-    """Catches a gradient that ignores its neighbourhood, for which the test above would pass with any REACH."""
+    """Catches a gradient that ignores its neighbourhood, for which the test above would pass with any LOSS_REACH_PX."""
     image, target = random_pair(59, 71, seed=1)
     expected, changed = np.empty_like(image), np.empty_like(image)
     rectangles = np.array([[30, 25, 47, 40]])
     image_gradient(image, target, rectangles, 0.2, expected)
-    image[:, :, 30 - REACH] += 0.5
+    image[:, :, 30 - LOSS_REACH_PX] += 0.5
     image_gradient(image, target, rectangles, 0.2, changed)
     assert not np.array_equal(expected[:, 25:40, 30:47], changed[:, 25:40, 30:47])
 

@@ -92,9 +92,9 @@ def test_is_the_network_that_the_paper_describes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", REFERENCE)
 def test_has_the_figures_of_the_reference(size: tuple[int, int]) -> None:
     """Catches anything by which a figure printed here would not be the one that papers print."""
-    if not os.environ.get(lpips.VARIABLE):
-        pytest.skip(f"{lpips.VARIABLE} names no weights (docs/dependencies.md)")
-    network = lpips.network()
+    if not os.environ.get(lpips.WEIGHTS_VARIABLE):
+        pytest.skip(f"{lpips.WEIGHTS_VARIABLE} names no weights (docs/dependencies.md)")
+    network = lpips.load_network()
     assert network is not None
     assert network.distance(*pair(*size)) == pytest.approx(REFERENCE[size], abs=2e-6)
 
@@ -103,7 +103,7 @@ def test_is_measured_where_weights_are_named(tmp_path: Path, monkeypatch: pytest
     """Catches images taken for −1…1, channels that are mixed up, a region that sees the rest of the image, and images
     too small for the network."""
     path = written(tmp_path / "alexnet.ckpt", made_up())
-    monkeypatch.setenv(lpips.VARIABLE, str(path))
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(path))
     image, target = pair(47, 68)
     quality = evaluate(lambda view: image, [sight_of(tmp_path, target)], perceptual=True)
     stored = np.round(255 * target).astype("f4") / 255
@@ -168,7 +168,7 @@ def run_of(capture: Capture) -> Run:
 
 def test_a_missing_file_is_told_before_training(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches ten minutes of training that end with a wrong path."""
-    monkeypatch.setenv(lpips.VARIABLE, str(tmp_path / "none.ckpt"))
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "none.ckpt"))
     with pytest.raises(StgaError, match=r"none\.ckpt"):
         train(toy, tmp_path / "run", run_of(toy))
     assert not (tmp_path / "run").exists()
@@ -176,7 +176,7 @@ def test_a_missing_file_is_told_before_training(toy: Capture, tmp_path: Path, mo
 
 def test_a_run_measures_it_once_it_is_whole(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches evaluations that take ten times as long, someone who cancels and waits for them, and no figure at all."""
-    monkeypatch.setenv(lpips.VARIABLE, str(written(tmp_path / "alexnet.ckpt", made_up())))
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(written(tmp_path / "alexnet.ckpt", made_up())))
     train(toy, tmp_path / "run", run_of(toy), report=lambda progress: progress.iteration >= 11)
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))
     train(toy, tmp_path / "run", run_of(toy), resume=True)

@@ -31,8 +31,8 @@ run_module.precompile_kernels()
 before = counts()
 capture = open_capture(root)
 settings = make_settings(
-    iterations=14, lattice=1, hull_points=False, warm_up=0.2, stray_every=3, density_every=3, density_span=(0, 1),
-    distance_weight=0.1, scale_limit=0.5, sh_steps=(0.2, 0.4, 0.6),
+    iterations=14, lattice=1, hull_points=False, warm_up_share=0.2, stray_reset_interval=3,
+    density_interval=3, density_span=(0, 1), distance_weight=0.1, scale_limit=0.5, sh_steps=(0.2, 0.4, 0.6),
 )
 run_module.train(capture, out, Run(root, None, "vhap", settings))
 assert len(read_metrics(out)) == 10

@@ -17,14 +17,15 @@ from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics, read_run, read_selection
-from stga_addon.training.run.loop import Progress, train
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import STRATEGIES
 
 from .toys import quick_settings
 
 ITERATIONS = 24
 # Everything that changes a state happens in a few iterations.
-BUSY = {"density_every": 5, "density_span": (0.0, 1.0), "stray_every": 4, "stray_limit": 0.3, "lattice": 1}
+BUSY = {"density_interval": 5, "density_span": (0.0, 1.0), "stray_reset_interval": 4, "stray_limit": 0.3, "lattice": 1}
 
 CLOCKED = ("seconds", "evaluation_s", "wall_s", "peak_memory_mb", "forecast")
 """Fields of a metrics line that depend on how fast the machine was."""
@@ -256,7 +257,7 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("schedule", ["default", "paper"])
 def test_every_strategy_and_schedule_runs(toy: Capture, tmp_path: Path, strategy: str, schedule: str) -> None:
     """Catches a combination of settings that no other test trains, and an avatar in the wrong convention."""
-    settings = quick_settings(strategy, schedule=schedule, iterations=8, stray_every=3, density_every=3)
+    settings = quick_settings(strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3)
     train(toy, tmp_path, Run(toy.root, None, "vhap", settings))
     avatar = read_avatar(tmp_path / "avatar.npz")
     assert avatar.convention == ("gaussian_avatars" if strategy == "gaussian-avatars" else "stga")
@@ -286,11 +287,11 @@ def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path
     """Catches shares that do not end at one, and speeds or losses that are never filled in."""
     told: list[Progress] = []
     train(toy, tmp_path, make_run(toy), report=lambda progress: bool(told.append(progress)))
-    training = [p for p in told if p.message == "training"]
+    training = [p for p in told if p.message == "Training"]
     assert [p.iteration for p in training] == list(range(1, ITERATIONS + 1))
     assert training[-1].share == 1.0
     assert training[-1].left_s == 0.0
     assert all(p.per_second > 0 and np.isfinite(p.loss) for p in training)
-    assert told[-1].message == "trained"
+    assert told[-1].message == "Finished"
     assert told[-1].psnr is not None
-    assert {p.message for p in told if not p.iteration} >= {"compiling kernels"}
+    assert {p.message for p in told if not p.iteration} >= {"Compiling kernels"}

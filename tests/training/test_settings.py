@@ -65,7 +65,7 @@ def test_impossible_settings(arguments: dict[str, Any], message: str) -> None:
 def test_the_papers_letter() -> None:
     """Catches a schedule that does not reach the settings: the figures are the paper's own."""
     paper = make_settings(schedule="paper", iterations=5)
-    assert (paper.global_every, paper.global_unit, paper.warm_up) == (20, "iteration", 0.0)
+    assert (paper.global_interval, paper.global_unit, paper.warm_up_share) == (20, "iteration", 0.0)
     assert (paper.lattice, paper.views_per_visit, paper.hull_points) == (4, 0, False)
     assert (paper.scale_limit, paper.stray_limit, paper.selection.threshold) == (1.0, 1.0, 0.01)
     changed = make_settings(schedule="paper", iterations=5, lattice=2)

@@ -20,7 +20,7 @@ from stga_addon.flame.sequence import read_motion, sequence_mesh
 from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
-from stga_addon.training.optimize.tracking import Tracking, frame_gradient, refined, track
+from stga_addon.training.optimize.tracking import Tracking, frame_gradient, refinable_tracking, with_refined_tracking
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.folder import Run, read_checkpoint, read_run
 from stga_addon.training.run.loop import train
@@ -88,7 +88,7 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
     """Catches a sign, a transposed rotation, a joint or a component taken for another, and what turns or grows a splat
     left out: against differences of a made-up loss of where splats are and how they lie."""
     capture, _ = lost
-    tracking = track(capture, "stga")
+    tracking = refinable_tracking(capture, "stga")
     generator = torch.Generator().manual_seed(0)
     face = np.random.default_rng(0).integers(0, len(capture.faces), 300)
     xyz, rotation, log_scale = (
@@ -164,7 +164,7 @@ def millimetres(trainer: Trainer, true: dict[int, np.ndarray]) -> float:
 
 def held_out(trainer: Trainer) -> float:
     views = trainer.capture.views["val"]
-    return float(np.mean([psnr(trainer.draw(view), read_image(view)) for view in views]))
+    return float(np.mean([psnr(trainer.render(view), read_image(view)) for view in views]))
 
 
 def test_what_it_brings(lost: Made) -> None:
@@ -175,7 +175,7 @@ def test_what_it_brings(lost: Made) -> None:
     assert millimetres(off, true) > 3.0
     assert millimetres(on, true) < 0.45 * millimetres(off, true)
     assert held_out(on) > held_out(off) + 1.5
-    common = on.tracking.numbers() - on.tracking.tracked
+    common = on.tracking.parameters() - on.tracking.tracked
     assert np.abs(common[:-1].mean(0)).max() < 1e-12  # what all have in common, an unseen timestep would not follow
     np.testing.assert_array_equal(common[-1], 0)
 
@@ -192,7 +192,9 @@ def test_nothing_moves_before_there_is_something_to_see(lost: Made) -> None:
     """Catches a tracking that follows grey splats, and one that moves in local iterations."""
     capture, _ = lost
     trainer = Trainer(
-        capture, quick_settings("selective", warm_up=0.0, global_every=2, tracking=True), {0: np.arange(320) < 9}
+        capture,
+        quick_settings("selective", warm_up_share=0.0, global_interval=2, tracking=True),
+        {0: np.arange(320) < 9},
     )
     view = next(view for view in capture.views["train"] if view.timestep == 0)
     assert trainer.tracking is not None
@@ -261,14 +263,14 @@ def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_fo
     checkpoint = read_checkpoint(run_folder)
     trainer = Trainer(capture, make_run(capture).settings, {}, checkpoint.state)
     trainer.continue_from(checkpoint)
-    shown = refined(capture, run_folder)
+    shown = with_refined_tracking(capture, run_folder)
     for timestep in TIMESTEPS[:-1]:
         np.testing.assert_allclose(shown.mesh(timestep), trainer.frames.mesh(timestep), atol=1e-12)
         assert np.abs(shown.mesh(timestep) - capture.mesh(timestep)).max() > 1e-4
     np.testing.assert_array_equal(shown.mesh(TIMESTEPS[-1]), capture.mesh(TIMESTEPS[-1]))
-    other = refined(right[0], run_folder)
+    other = with_refined_tracking(right[0], run_folder)
     np.testing.assert_array_equal(other.mesh(2), right[0].mesh(2))
-    assert refined(capture, run_folder.parent) is capture
+    assert with_refined_tracking(capture, run_folder.parent) is capture
 
 
 def test_the_file_is_a_motion(lost: Made, run_folder: Path) -> None:
@@ -276,7 +278,7 @@ def test_the_file_is_a_motion(lost: Made, run_folder: Path) -> None:
     capture, _ = lost
     assert capture.flame is not None
     motion = read_motion(run_folder / "tracking.npz", capture.flame.model)
-    shown = refined(capture, run_folder)
+    shown = with_refined_tracking(capture, run_folder)
     assert motion.timesteps == TIMESTEPS
     for timestep in TIMESTEPS:
         np.testing.assert_allclose(sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12)
@@ -316,7 +318,7 @@ def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
     ):
         write_npz(tmp_path / "tracking.npz", {**arrays, name: value})
         with pytest.raises(StgaError, match=rf"tracking\.npz: {says}"):
-            refined(lost[0], tmp_path)
+            with_refined_tracking(lost[0], tmp_path)
 
 
 def test_a_run_that_refines_nothing_leaves_nothing(lost: Made, run_folder: Path, tmp_path: Path) -> None:

@@ -33,7 +33,13 @@ def lower_part(capture: Capture) -> dict[int, np.ndarray]:
 
 
 def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) -> Trainer:
-    quiet = {"warm_up": 0.0, "global_every": 2, "density_every": 0, "stray_every": 0, "strain_color": True}
+    quiet = {
+        "warm_up_share": 0.0,
+        "global_interval": 2,
+        "density_interval": 0,
+        "stray_reset_interval": 0,
+        "strain_color": True,
+    }
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
 
 
@@ -97,7 +103,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
     screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
-    for buffer in step._scratch._buffers.values():
+    for buffer in step._buffers._buffers.values():
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for tensor in trainer.state.gradients:
         tensor.fill_(7.0)
@@ -146,22 +152,22 @@ def test_kinds_of_iterations(toy: Capture) -> None:
 
     assert kinds(make_trainer(toy)) == [False, False, True, False, False, True, False, False]
     # Two local visits of frames with two views each, then a global visit.
-    by_frame = kinds(make_trainer(toy, global_unit="frame", global_every=2))
+    by_frame = kinds(make_trainer(toy, global_unit="frame", global_interval=2))
     assert by_frame == [False] * 4 + [True] * 2 + [False] * 2
-    assert all(kinds(make_trainer(toy, warm_up=0.6)))
+    assert all(kinds(make_trainer(toy, warm_up_share=0.6)))
     assert all(kinds(make_trainer(toy, "global")))
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
     """Catches a gradient of the wrong sign, rates that are not applied, and a strategy that does not learn."""
-    trainer = make_trainer(toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up=0.3)
+    trainer = make_trainer(toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up_share=0.3)
     views, losses = toy.views["train"], []
     images = {view.name: read_image(view) for view in views}
-    before = [psnr(trainer.draw(view, 0.0), images[view.name]) for view in views]
+    before = [psnr(trainer.render(view, 0.0), images[view.name]) for view in views]
     for n, view in zip(range(60), view_order(views, 1, 0), strict=False):
         losses.append(trainer.step(view, images[view.name], n / 60))
-    after = [psnr(trainer.draw(view), images[view.name]) for view in views]
+    after = [psnr(trainer.render(view), images[view.name]) for view in views]
     everywhere = [loss for loss in losses if loss is not None]
     assert len(everywhere) == 60 if strategy != "selective" else 30 < len(everywhere) < 60
     assert np.mean(everywhere[-9:]) < 0.85 * np.mean(everywhere[:9])
@@ -170,7 +176,7 @@ def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
 
 def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     """Catches maintenance that never runs, runs outside its span, or grows beyond what was allowed."""
-    options = {"density_every": 2, "density_span": (0.2, 0.6), "growth": 0.05, "stray_every": 5}
+    options = {"density_interval": 2, "density_span": (0.2, 0.6), "growth": 0.05, "stray_reset_interval": 5}
     trainer = make_trainer(toy, "global", **options)
     view = view_of(toy, 1)
     image, counts = read_image(view), []
@@ -225,21 +231,21 @@ def test_draw_shows_the_average(toy: Capture) -> None:
     """Catches evaluations of other splats than those that the avatar is made of."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
-    picture = trainer.draw(view)
+    picture = trainer.render(view)
     trainer.state.parameters.opacity.fill_(-20.0)
-    np.testing.assert_array_equal(trainer.draw(view), picture)
+    np.testing.assert_array_equal(trainer.render(view), picture)
     trainer.state.average.opacity.fill_(-20.0)
-    assert trainer.draw(view).min() == 1
+    assert trainer.render(view).min() == 1
 
 
 def test_draw_is_a_copy(toy: Capture) -> None:
     """Catches pictures that change when the next one is drawn, since buffers are used again."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
-    picture = trainer.draw(view)
+    picture = trainer.render(view)
     kept = picture.copy()
     disturb(trainer)
-    assert not np.array_equal(trainer.draw(view), kept)
+    assert not np.array_equal(trainer.render(view), kept)
     np.testing.assert_array_equal(picture, kept)
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.model import Capture
-from ...effects.decide import decide
+from ...effects.plan import with_effect_plan
 from ...files import replacing, write_json
+from ...format import format_duration
 from ...report.run_summary import evaluation_share
-from ...training.evaluate.forecast import clock
 from ...training.run.folder import Run
 from ...training.settings import TrainingSettings
 from .chart import benchmark_chart
@@ -37,11 +37,11 @@ COLUMNS = {
     "peak_memory_mb": ("MB", 0),
     "val_psnr": ("val", 2),
     "val_psnr_mask": ("head", 2),
-    "val_psnr_selected": ("moving", 2),
+    "val_psnr_moving": ("moving", 2),
     "val_ssim": ("SSIM", 4),
     "val_lpips": ("LPIPS", 4),
     "test_psnr": ("test", 2),
-    "test_psnr_selected": ("moving", 2),
+    "test_psnr_moving": ("moving", 2),
 }
 """Figure -> heading and decimals. PSNR in dB on held-out views (val) and unseen expressions (test)."""
 
@@ -69,8 +69,8 @@ def run_benchmark(
             job.check()
     left = sum(not job.finished for of_seed in jobs.values() for job in of_seed.values())
     if left:
-        total = clock(left * seconds)
-        tell(f"{left} runs of {clock(seconds)}: {total} of training; what starting and measuring take is on top")
+        each, total = format_duration(seconds), format_duration(left * seconds)
+        tell(f"{left} runs of {each}: {total} of training; what starting and measuring take is on top")
     try:
         for seed, of_seed in jobs.items():
             if not all(job.finished for job in of_seed.values()):
@@ -87,7 +87,7 @@ def _runs(capture: Capture, run: Run, variants: Mapping[str, Changes], seconds: 
     """variant -> its run; one that would train as an earlier one does is left out."""
     runs: dict[str, Run] = {}
     for name, changes in variants.items():
-        decided = decide(replace(run, settings=settings_of(changes, seconds)), capture)
+        decided = with_effect_plan(replace(run, settings=settings_of(changes, seconds)), capture)
         if not any(_same(decided.settings, other.settings) for other in runs.values()):
             runs[name] = decided
     return runs
@@ -115,7 +115,7 @@ def _write(run: Run, jobs: Mapping[int, Mapping[str, BenchmarkRun]], seconds: fl
     if curves:
         title = f"{run.capture.name}: PSNR on held-out views, {len(jobs)} seeds; bold is best for its time"
         with replacing(out / "benchmark.png") as partial:
-            benchmark_chart(curves, title).save(partial, format="PNG")
+            benchmark_chart(curves, title).savefig(partial, format="png")
     return report
 
 
@@ -128,13 +128,13 @@ def report_text(outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], se
     counts = sorted({spreads["iterations"].count for spreads in table.values()})
     seeds = f"{'–'.join(map(str, counts))} seed{'' if counts == [1] else 's'}"
     lines = [
-        f"{capture.name}, {clock(seconds)} of training each, {seeds}; mean ± spread",
+        f"{capture.name}, {format_duration(seconds)} of training each, {seeds}; mean ± spread",
         "",
         *table_lines(table),
         "",
         *_comparisons(table),
     ]
-    spans = [f"{name} {clock(start)}–{clock(end)}" for name, start, end in leaders(curves)]
+    spans = [f"{name} {format_duration(start)}–{format_duration(end)}" for name, start, end in leaders(curves)]
     hit, checked = forecasts_checked(runs)
     lines += [f"Best for its time (Pareto front): {', '.join(spans)}."] if spans else []
     lines += (

@@ -1,24 +1,26 @@
-"""Chart of a benchmark: accuracy against training time, one curve per variant."""
+"""Chart of a benchmark: PSNR over training time, one curve per variant."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from PIL import Image
-
-from ...report.charts import Line, chart
+from ...report.charts import finish_axes, psnr_axes
 from .statistics import MeanCurve, leaders
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def benchmark_chart(curves: Mapping[str, MeanCurve], title: str) -> Image.Image:
-    """One curve a variant with the range of its seeds; the Pareto front is drawn bold."""
-    spans = leaders(curves)
-    lines = [
-        Line(
-            name,
-            curve.seconds,
-            curve.mean,
-            (curve.low, curve.high),
-            tuple((start, end) for leader, start, end in spans if leader == name),
-        )
-        for name, curve in curves.items()
-    ]
-    return chart(lines, title)
+
+def benchmark_chart(curves: Mapping[str, MeanCurve], title: str) -> "Figure":
+    """One curve per variant with the range over its seeds; the Pareto front is bold."""
+    figure, axes = psnr_axes(title)
+    front = leaders(curves)
+    for name, curve in curves.items():
+        (line,) = axes.plot(curve.seconds, curve.mean, label=name)
+        color = line.get_color()
+        axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.2, linewidth=0)
+        for leader, start, end in front:
+            if leader == name:
+                shown = (curve.seconds >= start) & (curve.seconds <= end)
+                axes.plot(curve.seconds[shown], curve.mean[shown], color=color, linewidth=4)
+    finish_axes(axes)
+    return figure

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...files import read_json
-from ...training.evaluate.forecast import curve_of, hits
+from ...training.evaluate.forecast import checked_forecasts, curve_of
 from ...training.run.metrics_log import read_metrics
 from .scheduler import BenchmarkRun
 from .worker import QUALITY
@@ -128,7 +128,7 @@ def leaders(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, float]]:
 
 def forecasts_checked(outcomes: Sequence[Outcome]) -> tuple[int, int]:
     """Forecasts of all runs that came true within their error, and those that could be checked."""
-    pairs = [hits(outcome.lines) for outcome in outcomes]
+    pairs = [checked_forecasts(outcome.lines) for outcome in outcomes]
     return sum(hit for hit, _ in pairs), sum(count for _, count in pairs)
 
 

@@ -17,10 +17,11 @@ from ...capture.open import open_capture
 from ...errors import StgaError
 from ...files import write_json
 from ...report.preset_timing import seconds_per_iteration
-from ...training.evaluate.metrics import measure
-from ...training.optimize.tracking import refined
+from ...training.evaluate.metrics import evaluate_avatar
+from ...training.optimize.tracking import with_refined_tracking
 from ...training.run.folder import read_run
-from ...training.run.loop import Progress, train
+from ...training.run.loop import train
+from ...training.run.progress import Progress
 
 WARM_UP = 1.0
 """Seconds of training before the run that are not counted: caches fill and the clock of the processor rises."""
@@ -64,8 +65,8 @@ def work(folder: Path, orders: IO[str], answers: IO[str]) -> None:
         avatar = read_avatar(train(capture, folder, run, resume=True, report=turns.report))
         if not turns.dismissed:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
-            trained = refined(capture, folder)
-            quality = {split: measure(avatar, trained, split, perceptual=True).as_json() for split in splits}
+            trained = with_refined_tracking(capture, folder)
+            quality = {split: evaluate_avatar(avatar, trained, split, perceptual=True).as_json() for split in splits}
             write_json(folder / QUALITY, quality)
         turns.answer({"done": not turns.dismissed})
     except StgaError as error:

@@ -12,18 +12,18 @@ from ...avatar.file import Avatar, read_avatar
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
-from ...effects.decide import decide
+from ...effects.plan import with_effect_plan
 from ...errors import StgaError
 from ...files import replacing, write_json
-from ...raster.images import selection_picture, side_by_side, to_bytes
-from ...raster.render import render_avatar
+from ...raster.render import render_avatar, to_uint8
 from ...selection import SelectionOptions, select_capture
-from ...training.evaluate.metrics import measure
+from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import Run
 from ...training.run.loop import train
 from ...training.run.progress_bar import ProgressBar
 from ...training.settings import make_settings
 from .capture import CaptureOptions, make_capture
+from .pictures import selection_picture, side_by_side
 
 SEED = 0
 TOLERANCE = 1e-5
@@ -77,7 +77,7 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
     # What was pictured is what the files say, and Blender shows the head as they do.
     settings = make_settings(seconds=seconds, seed=SEED, effects={"tracking": "off"})
-    run = decide(Run(capture.root, model.resolve(), "vhap", settings), capture)
+    run = with_effect_plan(Run(capture.root, model.resolve(), "vhap", settings), capture)
     folder = out / "run"
     if (folder / "run.json").exists():
         (folder / "run.json").unlink()  # the demo always starts anew
@@ -119,12 +119,12 @@ def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray],
     pictures = []
     for view in (capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]):
         image = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
-        pictures += [read_image(view), to_bytes(image)]
+        pictures += [read_image(view), to_uint8(image)]
     _save(out / "comparison.png", side_by_side(pictures))
     busiest = max(capture.views["val"], key=lambda view: selection[view.timestep].sum())
     selected = selection[busiest.timestep]
     picture = selection_picture(avatar, capture.mesh(busiest.timestep), busiest.camera, selected)
-    _save(out / "selection.png", to_bytes(picture))
+    _save(out / "selection.png", to_uint8(picture))
 
 
 def _save(path: Path, pixels: np.ndarray) -> None:
@@ -133,4 +133,4 @@ def _save(path: Path, pixels: np.ndarray) -> None:
 
 
 def _measure(capture: Capture, avatar: Avatar) -> dict[str, dict[str, float]]:
-    return {split: measure(avatar, capture, split).as_json() for split in ("val", "test")}
+    return {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}

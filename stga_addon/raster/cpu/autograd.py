@@ -7,10 +7,10 @@ import torch
 
 from ...avatar.embedding import WORLD, FaceFrames
 from ...capture.camera import Camera
-from .rasterize import CameraFrames, Parameters, camera_frames, render_backward, render_forward
+from .rasterize import CameraFrames, Parameters, frames_in_camera, render_backward, render_forward
 
 
-def render(
+def render_differentiable(
     splats: Parameters,
     camera: Camera,
     frames: FaceFrames = WORLD,
@@ -24,10 +24,10 @@ def render(
     alpha (H, W), and depth (H, W) = Σ weight · camera z.
     """
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
-    seen = camera_frames(frames, camera)
+    camera_frames = frames_in_camera(frames, camera)
     given = [tensor for tensor in splats if tensor is not None]
-    rgb, transmittance = _Blend.apply(seen, face, degree, False, antialiased, *given)
-    depth, _ = _Blend.apply(seen, face, degree, True, antialiased, *given)
+    rgb, transmittance = _Blend.apply(camera_frames, face, degree, False, antialiased, *given)
+    depth, _ = _Blend.apply(camera_frames, face, degree, True, antialiased, *given)
     return rgb, 1 - transmittance, depth[0]
 
 
@@ -35,22 +35,24 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        seen: CameraFrames,
+        camera_frames: CameraFrames,
         face: np.ndarray,
         degree: int,
-        depth_as_colour: bool,
+        depth_as_color: bool,
         antialiased: bool,
         *tensors: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
-        rendering = render_forward(splats, face, seen, degree, depth_as_colour=depth_as_colour, antialiased=antialiased)
-        ctx.saved = seen, face, splats, rendering
+        rendering = render_forward(
+            splats, face, camera_frames, degree, depth_as_color=depth_as_color, antialiased=antialiased
+        )
+        ctx.saved = camera_frames, face, splats, rendering
         return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
 
     @staticmethod
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
-        seen, face, splats, rendering = ctx.saved
+        camera_frames, face, splats, rendering = ctx.saved
         gradients = Parameters(*(np.zeros_like(a) for a in splats if a is not None))
         v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
-        render_backward(rendering, splats, face, seen, v_rgb, gradients, v_t)
+        render_backward(rendering, splats, face, camera_frames, v_rgb, gradients, v_t)
         return None, None, None, None, None, *(torch.from_numpy(g) for g in gradients if g is not None)

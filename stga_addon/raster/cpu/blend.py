@@ -12,9 +12,9 @@ from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PIXELS, PRECISION_X, P
 from .outline import outline, rows_within
 from .threads import parallel
 
-ALPHA_MAX = np.float32(0.999)
-ALPHA_MIN = np.float32(1 / 255)
-STOP = np.float32(1e-4)
+MAX_ALPHA = np.float32(0.999)
+MIN_ALPHA = np.float32(1 / 255)
+MIN_TRANSMITTANCE = np.float32(1e-4)
 LOG2E = np.float32(1.4426950408889634)
 
 # A tile is two halves, eight pixels wide, stored one after the other row by row: a vector of sixteen pixels holds two
@@ -23,8 +23,8 @@ HALF = TILE // 2
 HALF_PIXELS = PIXELS // 2
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
-# around in Python, and the test for it keeps LLVM from vectorising (12 times slower).
-ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, WEIGHT, PULL = (np.uint64(n * PIXELS) for n in range(1, 10))
+# around in Python, and the test for it keeps LLVM from vectorizing (12 times slower).
+ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, WEIGHT, V_POWER = (np.uint64(n * PIXELS) for n in range(1, 10))
 BEHIND, V_RED, V_GREEN, V_BLUE = ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE
 STATE = 10 * PIXELS
 
@@ -53,7 +53,7 @@ def _exp2(x):
 
 @part_jit
 def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
-    """Copy the projected splats of `count` pairs from `first` on; centres relative to the tile's corner (x0, y0)."""
+    """Copy the projected splats of `count` pairs from `first` on; centers relative to the tile's corner (x0, y0)."""
     for q in range(np.uint64(count)):
         i = np.uint64(pair_splat[np.uint64(first) + q])
         batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q] = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
@@ -67,7 +67,8 @@ def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
 def _find_rows(count, batch, low, high, low_right, high_right):
     """Which rows of each half of the tile a batch's splats reach: whole vectors, so pairs of rows.
 
-    low, high: first and past-the-last row of the left half that may be drawn on; low_right, high_right: of the right.
+    low, high: first and past-the-last row of the left half that may be rendered on; low_right, high_right: of the
+    right.
     """
     two, rows, width = np.float32(2.0), np.float32(TILE), np.float32(HALF)
     for q in range(np.uint64(count)):
@@ -98,7 +99,7 @@ def _rows_alive(s, half):
 
 @part_jit
 def _set_coordinates(s):
-    """Write the centres of a tile's pixels, relative to its corner."""
+    """Write the centers of a tile's pixels, relative to its corner."""
     for p in range(np.uint64(PIXELS)):
         half, within = np.int64(p) // HALF_PIXELS, np.int64(p) % HALF_PIXELS
         s[X + p] = np.float32(half * HALF + within % HALF) + np.float32(0.5)
@@ -159,11 +160,11 @@ def blend_forward(
                         dy = s[Y + p] - mean_y
                         dx = s[X + p] - mean_x - shear * dy
                         power = qx * dx * dx + qy * dy * dy
-                        a = min(ALPHA_MAX, opacity * _exp2(power))
-                        a = a * s[ALIVE + p] if a >= ALPHA_MIN else np.float32(0.0)
+                        a = min(MAX_ALPHA, opacity * _exp2(power))
+                        a = a * s[ALIVE + p] if a >= MIN_ALPHA else np.float32(0.0)
                         t = s[p]
                         after = t * (np.float32(1.0) - a)
-                        goes_on = after > STOP
+                        goes_on = after > MIN_TRANSMITTANCE
                         weight = a * t if goes_on else np.float32(0.0)
                         s[ALIVE + p] = s[ALIVE + p] if goes_on else np.float32(0.0)
                         s[p] = after if goes_on else t
@@ -250,8 +251,8 @@ def blend_backward(
                         dx = s[X + p] - mean_x - shear * dy
                         power = qx * dx * dx + qy * dy * dy
                         raw = opacity * _exp2(power)
-                        a = min(ALPHA_MAX, raw)
-                        a = a if (a >= ALPHA_MIN) and (order <= s[LAST + p]) else np.float32(0.0)
+                        a = min(MAX_ALPHA, raw)
+                        a = a if (a >= MIN_ALPHA) and (order <= s[LAST + p]) else np.float32(0.0)
                         ra = np.float32(1.0) / (np.float32(1.0) - a)
                         t = s[p] * ra
                         weight = a * t
@@ -261,13 +262,13 @@ def blend_backward(
                         s[BEHIND + p] += weight * along
                         s[WEIGHT + p] = weight
                         # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
-                        s[PULL + p] = a * v_a if raw < ALPHA_MAX else np.float32(0.0)
+                        s[V_POWER + p] = a * v_a if raw < MAX_ALPHA else np.float32(0.0)
                     if not is_wanted:
                         continue  # a frozen splat only has to be stepped through, in the very same arithmetic
                     for p in range(np.uint64(first), np.uint64(past)):
                         dy = s[Y + p] - mean_y
                         dx = s[X + p] - mean_x - shear * dy
-                        g, weight = s[PULL + p], s[WEIGHT + p]
+                        g, weight = s[V_POWER + p], s[WEIGHT + p]
                         g0 += g
                         gx += g * dx
                         gy += g * dy

@@ -11,7 +11,7 @@ from . import inline_jit, jit, part_jit
 from .threads import parallel
 
 RADIUS = 5
-REACH = 2 * RADIUS
+LOSS_REACH_PX = 2 * RADIUS
 """A pixel's gradient depends on image pixels up to this far away."""
 RING = 2 * RADIUS + 1
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
@@ -74,15 +74,15 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
-    1 / (3·H·W). Reads the image up to REACH pixels around a rectangle. Writes gradient (3, H, W) and, per rectangle,
-    sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
+    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, per
+    rectangle, sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
     """
     height, width = image.shape[1], image.shape[2]
     for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
         r, c = job // 3, job % 3
         x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
         # Columns [left, right) hold everything that matters; each row buffer is padded by RADIUS zeros.
-        left, right = max(0, x0 - REACH), min(width, x1 + REACH)
+        left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
         span = right - left
         stride = span + 2 * RADIUS
         wanted = np.zeros(RING * stride, np.float32)  # the target's last rows, as floats
@@ -93,7 +93,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
         second = np.zeros(3 * RING * stride, np.float32)
         blurred = np.zeros(3 * stride, np.float32)
         difference, similarity = 0.0, 0.0
-        for row in range(y0 - REACH, y1 + REACH):
+        for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
             # 1. horizontal blur of this row's four values
             inside = 0 <= row < height
             if inside:
@@ -172,7 +172,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
 @parallel(lambda image, *_: len(image))
 @jit
 def change_background(first_row, past_row, image, mask, before, after, out):
-    """Write image (H, W, 3) uint8, composited over the colour `before`, as it looks over `after`.
+    """Write image (H, W, 3) uint8, composited over the color `before`, as it looks over `after`.
 
     mask (H, W) uint8: the foreground's coverage; before, after (3,) float32 in 0…255; out as image.
     image = coverage · foreground + (1 − coverage) · before, so only the second term has to be exchanged.

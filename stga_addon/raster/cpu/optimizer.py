@@ -9,7 +9,7 @@ from .threads import parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 CHUNK = 256
-LARGEST = np.float32(1e18)
+MAX_GRADIENT = np.float32(1e18)
 """A gradient beyond this counts as broken: its square would make the second moment infinite, and the row NaN."""
 
 
@@ -24,8 +24,8 @@ def adam_rows(
     parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
     (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
     `newest`, or 4 / (steps + 3) where that is more: the first steps are long, and soon to be forgotten. Rows that are
-    not listed are not touched at all. A row whose gradient is not finite, or beyond LARGEST, keeps that parameter, its
-    moments and its average.
+    not listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that
+    parameter, its moments and its average.
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
@@ -49,13 +49,13 @@ def adam_rows(
 def _adam_block(
     rows, parameter, gradient, first, second, average, correct1, correct2, blend, rates, beta1, beta2, epsilon
 ):
-    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorises."""
+    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorizes."""
     width = parameter.shape[1]
     for n in range(len(rows)):
         i = rows[n]
         unsound = ZERO
         for c in range(width):
-            unsound += ZERO if abs(gradient[i, c]) < LARGEST else ONE
+            unsound += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
         if unsound != ZERO:
             continue
         scale1, scale2, share = correct1[n], correct2[n], blend[n]

@@ -25,10 +25,10 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
 
 @part_jit
 def rows_within(outline, left, width, rows):
-    """First and past-the-last of rows 0 to `rows` in which a pixel of the `width` columns from `left` on has its centre
+    """First and past-the-last of rows 0 to `rows` in which a pixel of the `width` columns from `left` on has its center
     in an outline; the first is not before the other where there are none. All float32.
 
-    Between the outermost centres the ellipse is highest where it is highest altogether, or else at the nearer edge, and
+    Between the outermost centers the ellipse is highest where it is highest altogether, or else at the nearer edge, and
     likewise lowest.
     """
     mean_x, mean_y, extent_y, lean, rate, chord, cut, slack = outline

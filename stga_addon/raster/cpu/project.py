@@ -1,4 +1,4 @@
-"""Embedding, projection and colour of every splat in one pass, forward and backward.
+"""Embedding, projection and color of every splat in one pass, forward and backward.
 
 The face frames arrive already in camera space (composed in float64 by the caller), so a head far from the
 world's origin loses nothing to float32, and embedded and world-space splats take the same path.
@@ -12,9 +12,9 @@ from . import jit, part_jit
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, TILE
 from .threads import parallel
 
-LOW_PASS = np.float32(0.3)
+LOW_PASS_PX2 = np.float32(0.3)
 """Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
-NEAR = np.float32(0.01)
+NEAR_M = np.float32(0.01)
 BLOCK = 64
 """So many splats' gradients are gathered at a time."""
 LIFT = np.float32(2.0**90)
@@ -26,7 +26,7 @@ SH = np.array(
     ],
     np.float32,
 )  # fmt: skip
-"""The normalisation constants of the real spherical harmonics up to degree 3, in order of first use."""
+"""The normalization constants of the real spherical harmonics up to degree 3, in order of first use."""
 
 
 @part_jit
@@ -105,43 +105,45 @@ def _basis_gradient(degree, x, y, z, w):
 
 @parallel(lambda origin, *_: len(origin))
 @jit
-def compose_frames(begin, end, origin, rotation, scale, turn, shift, seen_origin, seen_matrix):
-    """Face frames as a camera sees them: seen_matrix = turn @ rotation · scale, seen_origin = turn @ origin + shift.
+def compose_frames(begin, end, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
+    """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin = turn @ origin +
+    shift.
 
     origin (F, 3), rotation (F, 3, 3), scale (F,), turn (3, 3) and shift (3,) float64, so that distance from the origin
-    costs no precision. Writes seen_origin (F, 3) and seen_matrix (F, 3, 3) float32.
+    costs no precision. Writes camera_origin (F, 3) and camera_matrix (F, 3, 3) float32.
     """
     for f in range(begin, end):
         for r in range(3):
             t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
-            seen_origin[f, r] = t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
+            camera_origin[f, r] = t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
             for c in range(3):
                 along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
-                seen_matrix[f, r, c] = scale[f] * along
+                camera_matrix[f, r, c] = scale[f] * along
 
 
 @parallel(lambda rows, *_: len(rows))
 @jit
 def project_forward(
-    begin, end, rows, drawn,
-    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, depth, extent_y, rect,
+    begin, end, rows, rendered,
+    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, intrinsics,
+    size, depth_as_color, antialiased, projected, depth, extent_y, rect,
 ):  # fmt: skip
     """Project the listed ones of N embedded splats.
 
-    rows (M,): the splats to project. drawn (tiles_y, tiles_x) bool: one that reaches none of these tiles is not seen.
+    rows (M,): the splats to project. rendered (tiles_y, tiles_x) bool: one that reaches none of these tiles is not
+    visible.
     xyz, rotation (wxyz), log_scale, opacity (logit), sh (N, K, 3), strain_color (N, S, 3), face: as in `Splats`;
     `degree` ≤ the stored.
     origin (F, 3), matrix (F, 3, 3): camera-space frames, scale included: camera point = matrix @ xyz + origin.
-    strain (F, S): how the triangles deform; colours follow as many columns as both it and strain_color have.
-    to_world (3, 3): camera to world rotation. lens (4,): fl_x, fl_y, cx, cy. size (2,): width, height.
-    depth_as_colour: blend (z, 0, 0) instead of the colour. antialiased: what LOW_PASS adds to a splat's area is taken
+    strain (F, S): how the triangles deform; colors follow as many columns as both it and strain_color have.
+    to_world (3, 3): camera to world rotation. intrinsics (4,): fl_x, fl_y, cx, cy. size (2,): width, height.
+    depth_as_color: blend (z, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to a splat's area is taken
     from its opacity (Mip-Splatting's 2D filter, as gsplat's "antialiased" mode).
     Writes projected (N, 9), depth (N,), extent_y (N,) half height in pixels up to α = 1/255, and rect (N, 4) int32
     tile bounds x0, y0, x1, y1: all 0 for a splat that cannot be seen, all −1 for one that is not finite or would be
     wider than float32 can square (some 1e9 pixels).
     """
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     width, height = size[0], size[1]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
@@ -155,7 +157,7 @@ def project_forward(
         x = matrix[f, 0, 0] * lx + matrix[f, 0, 1] * ly + matrix[f, 0, 2] * lz + origin[f, 0]
         y = matrix[f, 1, 0] * lx + matrix[f, 1, 1] * ly + matrix[f, 1, 2] * lz + origin[f, 1]
         z = matrix[f, 2, 0] * lx + matrix[f, 2, 1] * ly + matrix[f, 2, 2] * lz + origin[f, 2]
-        if z < NEAR:
+        if z < NEAR_M:
             continue
         rz = ONE / z
         tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
@@ -174,13 +176,13 @@ def project_forward(
         a02 = (u00 * r02 + u01 * r12 + u02 * r22) * s2
         a10, a11 = (u10 * r00 + u11 * r10 + u12 * r20) * s0, (u10 * r01 + u11 * r11 + u12 * r21) * s1
         a12 = (u10 * r02 + u11 * r12 + u12 * r22) * s2
-        xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS
+        xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS_PX2
         xy = a00 * a10 + a01 * a11 + a02 * a12
-        yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS
+        yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS_PX2
         # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or below.
         m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
         sharp = m01 * m01 + m02 * m02 + m12 * m12
-        det = sharp + LOW_PASS * (xx + yy - LOW_PASS)
+        det = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2)
         visible = ONE / (ONE + math.exp(-opacity[i]))
         if antialiased:
             visible *= math.sqrt(sharp / det)
@@ -198,7 +200,7 @@ def project_forward(
         x1 = np.int32(min(limit_x, max(ZERO, np.ceil((mean_x + ex) / size_))))
         y0 = np.int32(min(limit_y, max(ZERO, np.floor((mean_y - ey) / size_))))
         y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
-        if not _any_drawn(drawn, x0, y0, x1, y1):
+        if not _any_drawn(rendered, x0, y0, x1, y1):
             continue
         rd = ONE / math.sqrt(x * x + y * y + z * z)
         dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
@@ -219,7 +221,7 @@ def project_forward(
             rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
             continue
         red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
-        if depth_as_colour:
+        if depth_as_color:
             red, green, blue = z, ZERO, ZERO
         rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3] = x0, y0, x1, y1
         depth[i] = z
@@ -231,10 +233,10 @@ def project_forward(
 
 
 @part_jit
-def _any_drawn(drawn, x0, y0, x1, y1):
+def _any_drawn(rendered, x0, y0, x1, y1):
     for y in range(y0, y1):
         for x in range(x0, x1):
-            if drawn[y, x]:
+            if rendered[y, x]:
                 return True
     return False
 
@@ -252,7 +254,7 @@ def _tan_limits(fx, fy, cx, cy, width, height):
 @part_jit
 def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
     """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in `project_forward`."""
-    low = LOW_PASS
+    low = LOW_PASS_PX2
     sharp = m01 * m01 + m02 * m02 + m12 * m12
     xx, yy = a00 * a00 + a01 * a01 + a02 * a02, a10 * a10 + a11 * a11 + a12 * a12
     det = sharp + low * (xx + yy + low)
@@ -285,17 +287,18 @@ def _sum_pairs(splats, first_pair, pairs, splat_pairs, grads, sums):
 @jit
 def project_backward(
     begin, end, visible,
-    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, lens, size,
-    depth_as_colour, antialiased, projected, first_pair, pairs, splat_pairs, grads,
+    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, intrinsics,
+    size, depth_as_color, antialiased, projected, first_pair, pairs, splat_pairs, grads,
     v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of v_*; the counterpart of `project_forward`.
 
-    visible (M,) int32: the splats to differentiate. grads (P, 9): gradients of all pairs; those of splat i are its rows
+    visible (M,) int32: the splats to image_loss_gradient. grads (P, 9): gradients of all pairs; those of splat i are
+    its rows
     splat_pairs[first_pair[i] : first_pair[i] + pairs[i]]. screen (N,): length of the gradient with respect to the
-    projected centre in units of half the image (what density control asks for), written for each listed splat.
+    projected center in units of half the image (what density control asks for), written for each listed splat.
     """
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
     basis, weight = np.empty(16, np.float32), np.empty(16, np.float32)
@@ -338,9 +341,9 @@ def project_backward(
         # something of row 1, is taken together with row 0, because the two cancel for long splats.
         shear, inverse_yy = projected[i, SHEAR], projected[i, PRECISION_Y]
         m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
-        e0 = inverse_yy * (LOW_PASS * a00 + a11 * m01 + a12 * m02)
-        e1 = inverse_yy * (LOW_PASS * a01 - a10 * m01 + a12 * m12)
-        e2 = inverse_yy * (LOW_PASS * a02 - a10 * m02 - a11 * m12)
+        e0 = inverse_yy * (LOW_PASS_PX2 * a00 + a11 * m01 + a12 * m02)
+        e1 = inverse_yy * (LOW_PASS_PX2 * a01 - a10 * m01 + a12 * m12)
+        e2 = inverse_yy * (LOW_PASS_PX2 * a02 - a10 * m02 - a11 * m12)
         vs = -TWO * projected[i, PRECISION_X] * projected[i, PRECISION_X] * g[PRECISION_X]
         vk = inverse_yy * g[SHEAR]
         vw = -TWO * inverse_yy * inverse_yy * g[PRECISION_Y]
@@ -356,7 +359,7 @@ def project_backward(
         v_log_scale[i, 0] = by0
         v_log_scale[i, 1] = by1
         v_log_scale[i, 2] = by2
-        # A = U·R·diag(s): to R, then through the normalised quaternion.
+        # A = U·R·diag(s): to R, then through the normalized quaternion.
         v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
         p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
         h00, h01, h02 = p0 * v00 + u10 * v10, p0 * v01 + u10 * v11, p0 * v02 + u10 * v12
@@ -388,7 +391,7 @@ def project_backward(
 
         # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
         v_opacity[i] = g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
-        if depth_as_colour:
+        if depth_as_color:
             vz += g[RED]
         else:
             rd = ONE / math.sqrt(x * x + y * y + z * z)

@@ -12,16 +12,16 @@ from ...capture.camera import Camera
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, TILE
 from .project import compose_frames, project_backward, project_forward
-from .threads import PIECES, threads
-from .tiles import PARTS, count_pairs, depth_order, fill_pairs, lay_out, mark_tiles
+from .threads import PIECES_PER_THREAD, threads
+from .tiles import PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, mark_tiles
 
-BLACK = np.zeros(3, np.float32)
+BLACK_BACKGROUND = np.zeros(3, np.float32)
 
 
 class Parameters(NamedTuple):
     """What is trained of N splats, in the raw form of `Splats`: numpy float32 arrays, or torch tensors in `autograd`.
 
-    Without `strain_color`, colours do not follow strain.
+    Without `strain_color`, colors do not follow strain.
     """
 
     xyz: Any
@@ -41,7 +41,7 @@ class CameraFrames:
     matrix: np.ndarray
     strain: np.ndarray
     to_world: np.ndarray
-    lens: np.ndarray
+    intrinsics: np.ndarray
     size: np.ndarray
 
 
@@ -72,7 +72,7 @@ class RenderOutput:
     touched: np.ndarray
     background: np.ndarray
     degree: int
-    depth_as_colour: bool
+    depth_as_color: bool
     antialiased: bool
 
 
@@ -82,8 +82,8 @@ class BufferPool:
     def __init__(self) -> None:
         self._buffers: dict[str, np.ndarray] = {}
 
-    def take(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
-        """An uninitialised array; the same memory whenever the same name is taken again."""
+    def get(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+        """An uninitialized array; the same memory whenever the same name is taken again."""
         size = int(np.prod(shape))
         buffer = self._buffers.get(name)
         if buffer is None or len(buffer) < size:
@@ -92,7 +92,7 @@ class BufferPool:
         return buffer[:size].reshape(shape)
 
 
-def camera_frames(frames: FaceFrames, camera: Camera) -> CameraFrames:
+def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
     """Compose face frames with a camera in float64, so that distance from the origin costs no precision."""
     turn, shift = np.float64(camera.world_to_camera[:3, :3]), np.float64(camera.world_to_camera[:3, 3])
     parts = (frames.origin, frames.rotation, frames.scale, turn, shift)
@@ -105,7 +105,7 @@ def camera_frames(frames: FaceFrames, camera: Camera) -> CameraFrames:
         matrix=matrix,
         strain=frames.strain,
         to_world=np.ascontiguousarray(turn.T, np.float32),
-        lens=np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy], np.float32),
+        intrinsics=np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy], np.float32),
         size=np.array([camera.width, camera.height], np.int64),
     )
 
@@ -113,63 +113,64 @@ def camera_frames(frames: FaceFrames, camera: Camera) -> CameraFrames:
 def render_forward(
     splats: Parameters,
     face: np.ndarray,
-    seen: CameraFrames,
+    frames: CameraFrames,
     degree: int,
-    background: np.ndarray = BLACK,
+    background: np.ndarray = BLACK_BACKGROUND,
     focus: np.ndarray | None = None,
     reach: int = 0,
-    depth_as_colour: bool = False,
+    depth_as_color: bool = False,
     antialiased: bool = False,
-    scratch: "BufferPool | None" = None,
+    buffers: "BufferPool | None" = None,
 ) -> RenderOutput:
-    """Render N embedded splats over a background colour (3,).
+    """Render N embedded splats over a background color (3,).
 
     splats: numpy arrays as in `Splats`; face (N,) int32; degree: spherical harmonics used.
     focus (N,) bool: render only the tiles these splats touch and those at most `reach` pixels away, which is all
     that can influence their gradient; None renders everything.
-    depth_as_colour: the first channel blends camera depth, the others are zero.
-    antialiased: splats narrower than a pixel, which are drawn a pixel wide, lose the opacity that this adds.
-    scratch: buffers to reuse; the rendering is then valid until the next one with the same scratch.
+    depth_as_color: the first channel blends camera depth, the others are zero.
+    antialiased: splats narrower than a pixel, which are rendered a pixel wide, lose the opacity that this adds.
+    buffers: buffers to reuse; the rendering is then valid until the next one with the same buffers.
     """
-    n, camera, splats = len(splats.xyz), seen.camera, complete(splats)
-    take = (scratch or BufferPool()).take
+    n, camera, splats = len(splats.xyz), frames.camera, with_strain_color(splats)
+    array = (buffers or BufferPool()).get
     tiles_x, tiles_y = tile_grid(camera)
-    projected, depth = take("projected", (n, PROJECTED)), take("depth", (n,))
-    extent_y, rect = take("extent_y", (n,)), take("rect", (n, 4), np.int32)
+    projected, depth = array("projected", (n, PROJECTED)), array("depth", (n,))
+    extent_y, rect = array("extent_y", (n,)), array("rect", (n, 4), np.int32)
 
-    def project(rows: np.ndarray, drawn: np.ndarray) -> None:
+    def project(rows: np.ndarray, rendered: np.ndarray) -> None:
         project_forward(
-            rows, drawn, *splats, degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world, seen.lens,
-            seen.size, depth_as_colour, antialiased, projected, depth, extent_y, rect,
+            rows, rendered, *splats, degree, face, frames.origin, frames.matrix, frames.strain, frames.to_world,
+            frames.intrinsics, frames.size, depth_as_color, antialiased, projected, depth, extent_y, rect,
         )  # fmt: skip
 
-    touched = drawn = np.ones((tiles_y, tiles_x), bool)
+    touched = rendered = np.ones((tiles_y, tiles_x), bool)
     if focus is None:
-        project(np.arange(n), drawn)
+        project(np.arange(n), rendered)
     else:
-        project(np.flatnonzero(focus), drawn)
-        touched = np.zeros_like(drawn)
+        project(np.flatnonzero(focus), rendered)
+        touched = np.zeros_like(rendered)
         mark_tiles(rect, np.flatnonzero(focus), touched)
-        drawn = _near(touched, reach)
-        project(np.flatnonzero(~focus), drawn)
-    bins = sort_into_tiles(depth, rect, camera, take)
-    tiles = deal(np.flatnonzero(drawn).astype(np.int32))
-    image = take("image", (3, camera.height, camera.width))
-    transmittance = take("transmittance", (camera.height, camera.width))
-    last = take("last", (camera.height, camera.width), np.int32)
-    pair_rows = take("pair_rows", (len(bins.pair_splat), 4), np.uint8)
+        rendered = _dilate(touched, reach)
+        project(np.flatnonzero(~focus), rendered)
+    lists = sort_into_tiles(depth, rect, camera, array)
+    tiles = interleave_tiles(np.flatnonzero(rendered).astype(np.int32))
+    image = array("image", (3, camera.height, camera.width))
+    transmittance = array("transmittance", (camera.height, camera.width))
+    last = array("last", (camera.height, camera.width), np.int32)
+    pair_rows = array("pair_rows", (len(lists.pair_splat), 4), np.uint8)
     background = np.asarray(background, np.float32)
     blend_forward(
-        tiles, tiles_x, bins.start, bins.pair_splat, projected, extent_y, background, pair_rows, image, transmittance,
+        tiles, tiles_x, lists.start, lists.pair_splat, projected, extent_y, background, pair_rows, image, transmittance,
         last,
     )  # fmt: skip
     return RenderOutput(
-        image, transmittance, bins.visible, projected, rect, last, bins.first_pair, bins.pairs, bins.splat_pairs,
-        bins.start, bins.pair_splat, pair_rows, tiles, focus, touched, background, degree, depth_as_colour, antialiased,
+        image, transmittance, lists.visible, projected, rect, last, lists.first_pair, lists.pairs, lists.splat_pairs,
+        lists.start, lists.pair_splat, pair_rows, tiles, focus, touched, background, degree, depth_as_color,
+        antialiased,
     )  # fmt: skip
 
 
-class Bins(NamedTuple):
+class TileLists(NamedTuple):
     """Which splats touch which tile, as `blend_forward` wants it; visible (M,) int32: those that touch any."""
 
     visible: np.ndarray
@@ -184,51 +185,51 @@ def sort_into_tiles(
     depth: np.ndarray,
     rect: np.ndarray,
     camera: Camera,
-    take: Callable[..., np.ndarray],
-) -> Bins:
-    """Projected splats in tiles, front to back; arrays as from `project_forward`, take: a `BufferPool`'s.
+    array: Callable[..., np.ndarray],
+) -> TileLists:
+    """Projected splats in tiles, front to back; arrays as from `project_forward`, array: a `BufferPool`'s `get`.
 
     Splats of several projections may stand in the arrays one after the other.
     """
     tiles_x, tiles_y = tile_grid(camera)
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
     order = depth_order(depth, visible)
-    first_pair, pairs = take("first_pair", depth.shape, np.int32), take("pairs", depth.shape, np.int32)
-    counts = take("counts", (PARTS, tiles_x * tiles_y), np.int32)
+    first_pair, pairs = array("first_pair", depth.shape, np.int32), array("pairs", depth.shape, np.int32)
+    counts = array("counts", (PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts, pairs)
-    start = lay_out(visible, pairs, counts, first_pair)
-    splat_pairs = take("splat_pairs", (start[-1],), np.int32)
-    pair_splat = take("pair_splat", (start[-1],), np.int32)
+    start = compute_offsets(visible, pairs, counts, first_pair)
+    splat_pairs = array("splat_pairs", (start[-1],), np.int32)
+    pair_splat = array("pair_splat", (start[-1],), np.int32)
     fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
-    return Bins(visible, first_pair, pairs, splat_pairs, start, pair_splat)
+    return TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat)
 
 
 def render_backward(
     rendering: RenderOutput,
     splats: Parameters,
     face: np.ndarray,
-    seen: CameraFrames,
+    frames: CameraFrames,
     v_image: np.ndarray,
     gradients: Parameters,
     v_transmittance: np.ndarray | None = None,
-    scratch: "BufferPool | None" = None,
+    buffers: "BufferPool | None" = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients` that belong to a
     visible splat, one in focus if the rendering has a focus, and leaves all others as they are.
     Returns the rows written (M,) int32, and screen (N,): for those rows, the length of the gradient with respect to
-    the projected centre in units of half the image.
+    the projected center in units of half the image.
     """
-    n, take = len(splats.xyz), (scratch or BufferPool()).take
-    tiles_x, _ = tile_grid(seen.camera)
+    n, array = len(splats.xyz), (buffers or BufferPool()).get
+    tiles_x, _ = tile_grid(frames.camera)
     tiles, rows = rendering.tiles, rendering.visible
     wanted = np.ones(n, bool)
     if rendering.focus is not None:
         wanted = rendering.focus
         tiles, rows = tiles[rendering.touched.ravel()[tiles]], rows[wanted[rows]]
-    pair_gradients = take("pair_gradients", (len(rendering.pair_splat), PROJECTED))
-    screen = take("screen", (n,))
+    pair_gradients = array("pair_gradients", (len(rendering.pair_splat), PROJECTED))
+    screen = array("screen", (n,))
     if v_transmittance is None:
         v_transmittance = np.broadcast_to(np.float32(0), rendering.transmittance.shape)
     blend_backward(
@@ -237,14 +238,16 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        rows, *complete(splats), rendering.degree, face, seen.origin, seen.matrix, seen.strain, seen.to_world,
-        seen.lens, seen.size, rendering.depth_as_colour, rendering.antialiased, rendering.projected,
-        rendering.first_pair, rendering.pairs, rendering.splat_pairs, pair_gradients, *complete(gradients), screen,
+        rows, *with_strain_color(splats), rendering.degree, face, frames.origin, frames.matrix, frames.strain,
+        frames.to_world,
+        frames.intrinsics, frames.size, rendering.depth_as_color, rendering.antialiased, rendering.projected,
+        rendering.first_pair, rendering.pairs, rendering.splat_pairs, pair_gradients, *with_strain_color(gradients),
+        screen,
     )  # fmt: skip
     return rows, screen
 
 
-def complete(splats: Parameters) -> Parameters:
+def with_strain_color(splats: Parameters) -> Parameters:
     """With an empty `strain_color` where there is none, as the kernels want it."""
     if splats.strain_color is not None:
         return splats
@@ -256,7 +259,7 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
     return -(-camera.width // TILE), -(-camera.height // TILE)
 
 
-def _near(tiles: np.ndarray, reach: int) -> np.ndarray:
+def _dilate(tiles: np.ndarray, reach: int) -> np.ndarray:
     """Tiles (rows, columns) bool within `reach` pixels of a marked one."""
     grown = tiles.copy()
     for _ in range(-(-reach // TILE)):
@@ -266,7 +269,7 @@ def _near(tiles: np.ndarray, reach: int) -> np.ndarray:
     return grown
 
 
-def deal(tiles: np.ndarray) -> np.ndarray:
+def interleave_tiles(tiles: np.ndarray) -> np.ndarray:
     """Deal tiles out like cards, so that every piece of a thread's work is spread over the whole image."""
-    pieces = PIECES * threads()
+    pieces = PIECES_PER_THREAD * threads()
     return np.concatenate([tiles[k::pieces] for k in range(pieces)])

@@ -1,8 +1,8 @@
 """Kernels on several threads: they release Python's lock, so Python's own threads do.
 
 Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image loss), hold the lock
-while they run, so that Blender's window waits for a picture drawn in its background, and crash where two threads call
-them at once.
+while they run, so that Blender's window waits for a picture rendered in its background, and crash where two threads
+call them at once.
 """
 
 import os
@@ -12,7 +12,7 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
-PIECES = 8
+PIECES_PER_THREAD = 8
 """Pieces of work a thread: what one thread is late with, another takes over."""
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -32,7 +32,7 @@ def set_threads(count: int) -> None:
     _threads = max(1, count)
 
 
-def parallel(units: Callable[..., int], pieces: int = PIECES) -> Callable[[Any], Callable[..., None]]:
+def parallel(units: Callable[..., int], pieces: int = PIECES_PER_THREAD) -> Callable[[Any], Callable[..., None]]:
     """Make kernel(begin, end, *arguments) a function of the arguments alone that runs on all threads.
 
     units: how many units of work the arguments hold; a kernel must do [begin, end) of them whatever the others do, and

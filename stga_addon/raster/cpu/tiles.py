@@ -57,7 +57,7 @@ def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
 
 
 @jit
-def lay_out(visible, pairs, counts, first_pair):
+def compute_offsets(visible, pairs, counts, first_pair):
     """Turn the counts of `count_pairs` into the places where each part's pairs begin.
 
     visible (M,) int32: the splats in the order in which their pairs are to be found: splat i's from first_pair[i] on.
@@ -81,7 +81,7 @@ def lay_out(visible, pairs, counts, first_pair):
 @parallel(lambda *_: PARTS)
 @jit
 def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
-    """Write every tile's pairs front to back, from the places of `lay_out` on, which move along.
+    """Write every tile's pairs front to back, from the places of `compute_offsets` on, which move along.
 
     pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat stand, its first at
     first_pair[i].

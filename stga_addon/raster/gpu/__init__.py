@@ -1,4 +1,4 @@
-"""The rasteriser's second back end: Warp kernels for NVIDIA GPUs, and on Warp's CPU device for tests.
+"""The rasterizer's second back end: Warp kernels for NVIDIA GPUs, and on Warp's CPU device for tests.
 
 Formulas, constants and results are those of `cpu/`. One thread a pixel, splat or coefficient; nothing here depends
 on the order in which threads run, so the same input gives the same bits (there is no faster, unordered mode). Warp

@@ -8,11 +8,11 @@ import warp as wp
 
 from ...avatar.embedding import WORLD, FaceFrames
 from ...capture.camera import Camera
-from ..cpu.rasterize import Parameters, camera_frames
-from .rasterize import TYPES, DeviceFrames, Rasteriser, lens_of
+from ..cpu.rasterize import Parameters, frames_in_camera
+from .rasterize import PARAMETER_TYPES, DeviceFrames, Rasterizer, device_camera
 
 
-def render(
+def render_differentiable(
     splats: Parameters,
     camera: Camera,
     frames: FaceFrames = WORLD,
@@ -25,26 +25,30 @@ def render(
     Everything else as in `raster.autograd.render`.
     """
     device = str(splats.xyz.device)
-    seen, count = camera_frames(frames, camera), len(splats.xyz)
+    camera_frames, count = frames_in_camera(frames, camera), len(splats.xyz)
     if splats.strain_color is None:
         splats = splats._replace(strain_color=splats.xyz.new_zeros(count, 0, 3))
-    strains = min(seen.strain.shape[1], splats.strain_color.shape[1])
+    strains = min(camera_frames.strain.shape[1], splats.strain_color.shape[1])
     origin, matrix, strain = (
         wp.array(value, dtype=dtype, device=device)
-        for value, dtype in ((seen.origin, wp.vec3), (seen.matrix, wp.mat33), (seen.strain, wp.float32))
+        for value, dtype in (
+            (camera_frames.origin, wp.vec3),
+            (camera_frames.matrix, wp.mat33),
+            (camera_frames.strain, wp.float32),
+        )
     )
     on_face = wp.array(np.zeros(count, np.int32) if face is None else face, dtype=wp.int32, device=device)
     images = []
-    for depth_as_colour in (False, True):
-        lens = lens_of(camera, degree, strains, depth_as_colour, antialiased)
+    for depth_as_color in (False, True):
+        lens = device_camera(camera, degree, strains, depth_as_color, antialiased)
         images.append(_Blend.apply(DeviceFrames(origin, matrix, strain, lens), on_face, *splats))
     (rgb, transmittance), (depth, _) = images
     return rgb, 1 - transmittance, depth[0]
 
 
 def shared(tensors: Parameters) -> Parameters:
-    """Contiguous torch tensors as Warp arrays of `TYPES` that share their memory."""
-    return Parameters(*(_share(tensor.detach(), kind) for tensor, kind in zip(tensors, TYPES, strict=True)))
+    """Contiguous torch tensors as Warp arrays of `PARAMETER_TYPES` that share their memory."""
+    return Parameters(*(_share(tensor.detach(), kind) for tensor, kind in zip(tensors, PARAMETER_TYPES, strict=True)))
 
 
 def _share(tensor: torch.Tensor, kind: Any) -> wp.array:
@@ -67,17 +71,17 @@ class _Blend(torch.autograd.Function):
         device = tensors[0].device
         kept = [tensor.detach().contiguous() for tensor in tensors]
         with _stream(device):
-            rasteriser, splats = Rasteriser(str(device)), shared(Parameters(*kept))
-            rendering = rasteriser.forward(splats, face, frames)
-        ctx.saved = kept, splats, face, rasteriser, rendering
+            rasterizer, splats = Rasterizer(str(device)), shared(Parameters(*kept))
+            rendering = rasterizer.forward(splats, face, frames)
+        ctx.saved = kept, splats, face, rasterizer, rendering
         return wp.to_torch(rendering.image), wp.to_torch(rendering.transmittance)
 
     @staticmethod
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
-        kept, splats, face, rasteriser, rendering = ctx.saved
+        kept, splats, face, rasterizer, rendering = ctx.saved
         gradients = Parameters(*(torch.zeros_like(tensor) for tensor in kept))
         with _stream(kept[0].device):
-            rasteriser.backward(
+            rasterizer.backward(
                 rendering, splats, face, wp.from_torch(v_image.contiguous()), shared(gradients),
                 wp.from_torch(v_transmittance.contiguous()),
             )  # fmt: skip

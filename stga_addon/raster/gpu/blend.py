@@ -5,7 +5,7 @@ broadcast from the cache). Backward: a warp half a tile, four pixels a lane. The
 summed over the warp's registers, and each half has a row of its own to write it to; the rows of a splat are summed
 later, in order. So no two threads write one place and no sum depends on chance.
 
-On Warp's CPU device, where threads run one after the other, a warp is a single lane: `_over_warp` and its like return
+On Warp's CPU device, where threads run one after the other, a warp is a single lane: `_warp_sum` and its like return
 what they are given, every lane counts as the leading one, and rows are added to, in the order of lanes.
 """
 
@@ -15,20 +15,22 @@ from ..cpu import blend as cpu
 from ..cpu import layout
 from ..cpu.layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
 from .project import Projected
-from .tiles import NO
+from .tiles import UNMARKED
 
 wp.set_module_options({"enable_backward": False})
 
 TILE, PIXELS = wp.constant(layout.TILE), wp.constant(layout.PIXELS)
-ALPHA_MAX, ALPHA_MIN, STOP = (wp.constant(float(c)) for c in (cpu.ALPHA_MAX, cpu.ALPHA_MIN, cpu.STOP))
-LANES = wp.constant(32)
+MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE = (
+    wp.constant(float(c)) for c in (cpu.MAX_ALPHA, cpu.MIN_ALPHA, cpu.MIN_TRANSMITTANCE)
+)
+WARP_LANES = wp.constant(32)
 PARTS = wp.constant(2)
 """Warps a tile has in the backward, and rows a pair: more warps fill a GPU better, fewer add up less."""
-SHARE = layout.PIXELS // (32 * 2)
+PIXELS_PER_LANE = layout.PIXELS // (32 * 2)
 
-Share = wp.types.vector(length=SHARE, dtype=wp.float32)
+LaneFloats = wp.types.vector(length=PIXELS_PER_LANE, dtype=wp.float32)
 """A value of each of a lane's pixels."""
-ShareInt = wp.types.vector(length=SHARE, dtype=wp.int32)
+LaneInts = wp.types.vector(length=PIXELS_PER_LANE, dtype=wp.int32)
 
 
 @wp.func_native("""
@@ -38,7 +40,7 @@ ShareInt = wp.types.vector(length=SHARE, dtype=wp.int32)
 #endif
     return value;
 """)
-def _over_warp(value: wp.float32) -> wp.float32:
+def _warp_sum(value: wp.float32) -> wp.float32:
     """The sum over a warp, the same in all lanes; all must call."""
     ...
 
@@ -50,7 +52,7 @@ def _over_warp(value: wp.float32) -> wp.float32:
 #endif
     return value;
 """)
-def _largest_of_warp(value: wp.int32) -> wp.int32:
+def _warp_max(value: wp.int32) -> wp.int32:
     """The largest value of a warp, the same in all lanes; all must call."""
     ...
 
@@ -62,14 +64,14 @@ def _largest_of_warp(value: wp.int32) -> wp.int32:
     return true;
 #endif
 """)
-def _leads() -> wp.bool:
+def _is_warp_leader() -> wp.bool:
     """Whether this lane writes for its warp."""
     ...
 
 
 @wp.func
 def _power(row: Projected, x: float, y: float) -> float:
-    """Logarithm of a splat's density at an offset from its centre: squares, whose sign rounding cannot turn."""
+    """Logarithm of a splat's density at an offset from its center: squares, whose sign rounding cannot turn."""
     dx = x - row[SHEAR] * y
     return -0.5 * (row[PRECISION_X] * dx * dx + row[PRECISION_Y] * y * y)
 
@@ -77,7 +79,7 @@ def _power(row: Projected, x: float, y: float) -> float:
 @wp.kernel
 def blend_forward(
     tiles_x: wp.int32,
-    drawn: wp.array[wp.uint8],
+    rendered: wp.array[wp.uint8],
     first: wp.array[wp.int32],
     past: wp.array[wp.int32],
     pair_splat: wp.array[wp.int32],
@@ -87,32 +89,32 @@ def blend_forward(
     transmittance: wp.array2d[wp.float32],
     last: wp.array2d[wp.int32],
 ):
-    """As the CPU's, for the drawn tiles; launched over all tiles' pixels."""
+    """As the CPU's, for the rendered tiles; launched over all tiles' pixels."""
     n = wp.tid()
     tile, p = n // PIXELS, n % PIXELS
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     x, y = left + p % TILE, top + p // TILE
-    if drawn[tile] == NO or y >= last.shape[0] or x >= last.shape[1]:
+    if rendered[tile] == UNMARKED or y >= last.shape[0] or x >= last.shape[1]:
         return
     px, py = float(p % TILE) + 0.5, float(p // TILE) + 0.5
-    colour, t, deepest = wp.vec3(), float(1.0), int(0)
+    color, t, deepest = wp.vec3(), float(1.0), int(0)
     begin = first[tile]
     for j in range(begin, past[tile]):
         row = projected[pair_splat[j]]
         density = wp.exp(_power(row, px - (row[MEAN_X] - float(left)), py - (row[MEAN_Y] - float(top))))
-        a = wp.min(ALPHA_MAX, row[OPACITY] * density)
-        if a < ALPHA_MIN:
+        a = wp.min(MAX_ALPHA, row[OPACITY] * density)
+        if a < MIN_ALPHA:
             continue
         after = t * (1.0 - a)
-        if after <= STOP:
+        if after <= MIN_TRANSMITTANCE:
             break
-        colour += a * t * wp.vec3(row[RED], row[GREEN], row[BLUE])
+        color += a * t * wp.vec3(row[RED], row[GREEN], row[BLUE])
         t = after
         deepest = j - begin + 1
-    colour += t * background
-    image[0, y, x] = colour[0]
-    image[1, y, x] = colour[1]
-    image[2, y, x] = colour[2]
+    color += t * background
+    image[0, y, x] = color[0]
+    image[1, y, x] = color[1]
+    image[2, y, x] = color[2]
     transmittance[y, x] = t
     last[y, x] = deepest
 
@@ -135,21 +137,21 @@ def blend_backward(
 ):
     """Add the gradient of every wanted pair of the touched tiles to its rows, slot · PARTS and on, which are zero.
 
-    Launched over PARTS · LANES threads a tile. v_transmittance may have no rows, which means zero.
+    Launched over PARTS · WARP_LANES threads a tile. v_transmittance may have no rows, which means zero.
     """
     n = wp.tid()
-    lane, part = n % LANES, (n // LANES) % PARTS
-    tile = n // (LANES * PARTS)
-    if touched[tile] == NO:
+    lane, part = n % WARP_LANES, (n // WARP_LANES) % PARTS
+    tile = n // (WARP_LANES * PARTS)
+    if touched[tile] == UNMARKED:
         return
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    t, behind = Share(), Share()
-    v_red, v_green, v_blue = Share(), Share(), Share()
-    until = ShareInt()
+    t, behind = LaneFloats(), LaneFloats()
+    v_red, v_green, v_blue = LaneFloats(), LaneFloats(), LaneFloats()
+    until = LaneInts()
     deepest = int(0)
-    base = part * (PIXELS // PARTS) + lane  # neighbouring lanes have neighbouring pixels
-    for k in range(wp.static(SHARE)):
-        p = base + k * LANES
+    base = part * (PIXELS // PARTS) + lane  # neighboring lanes have neighboring pixels
+    for k in range(wp.static(PIXELS_PER_LANE)):
+        p = base + k * WARP_LANES
         column, line = left + p % TILE, top + p // TILE
         if line < last.shape[0] and column < last.shape[1]:
             t[k] = transmittance[line, column]
@@ -163,10 +165,10 @@ def blend_backward(
             behind[k] = t[k] * through
             until[k] = last[line, column]
             deepest = wp.max(deepest, until[k])
-    deepest = _largest_of_warp(deepest)
+    deepest = _warp_max(deepest)
     begin = first[tile]
     nearest = begin  # nothing in front of the first wanted pair needs to be walked
-    while nearest < begin + deepest and wanted[pair_splat[nearest]] == NO:
+    while nearest < begin + deepest and wanted[pair_splat[nearest]] == UNMARKED:
         nearest += 1
     for back in range(begin + deepest - nearest):
         j = begin + deepest - 1 - back
@@ -178,13 +180,13 @@ def blend_backward(
         gxx, gxy, gyy = float(0.0), float(0.0), float(0.0)
         g_red, g_green, g_blue = float(0.0), float(0.0), float(0.0)
         counts = int(0)
-        for k in range(wp.static(SHARE)):
-            p = base + k * LANES
+        for k in range(wp.static(PIXELS_PER_LANE)):
+            p = base + k * WARP_LANES
             y = float(p // TILE) + 0.5 - mean_y
             x = float(p % TILE) + 0.5 - mean_x
             raw = row[OPACITY] * wp.exp(_power(row, x, y))
-            a = wp.min(ALPHA_MAX, raw)
-            if a >= ALPHA_MIN and j - begin < until[k]:
+            a = wp.min(MAX_ALPHA, raw)
+            if a >= MIN_ALPHA and j - begin < until[k]:
                 ra = 1.0 / (1.0 - a)
                 before = t[k] * ra
                 weight = a * before
@@ -192,7 +194,7 @@ def blend_backward(
                 v_a = before * along - ra * behind[k]
                 t[k] = before
                 behind[k] = behind[k] + weight * along
-                g = wp.where(raw < ALPHA_MAX, v_a * raw, 0.0)
+                g = wp.where(raw < MAX_ALPHA, v_a * raw, 0.0)
                 dx = x - row[SHEAR] * y
                 g0 += g
                 gx += g * dx
@@ -204,14 +206,14 @@ def blend_backward(
                 g_green += weight * v_green[k]
                 g_blue += weight * v_blue[k]
                 counts = int(1)
-        if wanted[i] == NO:
+        if wanted[i] == UNMARKED:
             continue
-        if _largest_of_warp(counts) == 0:
+        if _warp_max(counts) == 0:
             continue
         total = Projected(g0, gx, gy, gxx, gxy, gyy, g_red, g_green, g_blue)
         for c in range(wp.static(layout.PROJECTED)):
-            total[c] = _over_warp(total[c])
-        if _leads():
+            total[c] = _warp_sum(total[c])
+        if _is_warp_leader():
             by_x = row[PRECISION_X] * total[1]
             at = pair_slot[j] * PARTS + part
             rows[at] = rows[at] + Projected(

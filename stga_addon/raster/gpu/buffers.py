@@ -14,8 +14,8 @@ class DeviceBufferPool:
         self._views: dict[str, wp.array] = {}
         self._buffers: dict[str, wp.array] = {}
 
-    def take(self, name: str, shape: int | tuple[int, ...], dtype: Any = wp.float32) -> wp.array:
-        """An uninitialised array; the same memory whenever the same name, of one dtype, is taken again."""
+    def get(self, name: str, shape: int | tuple[int, ...], dtype: Any = wp.float32) -> wp.array:
+        """An uninitialized array; the same memory whenever the same name, of one dtype, is taken again."""
         shape = (shape,) if isinstance(shape, int) else shape
         view = self._views.get(name)
         if view is not None and view.shape == shape:

@@ -36,7 +36,7 @@ def _perpendicular(first: wp.vec3d, normal: wp.vec3d, longest: wp.float64) -> wp
 
 
 @wp.kernel
-def place_faces(
+def compose_frames(
     vertices: wp.array[wp.vec3d],
     faces: wp.array[wp.vec3i],
     neutral_area: wp.array[wp.float64],
@@ -139,10 +139,10 @@ class Embedding:
         convention: str,
         basis: strain.StrainBasis | None = None,
     ) -> None:
-        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where colours follow strain."""
+        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where colors follow strain."""
         if convention not in embedding.CONVENTIONS:
             raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
-        self._scratch, self._area_scales = DeviceBufferPool(device), convention == "stga"
+        self._buffers, self._area_scales = DeviceBufferPool(device), convention == "stga"
 
         def array(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(values, dtype=dtype, device=device)
@@ -159,22 +159,22 @@ class Embedding:
                 array(start.astype(np.int32), wp.int32), array((by_vertex // 3).astype(np.int32), wp.int32),
             )  # fmt: skip
 
-    def place(self, vertices: wp.array, camera: Camera) -> tuple[wp.array, wp.array, wp.array]:
+    def frames(self, vertices: wp.array, camera: Camera) -> tuple[wp.array, wp.array, wp.array]:
         """origin (F,), matrix (F,) and strain (F, S) of the posed mesh, as in `CameraFrames`; valid until called again.
 
-        vertices (V,) float64 vectors, world metres.
+        vertices (V,) float64 vectors, world meters.
         """
-        n, device, take = self._faces.size, self._scratch.device, self._scratch.take
-        origin, matrix = take("origin", n, wp.vec3), take("matrix", n, wp.mat33)
+        n, device, array = self._faces.size, self._buffers.device, self._buffers.get
+        origin, matrix = array("origin", n, wp.vec3), array("matrix", n, wp.mat33)
         pose = camera.world_to_camera
         turn, shift = wp.mat33d(*pose[:3, :3].ravel().tolist()), wp.vec3d(*pose[:3, 3].tolist())
         given = [vertices, self._faces, self._area, self._area_scales, turn, shift]
-        wp.launch(place_faces, n, given, [origin, matrix], device=device)
+        wp.launch(compose_frames, n, given, [origin, matrix], device=device)
         if self._strain is None:
             return origin, matrix, wp.empty((n, 0), wp.float32, device=device)
         gram, to_tensor, to_plane, start, touching = self._strain
-        tensor, at_vertex = take("tensor", n, Tensor), take("at_vertex", vertices.size, Tensor)
-        out = take("strain", (n, strain.STRAINS))
+        tensor, at_vertex = array("tensor", n, Tensor), array("at_vertex", vertices.size, Tensor)
+        out = array("strain", (n, strain.STRAINS))
         wp.launch(strain_faces, n, [vertices, self._faces, gram, to_tensor], [tensor], device=device)
         wp.launch(average_at_vertices, vertices.size, [tensor, start, touching], [at_vertex], device=device)
         wp.launch(strain_in_plane, n, [at_vertex, self._faces, to_plane], [out], device=device)

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from ..cpu import image_loss as cpu
-from .rasterize import DeviceRenderOutput, Rasteriser
-from .tiles import NO, TILE
+from .rasterize import DeviceRenderOutput, Rasterizer
+from .tiles import TILE, UNMARKED
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,12 +32,12 @@ def blur_rows(
     image: wp.array3d[wp.float32],
     target: wp.array3d[wp.uint8],
     tiles_x: wp.int32,
-    drawn: wp.array[wp.uint8],
+    rendered: wp.array[wp.uint8],
     out: wp.array3d[wp.vec4],
 ):
-    """Image, target, sum of their squares and product, blurred along x; for the drawn tiles' pixels."""
+    """Image, target, sum of their squares and product, blurred along x; for the rendered tiles' pixels."""
     c, y, x = wp.tid()
-    if drawn[(y // TILE) * tiles_x + x // TILE] == NO:
+    if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     total = wp.vec4()
     for k in range(wp.static(WIDTH)):
@@ -53,7 +53,7 @@ def find_slopes(
     target: wp.array3d[wp.uint8],
     blurred: wp.array3d[wp.vec4],
     tiles_x: wp.int32,
-    drawn: wp.array[wp.uint8],
+    rendered: wp.array[wp.uint8],
     ssim_weight: wp.float32,
     out: wp.array3d[wp.vec3],
     loss: wp.array3d[wp.float32],
@@ -63,7 +63,7 @@ def find_slopes(
     loss (3, H, W): what each value adds to the loss, before the mean.
     """
     c, y, x = wp.tid()
-    if drawn[(y // TILE) * tiles_x + x // TILE] == NO:
+    if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     m = wp.vec4()
     for k in range(wp.static(WIDTH)):
@@ -85,11 +85,11 @@ def find_slopes(
 
 @wp.kernel
 def blur_slopes(
-    slopes: wp.array3d[wp.vec3], tiles_x: wp.int32, drawn: wp.array[wp.uint8], out: wp.array3d[wp.vec3]
+    slopes: wp.array3d[wp.vec3], tiles_x: wp.int32, rendered: wp.array[wp.uint8], out: wp.array3d[wp.vec3]
 ):  # fmt: skip
     """The slopes blurred along x."""
     c, y, x = wp.tid()
-    if drawn[(y // TILE) * tiles_x + x // TILE] == NO:
+    if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     total = wp.vec3()
     for k in range(wp.static(WIDTH)):
@@ -111,7 +111,7 @@ def image_gradient(
 ):
     """Gradient of the mean over all values of the loss with respect to the image, for the touched tiles' pixels."""
     c, y, x = wp.tid()
-    if touched[(y // TILE) * tiles_x + x // TILE] == NO:
+    if touched[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     s = wp.vec3()
     for k in range(wp.static(WIDTH)):
@@ -129,7 +129,7 @@ def image_gradient(
 def change_background(
     image: wp.array3d[wp.uint8], mask: wp.array2d[wp.uint8], change: wp.vec3, out: wp.array3d[wp.uint8]
 ):  # fmt: skip
-    """As the CPU's; change: the colour after less the one before, in 0…255."""
+    """As the CPU's; change: the color after less the one before, in 0…255."""
     y, x = wp.tid()
     clear = float(255 - int(mask[y, x])) * BYTE
     for c in range(3):
@@ -137,20 +137,20 @@ def change_background(
         out[y, x, c] = wp.uint8(wp.min(255.0, wp.max(0.0, value)) + 0.5)
 
 
-def differentiate(
-    rasteriser: Rasteriser, rendering: DeviceRenderOutput, target: wp.array, ssim_weight: float
+def image_loss_gradient(
+    rasterizer: Rasterizer, rendering: DeviceRenderOutput, target: wp.array, ssim_weight: float
 ) -> tuple[wp.array, wp.array]:
     """Gradient (3, H, W) of the image loss in the touched tiles, and what each value adds to the loss (3, H, W).
 
-    target (H, W, 3) uint8. The loss is the mean of the latter where every tile was drawn.
+    target (H, W, 3) uint8. The loss is the mean of the latter where every tile was rendered.
     """
-    shape, lens, take = rendering.image.shape, rendering.frames.lens, rasteriser.scratch.take
-    image, tiles_x, drawn = rendering.image, lens.tiles_x, rendering.drawn
-    moments, loss, v_image = take("moments", shape, wp.vec4), take("loss", shape), take("v_image", shape)
-    slopes, blurred = take("slopes", shape, wp.vec3), take("blurred_slopes", shape, wp.vec3)
-    launch = rasteriser.launch
-    launch(blur_rows, shape, image, target, tiles_x, drawn, moments)
-    launch(find_slopes, shape, image, target, moments, tiles_x, drawn, ssim_weight, slopes, loss)
-    launch(blur_slopes, shape, slopes, tiles_x, drawn, blurred)
+    shape, lens, array = rendering.image.shape, rendering.frames.lens, rasterizer.buffers.get
+    image, tiles_x, rendered = rendering.image, lens.tiles_x, rendering.rendered
+    moments, loss, v_image = array("moments", shape, wp.vec4), array("loss", shape), array("v_image", shape)
+    slopes, blurred = array("slopes", shape, wp.vec3), array("blurred_slopes", shape, wp.vec3)
+    launch = rasterizer.launch
+    launch(blur_rows, shape, image, target, tiles_x, rendered, moments)
+    launch(find_slopes, shape, image, target, moments, tiles_x, rendered, ssim_weight, slopes, loss)
+    launch(blur_slopes, shape, slopes, tiles_x, rendered, blurred)
     launch(image_gradient, shape, image, target, blurred, tiles_x, rendering.touched, ssim_weight, v_image)
     return v_image, loss

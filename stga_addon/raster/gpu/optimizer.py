@@ -3,11 +3,11 @@
 import warp as wp
 
 from ..cpu import optimizer as cpu
-from .tiles import NO
+from .tiles import UNMARKED
 
 wp.set_module_options({"enable_backward": False})
 
-LARGEST = wp.constant(float(cpu.LARGEST))
+MAX_GRADIENT = wp.constant(float(cpu.MAX_GRADIENT))
 
 
 @wp.kernel
@@ -32,7 +32,7 @@ def count_steps(
     In float64, because 1 − βⁿ cancels.
     """
     i = wp.tid()
-    if wanted[i] == NO:
+    if wanted[i] == UNMARKED:
         return
     steps[i] = steps[i] + 1
     n, one = wp.float64(steps[i]), wp.float64(1.0)
@@ -58,13 +58,13 @@ def adam(
 ):
     """One step of a parameter's (N, D) wanted rows, a thread a value; `rate_rest` is for the columns from `rest` on.
 
-    A row whose gradient is not finite, or beyond LARGEST, keeps its value and moments.
+    A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps its value and moments.
     """
     i, c = wp.tid()
-    if wanted[i] == NO:
+    if wanted[i] == UNMARKED:
         return
     for other in range(gradient.shape[1]):
-        if not (wp.abs(gradient[i, other]) < LARGEST):
+        if not (wp.abs(gradient[i, other]) < MAX_GRADIENT):
             return
     g = gradient[i, c]
     m = beta1 * first[i, c] + (1.0 - beta1) * g
@@ -94,7 +94,7 @@ def scale_excess(
     """‖ReLU(scale − limit)‖² of each row, 0 for rows that are not wanted or unbound."""
     i = wp.tid()
     total = float(0.0)
-    if wanted[i] != NO and unbound[i] == NO:
+    if wanted[i] != UNMARKED and unbound[i] == UNMARKED:
         for c in range(3):
             over = _over(wp.exp(log_scale[i][c]), limit[face[i]])
             total += over * over
@@ -114,7 +114,7 @@ def scale_limit(
 ):
     """Add the gradient of weight · ‖ReLU(scale − limit)‖₂, whose square is given."""
     i = wp.tid()
-    if wanted[i] == NO or unbound[i] != NO or not (square[0] > 0.0):
+    if wanted[i] == UNMARKED or unbound[i] != UNMARKED or not (square[0] > 0.0):
         return
     factor = weight / wp.sqrt(square[0])
     screen_gradient = wp.vec3()
@@ -136,7 +136,7 @@ def distance_excess(
     """ReLU(|xyz| − limit)² of each row, 0 for rows that are not wanted or unbound."""
     i = wp.tid()
     over = float(0.0)
-    if wanted[i] != NO and unbound[i] == NO:
+    if wanted[i] != UNMARKED and unbound[i] == UNMARKED:
         over = _over(wp.length(xyz[i]), limit[face[i]])
     squares[i] = over * over
 
@@ -154,7 +154,7 @@ def distance_limit(
 ):
     """Add the gradient of weight · ‖ReLU(|xyz| − limit)‖₂, whose square is given."""
     i = wp.tid()
-    if wanted[i] == NO or unbound[i] != NO or not (square[0] > 0.0):
+    if wanted[i] == UNMARKED or unbound[i] != UNMARKED or not (square[0] > 0.0):
         return
     length = wp.length(xyz[i])
     over = _over(length, limit[face[i]])
@@ -163,15 +163,15 @@ def distance_limit(
 
 
 @wp.kernel
-def gather_pull(
+def accumulate_screen_gradient(
     wanted: wp.array[wp.uint8],
     screen: wp.array[wp.float32],
     screen_gradient: wp.array[wp.float32],
-    seen: wp.array[wp.float32],
+    gradient_count: wp.array[wp.float32],
 ):
     """What density control asks for: the sum of screen-space gradients, and how many."""
     i = wp.tid()
-    if wanted[i] == NO:
+    if wanted[i] == UNMARKED:
         return
     screen_gradient[i] = screen_gradient[i] + screen[i]
-    seen[i] = seen[i] + 1.0
+    gradient_count[i] = gradient_count[i] + 1.0

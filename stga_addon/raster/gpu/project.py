@@ -1,4 +1,4 @@
-"""Embedding, projection and colour of every splat, one thread each; the counterpart of `cpu/project.py`.
+"""Embedding, projection and color of every splat, one thread each; the counterpart of `cpu/project.py`.
 
 A splat's row is read and written by one thread: 59 floats in a row, so the cache lines it opens are used up.
 """
@@ -16,7 +16,7 @@ from ..cpu.layout import TILE as _TILE
 wp.set_module_options({"enable_backward": False})  # gradients are kernels of their own
 
 TILE = wp.constant(_TILE)
-LOW_PASS, NEAR, LIFT = (wp.constant(float(c)) for c in (cpu.LOW_PASS, cpu.NEAR, cpu.LIFT))
+LOW_PASS_PX2, NEAR_M, LIFT = (wp.constant(float(c)) for c in (cpu.LOW_PASS_PX2, cpu.NEAR_M, cpu.LIFT))
 S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (wp.constant(float(c)) for c in cpu.SH)
 BASIS = 16
 
@@ -26,7 +26,7 @@ Basis = wp.types.vector(length=BASIS, dtype=wp.float32)
 
 
 @wp.struct
-class Lens:
+class DeviceCamera:
     """A camera: intrinsics and size in pixels, camera to world rotation, and how to draw."""
 
     fx: wp.float32
@@ -39,13 +39,13 @@ class Lens:
     tiles_y: wp.int32
     to_world: wp.mat33
     degree: wp.int32
-    strains: wp.int32  # how many columns of strain the colours follow
-    depth_as_colour: wp.bool
+    strains: wp.int32  # how many columns of strain the colors follow
+    depth_as_color: wp.bool
     antialiased: wp.bool
 
 
 @wp.struct
-class Placed:
+class CameraSplat:
     """A splat in the camera: what forward and backward both need."""
 
     position: wp.vec3
@@ -54,10 +54,10 @@ class Placed:
     turn: wp.mat33
     scale: wp.vec3
     slope: wp.vec2
-    held: wp.vec2  # the slope within the frustum's limits
+    clamped: wp.vec2  # the slope within the frustum's limits
     u0: wp.vec3  # rows of the map from the local frame to pixels
     u1: wp.vec3
-    a0: wp.vec3  # rows of A = U·R·diag(scale); the covariance is A·Aᵀ + LOW_PASS·I
+    a0: wp.vec3  # rows of A = U·R·diag(scale); the covariance is A·Aᵀ + LOW_PASS_PX2·I
     a1: wp.vec3
     minors: wp.vec3
 
@@ -85,20 +85,23 @@ def _rotation(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def _hold(slope: float, size: float, focal: float, principal: float) -> float:
+def _clamp_slope(slope: float, size: float, focal: float, principal: float) -> float:
     """x/z or y/z, kept within the image plus 0.3 of its half field of view, for the projection's Jacobian."""
     margin = 0.3 * (0.5 * size / focal)
     return wp.min((size - principal) / focal + margin, wp.max(-principal / focal - margin, slope))
 
 
 @wp.func
-def _place(xyz: wp.vec3, q: wp.vec4, log_scale: wp.vec3, origin: wp.vec3, frame: wp.mat33, lens: Lens) -> Placed:
-    s = Placed()
+def _to_camera(
+    xyz: wp.vec3, q: wp.vec4, log_scale: wp.vec3, origin: wp.vec3, frame: wp.mat33, lens: DeviceCamera
+) -> CameraSplat:
+    s = CameraSplat()
     s.position = frame * xyz + origin
     r = 1.0 / s.position[2]
     s.slope = wp.vec2(s.position[0] * r, s.position[1] * r)
-    s.held = wp.vec2(
-        _hold(s.slope[0], float(lens.width), lens.fx, lens.cx), _hold(s.slope[1], float(lens.height), lens.fy, lens.cy)
+    s.clamped = wp.vec2(
+        _clamp_slope(s.slope[0], float(lens.width), lens.fx, lens.cx),
+        _clamp_slope(s.slope[1], float(lens.height), lens.fy, lens.cy),
     )
     quaternion, inverse_norm = _unit(q)
     s.quaternion = quaternion
@@ -106,8 +109,8 @@ def _place(xyz: wp.vec3, q: wp.vec4, log_scale: wp.vec3, origin: wp.vec3, frame:
     s.turn = _rotation(s.quaternion)
     s.scale = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     last = wp.vec3(frame[2, 0], frame[2, 1], frame[2, 2])
-    s.u0 = lens.fx * r * (wp.vec3(frame[0, 0], frame[0, 1], frame[0, 2]) - s.held[0] * last)
-    s.u1 = lens.fy * r * (wp.vec3(frame[1, 0], frame[1, 1], frame[1, 2]) - s.held[1] * last)
+    s.u0 = lens.fx * r * (wp.vec3(frame[0, 0], frame[0, 1], frame[0, 2]) - s.clamped[0] * last)
+    s.u1 = lens.fy * r * (wp.vec3(frame[1, 0], frame[1, 1], frame[1, 2]) - s.clamped[1] * last)
     back = wp.transpose(s.turn)
     s.a0 = wp.cw_mul(back * s.u0, s.scale)
     s.a1 = wp.cw_mul(back * s.u1, s.scale)
@@ -190,7 +193,7 @@ def project_forward(
     origin: wp.array[wp.vec3],
     matrix: wp.array[wp.mat33],
     strain: wp.array2d[wp.float32],
-    lens: Lens,
+    lens: DeviceCamera,
     projected: wp.array[Projected],
     depth: wp.array[wp.float32],
     order: wp.array[wp.int32],
@@ -204,14 +207,14 @@ def project_forward(
     rect[i] = wp.vec4i(0, 0, 0, 0)
     f = face[i]
     # The near plane first: nothing below may divide by a depth of zero.
-    if (matrix[f] * xyz[i] + origin[f])[2] < NEAR:
+    if (matrix[f] * xyz[i] + origin[f])[2] < NEAR_M:
         return
-    s = _place(xyz[i], rotation[i], log_scale[i], origin[f], matrix[f], lens)
-    xx, xy = wp.dot(s.a0, s.a0) + LOW_PASS, wp.dot(s.a0, s.a1)
-    yy = wp.dot(s.a1, s.a1) + LOW_PASS
+    s = _to_camera(xyz[i], rotation[i], log_scale[i], origin[f], matrix[f], lens)
+    xx, xy = wp.dot(s.a0, s.a0) + LOW_PASS_PX2, wp.dot(s.a0, s.a1)
+    yy = wp.dot(s.a1, s.a1) + LOW_PASS_PX2
     # As squared 2×2 minors plus positive terms the determinant never cancels to zero or below.
     sharp = wp.dot(s.minors, s.minors)
-    det = sharp + LOW_PASS * (xx + yy - LOW_PASS)
+    det = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2)
     visible = 1.0 / (1.0 + wp.exp(-opacity[i]))
     if lens.antialiased:
         visible *= wp.sqrt(sharp / det)
@@ -229,23 +232,23 @@ def project_forward(
     if x1 <= x0 or y1 <= y0:
         return
     b = _basis(lens.degree, lens.to_world * (s.position / wp.length(s.position)))
-    colour = wp.vec3(0.5, 0.5, 0.5)
+    color = wp.vec3(0.5, 0.5, 0.5)
     for k in range(wp.static(BASIS)):
         if k < (lens.degree + 1) * (lens.degree + 1):
-            colour += b[k] * sh[i, k]
+            color += b[k] * sh[i, k]
     for k in range(lens.strains):
-        colour += strain[f, k] * strain_color[i, k]
+        color += strain[f, k] * strain_color[i, k]
     # Before the cut at zero, which would turn NaN and −∞ into black.
-    if not _finite(colour):
+    if not _finite(color):
         rect[i] = wp.vec4i(-1, -1, -1, -1)
         return
-    colour = wp.max(colour, wp.vec3(0.0, 0.0, 0.0))
-    if lens.depth_as_colour:
-        colour = wp.vec3(s.position[2], 0.0, 0.0)
+    color = wp.max(color, wp.vec3(0.0, 0.0, 0.0))
+    if lens.depth_as_color:
+        color = wp.vec3(s.position[2], 0.0, 0.0)
     rect[i] = wp.vec4i(x0, y0, x1, y1)
     depth[i] = s.position[2]
     projected[i] = Projected(
-        mean_x, mean_y, yy / det, xy / yy, 1.0 / yy, visible, colour[0], colour[1], colour[2]
+        mean_x, mean_y, yy / det, xy / yy, 1.0 / yy, visible, color[0], color[1], color[2]
     )  # fmt: skip
 
 
@@ -276,7 +279,7 @@ def project_backward(
     origin: wp.array[wp.vec3],
     matrix: wp.array[wp.mat33],
     strain: wp.array2d[wp.float32],
-    lens: Lens,
+    lens: DeviceCamera,
     projected: wp.array[Projected],
     wanted: wp.array[wp.uint8],
     slot_start: wp.array[wp.int32],
@@ -306,12 +309,12 @@ def project_backward(
     screen[i] = wp.sqrt(half_x * half_x + half_y * half_y)
     f = face[i]
     frame = matrix[f]
-    s = _place(xyz[i], rotation[i], log_scale[i], origin[f], frame, lens)
+    s = _to_camera(xyz[i], rotation[i], log_scale[i], origin[f], frame, lens)
     p = projected[i]
 
     # The derivation, and what must be taken together because it cancels, stands in `cpu/project.py`.
     shear, inverse_yy = p[SHEAR], p[PRECISION_Y]
-    e = inverse_yy * (LOW_PASS * s.a0 + wp.cross(s.a1, s.minors))
+    e = inverse_yy * (LOW_PASS_PX2 * s.a0 + wp.cross(s.a1, s.minors))
     vs = -2.0 * p[PRECISION_X] * p[PRECISION_X] * g[PRECISION_X]
     vk = inverse_yy * g[SHEAR]
     vw = -2.0 * inverse_yy * inverse_yy * g[PRECISION_Y]
@@ -319,10 +322,10 @@ def project_backward(
     v1 = vk * e + vw * s.a1
     if lens.antialiased:
         sharp = wp.dot(s.minors, s.minors)
-        around = LOW_PASS * (wp.dot(s.a0, s.a0) + wp.dot(s.a1, s.a1) + LOW_PASS)
+        around = LOW_PASS_PX2 * (wp.dot(s.a0, s.a0) + wp.dot(s.a1, s.a1) + LOW_PASS_PX2)
         v = g[OPACITY] * p[OPACITY]
         w = v * around / ((sharp + around) * wp.max(sharp, 1.0e-30))
-        u = -v * LOW_PASS / (sharp + around)
+        u = -v * LOW_PASS_PX2 / (sharp + around)
         b0 = w * wp.cross(s.a1, s.minors) + u * s.a0
         v0 += b0
         v1 += w * wp.cross(s.minors, s.a0) + u * s.a1 + shear * b0
@@ -337,31 +340,31 @@ def project_backward(
     from_row_0 = wp.dot(s.turn * v0, last)
     tx = -lens.fx * r * from_row_0
     ty = -lens.fy * r * (wp.dot(s.turn * v1, last) - shear * from_row_0)
-    tx = wp.where(s.held[0] == s.slope[0], tx, 0.0) + g[MEAN_X] * lens.fx
-    ty = wp.where(s.held[1] == s.slope[1], ty, 0.0) + g[MEAN_Y] * lens.fy
+    tx = wp.where(s.clamped[0] == s.slope[0], tx, 0.0) + g[MEAN_X] * lens.fx
+    ty = wp.where(s.clamped[1] == s.slope[1], ty, 0.0) + g[MEAN_Y] * lens.fy
     vz = -r * (by[0] + by[1] + by[2]) - (tx * s.slope[0] + ty * s.slope[1]) * r  # U shrinks with z as the scales do
     v_position = wp.vec3(tx * r, ty * r, vz)
     # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
     v_opacity[i] = g[OPACITY] * p[OPACITY] / (1.0 + wp.exp(opacity[i]))
     count = (lens.degree + 1) * (lens.degree + 1)
-    colour = wp.vec3(
+    color = wp.vec3(
         wp.where(p[RED] > 0.0, g[RED], 0.0), wp.where(p[GREEN] > 0.0, g[GREEN], 0.0),
         wp.where(p[BLUE] > 0.0, g[BLUE], 0.0),
     )  # fmt: skip
-    if lens.depth_as_colour:
+    if lens.depth_as_color:
         v_position += wp.vec3(0.0, 0.0, g[RED])
-        colour = wp.vec3(0.0, 0.0, 0.0)
+        color = wp.vec3(0.0, 0.0, 0.0)
     away = 1.0 / wp.length(s.position)
     d = lens.to_world * (s.position * away)
     b = _basis(lens.degree, d)
     weight = Basis()
     for k in range(wp.static(BASIS)):
         if k < sh.shape[1]:
-            v_sh[i, k] = b[k] * colour  # zero above the degree in use
+            v_sh[i, k] = b[k] * color  # zero above the degree in use
             if k < count:
-                weight[k] = wp.dot(colour, sh[i, k])
+                weight[k] = wp.dot(color, sh[i, k])
     for k in range(v_strain_color.shape[1]):
-        v_strain_color[i, k] = wp.where(k < lens.strains, strain[f, k] * colour, wp.vec3(0.0, 0.0, 0.0))
+        v_strain_color[i, k] = wp.where(k < lens.strains, strain[f, k] * color, wp.vec3(0.0, 0.0, 0.0))
     by_direction = _basis_gradient(lens.degree, d, weight)
     by_direction = (by_direction - wp.dot(by_direction, d) * d) * away
     v_position += wp.transpose(lens.to_world) * by_direction

@@ -14,7 +14,7 @@ from ..cpu.layout import TILE as _TILE
 wp.set_module_options({"enable_backward": False})
 
 TILE = wp.constant(_TILE)
-YES, NO = wp.constant(wp.uint8(1)), wp.constant(wp.uint8(0))
+MARKED, UNMARKED = wp.constant(wp.uint8(1)), wp.constant(wp.uint8(0))
 
 
 @wp.kernel
@@ -23,43 +23,43 @@ def mark_tiles(
 ):  # fmt: skip
     """Set the tiles that a splat of focus (N,) reaches; all who write one write the same."""
     i = wp.tid()
-    if focus[i] == NO:
+    if focus[i] == UNMARKED:
         return
     r = rect[i]
     for y in range(r[1], r[3]):
         for x in range(r[0], r[2]):
-            touched[y * tiles_x + x] = YES
+            touched[y * tiles_x + x] = MARKED
 
 
 @wp.kernel
-def grow_tiles(
-    touched: wp.array[wp.uint8], tiles_x: wp.int32, tiles_y: wp.int32, ring: wp.int32, drawn: wp.array[wp.uint8]
+def dilate_tiles(
+    touched: wp.array[wp.uint8], tiles_x: wp.int32, tiles_y: wp.int32, ring: wp.int32, rendered: wp.array[wp.uint8]
 ):  # fmt: skip
     """Mark the tiles with a touched one at most `ring` tiles away."""
     n = wp.tid()
     x, y = n % tiles_x, n // tiles_x
-    near = NO
+    near = UNMARKED
     for row in range(wp.max(0, y - ring), wp.min(tiles_y, y + ring + 1)):
         for column in range(wp.max(0, x - ring), wp.min(tiles_x, x + ring + 1)):
             near = wp.max(near, touched[row * tiles_x + column])
-    drawn[n] = near
+    rendered[n] = near
 
 
 @wp.kernel
 def count_pairs(
     order: wp.array[wp.int32],
     rect: wp.array[wp.vec4i],
-    drawn: wp.array[wp.uint8],
+    rendered: wp.array[wp.uint8],
     tiles_x: wp.int32,
     count: wp.array[wp.int32],
 ):
-    """How many drawn tiles the n-th splat in `order` touches."""
+    """How many rendered tiles the n-th splat in `order` touches."""
     n = wp.tid()
     r = rect[order[n]]
     pairs = int(0)
     for y in range(r[1], r[3]):
         for x in range(r[0], r[2]):
-            pairs += int(drawn[y * tiles_x + x])
+            pairs += int(rendered[y * tiles_x + x])
     count[n] = pairs
 
 
@@ -67,7 +67,7 @@ def count_pairs(
 def fill_pairs(
     order: wp.array[wp.int32],
     rect: wp.array[wp.vec4i],
-    drawn: wp.array[wp.uint8],
+    rendered: wp.array[wp.uint8],
     tiles_x: wp.int32,
     count: wp.array[wp.int32],
     end: wp.array[wp.int32],
@@ -83,7 +83,7 @@ def fill_pairs(
     """Write the n-th splat's pairs to its slots, end[n] − count[n] and on.
 
     pair_tile and pair_slot (≥ capacity) are keys and values ready to be sorted; slot_start, slot_count (N,) are by
-    splat. wanted (N,): splats of focus (N,) that are seen. Where the last end exceeds the capacity nothing fits.
+    splat. wanted (N,): splats of focus (N,) that are visible. Where the last end exceeds the capacity nothing fits.
     """
     n = wp.tid()
     i = order[n]
@@ -93,14 +93,14 @@ def fill_pairs(
     slot = end[n] - count[n]
     slot_start[i] = wp.where(fits, slot, 0)
     slot_count[i] = pairs
-    wanted[i] = wp.where(pairs > 0, focus[i], NO)
+    wanted[i] = wp.where(pairs > 0, focus[i], UNMARKED)
     if pairs == 0:
         return
     r = rect[i]
     for y in range(r[1], r[3]):
         for x in range(r[0], r[2]):
             tile = y * tiles_x + x
-            if drawn[tile] == YES:
+            if rendered[tile] == MARKED:
                 pair_tile[slot] = tile
                 pair_slot[slot] = slot
                 slot_splat[slot] = i

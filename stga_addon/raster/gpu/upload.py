@@ -30,10 +30,10 @@ class Uploads:
         """Start to copy an array; `values` may change at once. dtype may be a vector, then it is the last axes."""
         rank = len(getattr(dtype, "_shape_", ()))
         shape = values.shape[: values.ndim - rank]
-        there = self._there[self._turn].take(name, shape, dtype)
+        there = self._there[self._turn].get(name, shape, dtype)
         if not values.size:
             return there
-        here = self._pinned.take(name, shape, dtype)
+        here = self._pinned.get(name, shape, dtype)
         np.copyto(here.numpy(), values, casting="unsafe")
         wp.copy(there, here, stream=self._stream)
         return there

@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from PIL import Image, ImageDraw
 
-from ...capture.camera import Camera
 from ...capture.images import read_image, read_mask
 from ...capture.model import Capture, View
 from ...selection import SelectionOptions, select_capture
 
-MOST_VIEWS = 16
+MAX_EVALUATION_VIEWS = 16
 """Held-out views that an evaluation during training looks at, evenly spread: few enough to cost little."""
-FEWEST_PIXELS = 50
+MIN_REGION_PIXELS = 50
 """A region with fewer pixels in a view says nothing there."""
 
 
@@ -22,7 +21,7 @@ class EvaluationView:
     """A view and what its rendering is compared with.
 
     target   (H, W, 3) uint8, read-only
-    regions  "mask": inside the head mask; "selected": pixels of the triangles that the default selection rule picks
+    regions  "mask": inside the head mask; "moving": pixels of the triangles that the default selection rule picks
              at that timestep. (H, W) bool; a view without masks, or in which nothing moves, lacks the one or the other
     """
 
@@ -32,34 +31,35 @@ class EvaluationView:
 
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
-    """The held-out views that are looked at while training: at most MOST_VIEWS, evenly spread."""
+    """The held-out views that are looked at while training: at most MAX_EVALUATION_VIEWS, evenly spread."""
     views = capture.views.get("val", ())
-    if len(views) <= MOST_VIEWS:
+    if len(views) <= MAX_EVALUATION_VIEWS:
         return views
-    return [views[n] for n in np.linspace(0, len(views) - 1, MOST_VIEWS).round().astype(int)]
+    return [views[n] for n in np.linspace(0, len(views) - 1, MAX_EVALUATION_VIEWS).round().astype(int)]
 
 
-def look(capture: Capture, view: View) -> EvaluationView:
+def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:
     """Read a view's image and mask and find its regions.
 
-    The rule for "selected" is the default one whatever a run trains by, so that runs compare.
+    The rule for "moving" is the default one whatever a run trains by, so that runs compare.
     Raises StgaError where a file cannot be read.
     """
     target, mask = read_image(view), read_mask(view)
     target.setflags(write=False)  # as in training; Numba would compile anew for writable arrays
     selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
-    regions = {"selected": visible_pixels(capture, view, selection[view.timestep])}
+    regions = {"moving": visible_pixels(capture, view, selection[view.timestep])}
     if mask is not None:
         regions = {"mask": mask > 127, **regions}
     return EvaluationView(
-        view, target, {name: where for name, where in regions.items() if where.sum() >= FEWEST_PIXELS}
+        view, target, {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
     )
 
 
 def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
     """(H, W) bool: where one of the triangles `faces` (F,) bool is the nearest one."""
     mesh = np.asarray(capture.mesh(view.timestep))
-    corners, depth = _in_image(mesh, view.camera)
+    corners, depth = view.camera.project(mesh)
+    corners -= 0.5  # Pillow's pixel centers lie at whole numbers
     centres = depth[capture.faces].mean(1)
     picture = Image.new("1", (view.camera.width, view.camera.height))
     draw = ImageDraw.Draw(picture)
@@ -69,10 +69,3 @@ def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarra
     for polygon, chosen in zip(polygons, faces[drawn].tolist(), strict=True):
         draw.polygon(polygon, fill=int(chosen))
     return np.asarray(picture)
-
-
-def _in_image(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2), with pixel centres at whole numbers as Pillow has them, and depths (N,) of points (N, 3)."""
-    p = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = p[:, :2] / np.maximum(p[:, 2:], 1e-6) * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
-    return pixels - 0.5, p[:, 2]

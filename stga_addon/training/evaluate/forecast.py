@@ -1,4 +1,4 @@
-"""What more time will bring: a curve of held-out PSNR over training time, continued with an error that is earned."""
+"""Forecast of held-out PSNR from the evaluations of a run so far."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -6,33 +6,36 @@ from typing import Any
 
 import numpy as np
 
+from ...format import format_duration
+
 Curve = Sequence[tuple[float, float]]
 """(seconds of training, PSNR in dB) of each evaluation, ascending."""
 
-FEWEST = 4
-"""Evaluations before which nothing is said."""
-LATE = 2 / 3
-"""Only evaluations since this share of the time are continued: what came before was another phase."""
-TRUE = 0.8
-"""Share of the forecasts that should come true within their error."""
-DOUBT = 0.8
-"""Error of a forecast that nothing is known about, as a share of the gain that it promises."""
-RESOLUTION = 0.05
-"""dB: evaluations scatter by about this much."""
-HORIZONS = (5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600)
-"""Seconds that a forecast may look ahead."""
-STILL = 0.02
-"""dB: a smaller gain is none."""
-LEAST = 0.2
-"""Of what a curve will ever gain, this share must be left at a target to call it in reach: with less, it would take 25
-times as long as was trained."""
-SOON = 1.1
-"""Times the time trained that a target takes at least which the scatter alone kept from being reached."""
+MIN_EVALUATIONS = 4
+"""Evaluations that a forecast needs."""
+FITTED_SINCE_SHARE = 2 / 3
+"""The fit uses only evaluations since this share of the time: earlier ones belong to a steeper phase."""
+FORECAST_CONFIDENCE = 0.8
+"""Share of forecasts that should hold within their error."""
+PRIOR_RELATIVE_ERROR = 0.8
+"""Error of a forecast without earlier ones to check, as a share of the gain that it promises."""
+EVALUATION_NOISE_DB = 0.05
+"""Typical scatter between evaluations."""
+HORIZONS_S = (5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600)
+"""Time spans that a forecast may look ahead."""
+MIN_GAIN_DB = 0.02
+"""Smaller gains count as none."""
+MIN_REMAINING_SHARE = 0.2
+"""A target is called reachable if at least this share of the total predicted gain lies beyond it; with less, reaching
+it would take more than 25 times the time trained."""
+MIN_TIME_FACTOR = 1.1
+"""Lower bound of the predicted time to a target, as a multiple of the time trained; applies where the fit already
+lies above the target but no evaluation does."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """PSNR ± error in dB at `seconds` of training, `ahead` seconds after it was made, `gain` dB more than then."""
+    """PSNR ± error in dB at `seconds` of training, `ahead` seconds after the forecast; `gain` is in dB from then."""
 
     seconds: float
     psnr: float
@@ -44,116 +47,109 @@ class Forecast:
         return {name: round(value, 4) for name, value in asdict(self).items()}
 
     def __str__(self) -> str:
-        return f"another {clock(self.ahead)}: about {self.gain:+.1f} dB (±{self.error:.1f})"
+        return f"another {format_duration(self.ahead)}: about {self.gain:+.1f} dB (±{self.error:.1f})"
 
 
 def forecast(curve: Curve, ahead: float) -> Forecast | None:
-    """Where the curve will be `ahead` seconds after its end; None where it is too short to tell.
+    """Predict the curve `ahead` seconds after its end; None if it is too short.
 
-    The model is PSNR = a − b/√t, which levels off at a, laid through the late evaluations by the median of the slopes
-    between them, so that a single bad one does not tilt it. Its error is how far off the forecasts would have been
-    that earlier evaluations gave over the same span in proportion, in units of the gain that each promised and of the
-    scatter; one that was off by DOUBT counts among them, so that a lucky start does not look like knowledge.
+    The model is PSNR = a − b/√t, fitted to the late evaluations by the median of pairwise slopes, which is robust to
+    outliers. To estimate the error, the same forecast is repeated from earlier evaluations and compared with what
+    followed; errors are relative to the predicted gain plus the scatter. PRIOR_RELATIVE_ERROR counts as one of them.
     """
-    if len(curve) < FEWEST:
+    if len(curve) < MIN_EVALUATIONS:
         return None
     t, psnr = np.array(curve, np.float64).T
     if not (t[0] > 0 and (np.diff(t) > 0).all() and np.isfinite(psnr).all()):
         return None
-    reach = 1 + ahead / t[-1]
-    now, gain, scatter = _continued(t, psnr, reach)
-    past = [n for n in range(FEWEST, len(t)) if reach * t[n - 1] <= t[-1]]
-    misses = [DOUBT]
+    factor = 1 + ahead / t[-1]
+    now, gain, scatter = _fit(t, psnr, factor)
+    past = [n for n in range(MIN_EVALUATIONS, len(t)) if factor * t[n - 1] <= t[-1]]
+    errors = [PRIOR_RELATIVE_ERROR]
     for n in past:
-        then, promised, _ = _continued(t[:n], psnr[:n], reach)
-        came = float(np.interp(reach * t[n - 1], t, psnr))
-        misses.append(abs(then + promised - came) / (abs(promised) + scatter))
-    error = float(np.quantile(misses, TRUE, method="higher")) * (abs(gain) + scatter)
-    return Forecast(float(t[-1] + ahead), now + gain, max(error, RESOLUTION), ahead, gain)
+        then, predicted_gain, _ = _fit(t[:n], psnr[:n], factor)
+        actual = float(np.interp(factor * t[n - 1], t, psnr))
+        errors.append(abs(then + predicted_gain - actual) / (abs(predicted_gain) + scatter))
+    error = float(np.quantile(errors, FORECAST_CONFIDENCE, method="higher")) * (abs(gain) + scatter)
+    return Forecast(float(t[-1] + ahead), now + gain, max(error, EVALUATION_NOISE_DB), ahead, gain)
 
 
-def horizon(elapsed: float, left: float) -> float | None:
-    """How far ahead to look: a round time, within the budget, at most half of what was seen; None if too little."""
-    fitting = [ahead for ahead in HORIZONS if ahead <= min(left, elapsed / 2)]
+def forecast_horizon(elapsed: float, left: float) -> float | None:
+    """Longest of HORIZONS_S within the remaining budget `left` and half of `elapsed` (seconds); None if none fits."""
+    fitting = [ahead for ahead in HORIZONS_S if ahead <= min(left, elapsed / 2)]
     return float(fitting[-1]) if fitting else None
 
 
-def level_since(curve: Curve) -> float | None:
-    """The time of the best evaluation, if more time no longer helps: the last third of the time, and at least four
-    evaluations, brought nothing over it. None while it still rises."""
+def plateau_start(curve: Curve) -> float | None:
+    """Time of the best evaluation if PSNR has stopped rising, else None.
+
+    It has stopped if at least MIN_EVALUATIONS in the last third of the time gained less than MIN_GAIN_DB.
+    """
     t, psnr = np.array(curve, np.float64).reshape(-1, 2).T
-    late = np.flatnonzero(t > LATE * t[-1:])
-    if len(late) < FEWEST or len(late) == len(t):
+    late = np.flatnonzero(t > FITTED_SINCE_SHARE * t[-1:])
+    if len(late) < MIN_EVALUATIONS or len(late) == len(t):
         return None
     before = psnr[: late[0]]
-    return float(t[np.argmax(before)]) if psnr[late].max() < before.max() + STILL else None
+    return float(t[np.argmax(before)]) if psnr[late].max() < before.max() + MIN_GAIN_DB else None
 
 
-def hits(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
-    """How many forecasts of a metrics.jsonl came true within their error, and how many could be checked.
+def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """How many forecasts in a metrics.jsonl held within their error, and how many could be checked.
 
-    The curve is taken as straight between evaluations.
+    PSNR is interpolated linearly between evaluations.
     """
     curve = curve_of(lines)
     if not curve:
         return 0, 0
     t, psnr = np.array(curve, np.float64).T
     made = [line["forecast"] for line in lines if "forecast" in line]
-    due = [f for f in made if f["seconds"] <= t[-1]]
-    came_true = [abs(np.interp(f["seconds"], t, psnr) - f["psnr"]) <= f["error"] for f in due]
-    return int(sum(came_true)), len(due)
+    checked = [f for f in made if f["seconds"] <= t[-1]]
+    held = [abs(np.interp(f["seconds"], t, psnr) - f["psnr"]) <= f["error"] for f in checked]
+    return int(sum(held)), len(checked)
 
 
-def curve_of(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """The curve in a metrics.jsonl; an evaluation at the same moment as the one before it is left out."""
+def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
+    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times."""
     curve: list[tuple[float, float]] = []
     for line in lines:
-        if "psnr" in line and (not curve or line["seconds"] > curve[-1][0]):
-            curve.append((line["seconds"], line["psnr"]))
+        if key in line and (not curve or line["seconds"] > curve[-1][0]):
+            curve.append((line["seconds"], line[key]))
     return curve
 
 
-def missed(curve: Curve, target: float) -> str:
-    """Why a target PSNR was not reached, in one sentence."""
+def explain_missed_target(curve: Curve, target: float) -> str:
+    """Why a target PSNR was not reached and what would help, in one sentence."""
     best = max(psnr for _, psnr in curve)
-    lead = f"{target:g} dB was not reached (best {best:.2f} dB)"
-    level = level_since(curve)
-    if level is not None:
-        return f"{lead}: nothing was gained after {clock(level)}, so more time would not help; more splats may"
-    if len(curve) < FEWEST:
-        return f"{lead}: there are too few evaluations to say how long it would take"
+    missed = f"{target:g} dB was not reached (best {best:.2f} dB)"
+    plateau = plateau_start(curve)
+    if plateau is not None:
+        since = format_duration(plateau)
+        return f"{missed}: nothing was gained after {since}, so more time would not help; more splats may"
+    if len(curve) < MIN_EVALUATIONS:
+        return f"{missed}: there are too few evaluations to say how long it would take"
     t, psnr = np.array(curve, np.float64).T
-    now, gain, _ = _continued(t, psnr, np.inf)
+    now, gain, _ = _fit(t, psnr, np.inf)
     if gain <= 0:
-        return f"{lead}: the curve does not rise steadily"
-    left = 1 - (target - now) / gain  # share of the gain that is still to come once the target is reached
-    if left < LEAST:
-        beyond = target > now + (1 + DOUBT) * gain
-        says = "more time alone would not reach it" if beyond else "only a much longer budget might reach it"
-        return f"{lead}: the curve levels off at about {now + gain:.1f} dB; {says}"
-    reach = max(left**-2, SOON)
-    return f"{lead}: as the curve goes, it would take about {clock((reach - 1) * t[-1])} more"
+        return f"{missed}: the curve does not rise steadily"
+    remaining = 1 - (target - now) / gain  # share of the total gain that lies beyond the target
+    if remaining < MIN_REMAINING_SHARE:
+        unreachable = target > now + (1 + PRIOR_RELATIVE_ERROR) * gain
+        advice = "more time alone would not reach it" if unreachable else "only a much longer budget might reach it"
+        return f"{missed}: the curve levels off at about {now + gain:.1f} dB; {advice}"
+    factor = max(remaining**-2, MIN_TIME_FACTOR)
+    return f"{missed}: extrapolating the curve, it would take about {format_duration((factor - 1) * t[-1])} more"
 
 
-def clock(seconds: float) -> str:
-    """ "45 s", "2 min", "1 h 30 min"."""
-    whole = round(seconds)
-    if whole < 100:
-        return "1 min" if whole == 60 else f"{whole} s"
-    minutes = round(whole / 60)
-    if minutes < 100:
-        return f"{minutes} min" if minutes * 60 == whole or whole > 600 else f"{whole / 60:.1f} min"
-    return f"{minutes // 60} h {minutes % 60} min"
+def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, float]:
+    """The model's PSNR at t[-1], its gain from there to factor·t[-1], and the scatter of the evaluations around it.
 
-
-def _continued(t: np.ndarray, psnr: np.ndarray, reach: float) -> tuple[float, float, float]:
-    """The model's value at t[-1], its gain from there to reach·t[-1] (slope after Theil and Sen), and the scatter of
-    the evaluations around it."""
-    late = np.arange(len(t)) >= min(np.searchsorted(t, LATE * t[-1]), len(t) - FEWEST)
+    The slope is the Theil–Sen estimator.
+    """
+    late = np.arange(len(t)) >= min(np.searchsorted(t, FITTED_SINCE_SHARE * t[-1]), len(t) - MIN_EVALUATIONS)
     x, y = -np.sqrt(t[-1] / t[late]), psnr[late]
     first, second = np.triu_indices(len(x), 1)
     slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))
     levels = y - slope * (x + 1)
     now = float(np.median(levels))
-    scatter = max(2 * RESOLUTION, 3 * float(np.median(np.abs(levels - now))))
-    return now, slope * (1 - reach**-0.5), scatter
+    scatter = max(2 * EVALUATION_NOISE_DB, 3 * float(np.median(np.abs(levels - now))))
+    return now, slope * (1 - factor**-0.5), scatter

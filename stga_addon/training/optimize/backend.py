@@ -47,5 +47,5 @@ class Backend(Protocol):
     def train(self, batch: Batch) -> float | None:
         """Make one step. Returns the image loss of the latest global iteration that is known and not yet told."""
 
-    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
         """The view as the splats show it now: a new (3, H, W) float32 image."""

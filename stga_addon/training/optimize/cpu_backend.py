@@ -6,12 +6,19 @@ from ...avatar.embedding import frame_backward
 from ...capture.model import View
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.optimizer import distance_limit, scale_limit
-from ...raster.cpu.rasterize import BufferPool, Parameters, RenderOutput, camera_frames, render_backward, render_forward
+from ...raster.cpu.rasterize import (
+    BufferPool,
+    Parameters,
+    RenderOutput,
+    frames_in_camera,
+    render_backward,
+    render_forward,
+)
 from ..settings import TrainingSettings
 from . import adam
 from .backend import Batch
 from .frames import FrameStore
-from .losses import REACH, image_gradient, tile_rectangles, whole_image
+from .losses import LOSS_REACH_PX, image_gradient, tile_rectangles, whole_image
 from .state import TrainState
 from .tracking import frame_gradient
 
@@ -22,7 +29,7 @@ class CpuBackend:
     def __init__(self, settings: TrainingSettings, lengths: np.ndarray, frames: FrameStore, state: TrainState) -> None:
         self.state = state
         self._settings, self._lengths, self._frames = settings, lengths, frames
-        self._scratch = BufferPool()
+        self._buffers = BufferPool()
 
     def __len__(self) -> int:
         return len(self.state)
@@ -35,13 +42,13 @@ class CpuBackend:
         if batch.refine:
             self._refine(batch, rows)
         self._limit(rows)
-        adam.step(state, rows, batch.rates, self._settings.averaging)
+        adam.step(state, rows, batch.rates, self._settings.ema_share)
         if focus is None:
             state.screen_gradient.numpy()[rows] += screen[rows]
             state.gradient_count.numpy()[rows] += 1
         return loss
 
-    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
         """The view as the splats' running average shows it: a new (3, H, W) float32 image."""
         average = Parameters(*(tensor.numpy() for tensor in self.state.average))
         return self._render(average, view, background, degree).image.copy()
@@ -50,7 +57,7 @@ class CpuBackend:
         """The target over the background that is drawn behind the splats."""
         if batch.mask is None:
             return batch.target
-        over = self._scratch.take("target", batch.target.shape, np.uint8)
+        over = self._buffers.get("target", batch.target.shape, np.uint8)
         before = np.array(self._settings.background, np.float32)
         change_background(batch.target, batch.mask, 255 * before, 255 * batch.background, over)
         read_only = over.view()
@@ -64,11 +71,11 @@ class CpuBackend:
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
         rendering = self._render(self.state.arrays(), view, background, degree, focus)
         rectangles = whole_image(height, width) if focus is None else tile_rectangles(rendering.touched, height, width)
-        v_image = self._scratch.take("v_image", (3, height, width))
+        v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
         rows, screen = render_backward(
             rendering, self.state.arrays(), self.state.face.numpy(), self._seen, v_image,
-            Parameters(*(g.numpy() for g in self.state.gradients)), scratch=self._scratch,
+            Parameters(*(g.numpy() for g in self.state.gradients)), buffers=self._buffers,
         )  # fmt: skip
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
@@ -76,10 +83,10 @@ class CpuBackend:
     def _render(
         self, splats: Parameters, view: View, background: np.ndarray, degree: int, focus: np.ndarray | None = None
     ) -> RenderOutput:
-        self._seen = camera_frames(self._frames.of(view.timestep), view.camera)
+        self._seen = frames_in_camera(self._frames.of(view.timestep), view.camera)
         return render_forward(
-            splats, self.state.face.numpy(), self._seen, degree, background, focus, REACH,
-            antialiased=self._settings.antialiased, scratch=self._scratch,
+            splats, self.state.face.numpy(), self._seen, degree, background, focus, LOSS_REACH_PX,
+            antialiased=self._settings.antialiased, buffers=self._buffers,
         )  # fmt: skip
 
     def _refine(self, batch: Batch, rows: np.ndarray) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # to ask for the device, `stga info` needs neither torch nor 
     from .frames import FrameStore
     from .state import TrainState
 
-LEAST_FREE = 1 << 30
+MIN_FREE_BYTES = 1 << 30
 """Bytes of GPU memory below which training does not begin there."""
 
 
@@ -64,15 +64,15 @@ def _find_gpu() -> tuple[str | None, str]:
     try:
         import warp
 
-        from ...raster.gpu.trial import compile_kernels, passes
+        from ...raster.gpu.self_test import compile_kernels, passes
 
         if not warp.is_cuda_available():
             return None, "the NVIDIA driver finds no GPU that it can use"
         device = warp.get_cuda_device()
-        if device.free_memory < LEAST_FREE:
+        if device.free_memory < MIN_FREE_BYTES:
             return (
                 None,
-                f"{device.name} has {device.free_memory >> 20} MiB of memory free, {LEAST_FREE >> 20} are needed",
+                f"{device.name} has {device.free_memory >> 20} MiB of memory free, {MIN_FREE_BYTES >> 20} are needed",
             )
         compile_kernels(device.alias)
         if not passes(device.alias):

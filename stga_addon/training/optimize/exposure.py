@@ -11,7 +11,7 @@ Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
 """View, image (H, W, 3) uint8 and mask (H, W) uint8 or None -> the image to train on."""
 
 
-def even_exposure(settings: TrainingSettings) -> Correction | None:
+def exposure_correction(settings: TrainingSettings) -> Correction | None:
     """What takes the settings' `exposure` away from the images of training cameras; None where there is none.
 
     Only the foreground passed through the camera: what the mask says is background keeps its colour. Cameras that

@@ -7,7 +7,7 @@ from ...avatar.strain import strain_basis
 from ...capture.model import Capture
 from .tracking import Tracking
 
-KEPT = 12
+CACHED_TIMESTEPS = 12
 """Timesteps whose frames stay in memory: about 1 MB each for 10,000 triangles."""
 
 
@@ -39,7 +39,7 @@ class FrameStore:
     def _latest(self, timestep: int) -> tuple[np.ndarray, FaceFrames]:
         known = self._kept.pop(timestep, None)
         self._kept[timestep] = known or self._read(timestep)  # the latest asked for stands last
-        if len(self._kept) > KEPT:
+        if len(self._kept) > CACHED_TIMESTEPS:
             del self._kept[next(iter(self._kept))]
         return self._kept[timestep]
 

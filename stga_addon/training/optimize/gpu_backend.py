@@ -16,20 +16,20 @@ from ...errors import StgaError
 from ...raster.cpu.rasterize import Parameters
 from ...raster.gpu import optimizer
 from ...raster.gpu.embed import Embedding
-from ...raster.gpu.image_loss import change_background, differentiate
-from ...raster.gpu.rasterize import TYPES, DeviceFrames, Rasteriser, lens_of
+from ...raster.gpu.image_loss import change_background, image_loss_gradient
+from ...raster.gpu.rasterize import PARAMETER_TYPES, DeviceFrames, Rasterizer, device_camera
 from ...raster.gpu.upload import Uploads
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, EPSILON
 from .backend import Batch
 from .frames import FrameStore
-from .losses import REACH
+from .losses import LOSS_REACH_PX
 from .state import TrainState
 
 
 @dataclass(frozen=True)
 class _Table:
-    """One parameter of all splats on the device: as values (N, D), and as the rasteriser's rows of the same memory."""
+    """One parameter of all splats on the device: as values (N, D), and as the rasterizer's rows of the same memory."""
 
     values: wp.array
     rows: wp.array
@@ -77,8 +77,8 @@ class GpuBackend:
         self._settings, self._frames = settings, frames
         capture = frames.capture
         with _room(device):
-            self._rasteriser = Rasteriser(device)
-            self._device = self._rasteriser.device
+            self._rasterizer = Rasterizer(device)
+            self._device = self._rasterizer.device
             self._uploads = Uploads(self._device)
             self._embedding = Embedding(
                 self._device, capture.neutral, capture.faces, frames.convention, frames.strain
@@ -123,7 +123,10 @@ class GpuBackend:
         self._settle()
 
         def tables(tensors: Parameters) -> list[_Table]:
-            return [_table(tensor.numpy(), kind, self._device) for tensor, kind in zip(tensors, TYPES, strict=True)]
+            return [
+                _table(tensor.numpy(), kind, self._device)
+                for tensor, kind in zip(tensors, PARAMETER_TYPES, strict=True)
+            ]
 
         def array(tensor: torch.Tensor, kind: Any) -> wp.array:
             return wp.array(tensor.numpy(), dtype=kind, device=self._device)
@@ -153,7 +156,7 @@ class GpuBackend:
             self._run(self._queued)
         return told
 
-    def draw(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
+    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
         """The view as the splats' running average shows it, after everything that is queued."""
         self._settle()
         with _room(self._device):
@@ -161,7 +164,7 @@ class GpuBackend:
             vertices = self._send_mesh(view)
             self._uploads.finish()
             parameters, frames = _rows(self._state.average), self._see(vertices, view, degree)
-            return np.array(self._rasteriser.forward(parameters, self._state.face, frames, background).image.numpy())
+            return np.array(self._rasterizer.forward(parameters, self._state.face, frames, background).image.numpy())
 
     def _settle(self) -> None:
         """Wait until everything that is queued is done."""
@@ -171,7 +174,7 @@ class GpuBackend:
 
     def _repeat_if_cut_short(self) -> None:
         queued, self._queued = self._queued, None
-        if queued is not None and not self._rasteriser.complete():
+        if queued is not None and not self._rasterizer.pairs_fit():
             self._run(queued)
 
     def _tell(self) -> float | None:
@@ -200,32 +203,37 @@ class GpuBackend:
 
     def _see(self, vertices: wp.array, view: View, degree: int) -> DeviceFrames:
         """The triangles' frames as the view's camera sees them."""
-        origin, matrix, strain = self._embedding.place(vertices, view.camera)
+        origin, matrix, strain = self._embedding.frames(vertices, view.camera)
         strains = min(strain.shape[1], self._state.parameters[-1].rows.shape[1])
-        lens = lens_of(view.camera, degree, strains, antialiased=self._settings.antialiased)
+        lens = device_camera(view.camera, degree, strains, antialiased=self._settings.antialiased)
         return DeviceFrames(origin, matrix, strain, lens)
 
     def _run(self, sent: _Sent) -> None:
         """Put one iteration into the device's queue."""
-        rasteriser, state, batch = self._rasteriser, self._state, sent.batch
+        rasterizer, state, batch = self._rasterizer, self._state, sent.batch
         focus = None
         if sent.selected is not None:
-            focus = rasteriser.scratch.take("focus", len(self), wp.uint8)
-            rasteriser.launch(optimizer.mark_focus, len(self), state.face, sent.selected, focus)
+            focus = rasterizer.buffers.get("focus", len(self), wp.uint8)
+            rasterizer.launch(optimizer.mark_focus, len(self), state.face, sent.selected, focus)
         parameters, gradients = _rows(state.parameters), _rows(state.gradients)
         frames = self._see(sent.vertices, batch.view, batch.degree)
-        rendering = rasteriser.forward(
-            parameters, state.face, frames, batch.background, focus, REACH, wait=False
+        rendering = rasterizer.forward(
+            parameters, state.face, frames, batch.background, focus, LOSS_REACH_PX, wait=False
         )  # fmt: skip
-        v_image, loss = differentiate(rasteriser, rendering, self._over(sent), self._settings.ssim_weight)
-        screen = rasteriser.backward(rendering, parameters, state.face, v_image, gradients)
+        v_image, loss = image_loss_gradient(rasterizer, rendering, self._over(sent), self._settings.ssim_weight)
+        screen = rasterizer.backward(rendering, parameters, state.face, v_image, gradients)
         self._limit(rendering.wanted)
         self._adam(rendering.wanted, batch.rates)
         if sent.selected is None:
-            rasteriser.launch(
-                optimizer.gather_pull, len(self), rendering.wanted, screen, state.screen_gradient, state.gradient_count
+            rasterizer.launch(
+                optimizer.accumulate_screen_gradient,
+                len(self),
+                rendering.wanted,
+                screen,
+                state.screen_gradient,
+                state.gradient_count,
             )
-            total = rasteriser.scratch.take("loss_sum", 1)
+            total = rasterizer.buffers.get("loss_sum", 1)
             wp.utils.array_sum(loss.flatten(), out=total)
             wp.copy(self._losses, total, dest_offset=sent.place, count=1)
 
@@ -233,17 +241,17 @@ class GpuBackend:
         """The target over the background that is drawn behind the splats."""
         if sent.mask is None:
             return sent.target
-        out = self._rasteriser.scratch.take("over", sent.target.shape, wp.uint8)
+        out = self._rasterizer.buffers.get("over", sent.target.shape, wp.uint8)
         change = 255 * sent.batch.background - 255 * np.array(self._settings.background, np.float32)
-        self._rasteriser.launch(
+        self._rasterizer.launch(
             change_background, sent.mask.shape, sent.target, sent.mask, wp.vec3(*(float(c) for c in change)), out
         )
         return out
 
     def _limit(self, wanted: wp.array) -> None:
         """Add the gradients of the limits that keep splats near what they cover."""
-        settings, state, launch, n = self._settings, self._state, self._rasteriser.launch, len(self)
-        squares, square = self._rasteriser.scratch.take("squares", n), self._rasteriser.scratch.take("square", 1)
+        settings, state, launch, n = self._settings, self._state, self._rasterizer.launch, len(self)
+        squares, square = self._rasterizer.buffers.get("squares", n), self._rasterizer.buffers.get("square", 1)
         xyz, log_scale = _rows(state.parameters).xyz, _rows(state.parameters).log_scale
         if settings.scale_weight:
             given = wanted, state.unbound, log_scale, state.face, self._scale_limit
@@ -257,10 +265,10 @@ class GpuBackend:
             launch(optimizer.distance_limit, n, *given, settings.distance_weight, square, _rows(state.gradients).xyz)
 
     def _adam(self, wanted: wp.array, rates: Mapping[str, float]) -> None:
-        state, launch = self._state, self._rasteriser.launch
-        correct = self._rasteriser.scratch.take("correct", len(self), wp.vec3)
+        state, launch = self._state, self._rasterizer.launch
+        correct = self._rasterizer.buffers.get("correct", len(self), wp.vec3)
         logarithms = math.log(BETA1), math.log(BETA2)
-        launch(optimizer.count_steps, len(self), wanted, *logarithms, self._settings.averaging, state.steps, correct)
+        launch(optimizer.count_steps, len(self), wanted, *logarithms, self._settings.ema_share, state.steps, correct)
         for name, *tables in zip(
             Parameters._fields, state.parameters, state.gradients, state.first, state.second, state.average, strict=True
         ):

@@ -79,11 +79,10 @@ def _shell(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: fl
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) bool: pixels that the mesh covers, or that a small tracking error would make it cover."""
-    p = mesh @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = p[:, :2] / np.maximum(p[:, 2:], 1e-6) * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
+    pixels, depth = camera.project(mesh)
     picture = Image.new("1", (camera.width, camera.height))
     draw = ImageDraw.Draw(picture)
-    for corners in pixels[faces[(p[:, 2] > 0.01)[faces].all(1)]].reshape(-1, 6).tolist():
+    for corners in pixels[faces[(depth > 0.01)[faces].all(1)]].reshape(-1, 6).tolist():
         draw.polygon(corners, fill=1)
     return np.asarray(binary_dilation(np.asarray(picture), iterations=max(1, round(TRACKING_ERROR * camera.height))))
 
@@ -97,11 +96,9 @@ def _foreground(view: View) -> np.ndarray:
 
 def _pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixel columns and rows of world points (N, 3), and which of them lie in the image."""
-    p = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    z = np.maximum(p[:, 2], 1e-6)
-    x = np.floor(camera.fl_x * p[:, 0] / z + camera.cx)
-    y = np.floor(camera.fl_y * p[:, 1] / z + camera.cy)
-    seen = (p[:, 2] > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    pixels, depth = camera.project(points)
+    x, y = np.floor(pixels).T
+    seen = (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
 
 

@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from ...raster.cpu.image_loss import REACH, image_loss
+from ...raster.cpu.image_loss import LOSS_REACH_PX, image_loss
 from ...raster.cpu.layout import TILE
 
-__all__ = ["REACH", "image_gradient", "similarity", "tile_rectangles", "whole_image"]
+__all__ = ["LOSS_REACH_PX", "image_gradient", "similarity", "tile_rectangles", "whole_image"]
 
 
 def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:

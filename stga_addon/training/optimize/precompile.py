@@ -10,12 +10,12 @@ import numpy as np
 from ...avatar.embedding import WORLD
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
-from ...raster.cpu import CACHE
+from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import PROJECTED
 from ...raster.cpu.optimizer import distance_limit, scale_limit
 from ...raster.cpu.project import project_backward
-from ...raster.cpu.rasterize import Parameters, camera_frames, complete, render_backward, render_forward
+from ...raster.cpu.rasterize import Parameters, frames_in_camera, render_backward, render_forward, with_strain_color
 from ...worker.process import same_packages
 from . import adam
 from .losses import image_gradient, whole_image
@@ -45,7 +45,7 @@ def precompile_kernels() -> None:
 
 def _second_process() -> "subprocess.Popen[bytes] | None":
     """A process that runs `_second_half`; None where the cache has that, or another process could not fill it."""
-    cached = any(Path(CACHE).glob("*/image_loss.image_loss-*.nbi"))
+    cached = any(Path(KERNEL_CACHE_FOLDER).glob("*/image_loss.image_loss-*.nbi"))
     # As part of an extension the package has another name and another cache.
     if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
         return None
@@ -79,7 +79,7 @@ def _pair() -> TrainState:
 def _render() -> None:
     """Forwards and backwards."""
     state = _pair()
-    seen, face = camera_frames(WORLD, CAMERA), state.face.numpy()
+    seen, face = frames_in_camera(WORLD, CAMERA), state.face.numpy()
     rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     render_backward(rendering, state.arrays(), face, seen, np.zeros_like(rendering.image), gradients)
@@ -98,12 +98,12 @@ def _second_half() -> None:
 def _project_backward() -> None:
     """Two splats without a pair."""
     state = _pair()
-    seen, none = camera_frames(WORLD, CAMERA), np.zeros(2, np.int32)
+    seen, none = frames_in_camera(WORLD, CAMERA), np.zeros(2, np.int32)
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     project_backward(
-        none, *complete(state.arrays()), 3, state.face.numpy(), seen.origin, seen.matrix, seen.strain, seen.to_world,
-        seen.lens, seen.size, False, False, np.ones((2, PROJECTED), np.float32), none, none, none,
-        np.zeros((2, PROJECTED), np.float32), *complete(gradients), np.zeros(2, np.float32),
+        none, *with_strain_color(state.arrays()), 3, state.face.numpy(), seen.origin, seen.matrix, seen.strain,
+        seen.to_world, seen.intrinsics, seen.size, False, False, np.ones((2, PROJECTED), np.float32), none, none, none,
+        np.zeros((2, PROJECTED), np.float32), *with_strain_color(gradients), np.zeros(2, np.float32),
     )  # fmt: skip
 
 

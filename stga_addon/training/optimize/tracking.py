@@ -29,14 +29,14 @@ COEFFICIENT, RADIAN, METRE = 1e-2, 2e-3, 2e-4
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 LEASH = 0.03
 """Share of the way back to the tracked values that comes with a step at full rate, for what no image shows."""
-JOINTS, PLACE = 15, 3
+POSE_SIZE, TRANSLATION_SIZE = 15, 3
 """The last numbers of a timestep: axis-angles of five joints, and the translation. Expression comes first."""
-KEPT = 12
+CACHED_TIMESTEPS = 12
 """Frames that stay in memory with their dynamic offsets."""
 
 
 @dataclass
-class Refinement:
+class RefinementState:
     """How far T timesteps have come, P numbers each in FLAME's units: what a checkpoint holds, in float64.
 
     change (T, P) and Adam's first moment `first` (T, P); its second moment `second` (P,), which the timesteps share
@@ -58,21 +58,21 @@ class Tracking:
     def __init__(self, sequence: FlameSequence, timesteps: Collection[int]) -> None:
         """timesteps: those to refine."""
         self.sequence = sequence
-        self.tracked = np.stack([numbers_of(sequence.frame(timestep)) for timestep in sequence.timesteps])
+        self.tracked = np.stack([parameters_of(sequence.frame(timestep)) for timestep in sequence.timesteps])
         self.trained = np.isin(sequence.timesteps, list(timesteps))
         zero = np.zeros_like(self.tracked)
-        self.state = Refinement(zero, zero.copy(), zero[0].copy(), np.zeros(len(zero), np.int64))
-        expressions = self.tracked.shape[1] - JOINTS - PLACE
-        self._rates = np.repeat([COEFFICIENT, RADIAN, METRE], [expressions, JOINTS, PLACE])
+        self.state = RefinementState(zero, zero.copy(), zero[0].copy(), np.zeros(len(zero), np.int64))
+        expressions = self.tracked.shape[1] - POSE_SIZE - TRANSLATION_SIZE
+        self._rates = np.repeat([COEFFICIENT, RADIAN, METRE], [expressions, POSE_SIZE, TRANSLATION_SIZE])
         self._row = {timestep: row for row, timestep in enumerate(sequence.timesteps)}
-        self._source = lru_cache(KEPT)(sequence.frame)
+        self._source = lru_cache(CACHED_TIMESTEPS)(sequence.frame)
         self._person = replace(with_identity(sequence), frame=self.frame)
         self._flame = flame_tensors(self._person.model)
 
     def refines(self, timestep: int) -> bool:
         return timestep in self._row and bool(self.trained[self._row[timestep]])
 
-    def numbers(self) -> np.ndarray:
+    def parameters(self) -> np.ndarray:
         """(T, P) as refined.
 
         What all timesteps have in common is left to the splats: they stand off the mesh as easily as the mesh moves
@@ -82,7 +82,7 @@ class Tracking:
         return np.asarray(self.tracked + np.where(self.trained[:, None], self.state.change - common, 0.0))
 
     def frame(self, timestep: int) -> FlameFrame:
-        return with_numbers(self._source(timestep), self.numbers()[self._row[timestep]])
+        return with_parameters(self._source(timestep), self.parameters()[self._row[timestep]])
 
     def mesh(self, timestep: int) -> np.ndarray:
         """(V, 3) metres."""
@@ -103,15 +103,15 @@ class Tracking:
     def gradient(self, timestep: int, pull: np.ndarray) -> np.ndarray:
         """(P,) with respect to the timestep's parameters, from that with respect to its vertices, `pull` (V, 3)."""
         frame = self.frame(timestep)
-        numbers = torch.tensor(numbers_of(frame)[None], dtype=torch.float32, requires_grad=True)
-        expr, pose, translation = numbers.tensor_split([-JOINTS - PLACE, -PLACE], dim=1)
+        numbers = torch.tensor(parameters_of(frame)[None], dtype=torch.float32, requires_grad=True)
+        expr, pose, translation = numbers.tensor_split([-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE], dim=1)
         offset = None if frame.dynamic_offset is None else torch.tensor(frame.dynamic_offset, dtype=torch.float32)
         vertices = flame_forward(self._flame, numbers.new_zeros(0), expr, pose.reshape(1, -1, 3), translation, offset)
         (gradient,) = torch.autograd.grad(vertices, numbers, torch.tensor(pull[None], dtype=torch.float32))
         return gradient[0].numpy().astype(np.float64)
 
 
-def track(capture: Capture, convention: str) -> Tracking:
+def refinable_tracking(capture: Capture, convention: str) -> Tracking:
     """The capture's parameters, to be refined where there are training views.
 
     Raises StgaError where it has none, or the splats are embedded by a convention other than "stga" (`frame_backward`).
@@ -123,7 +123,7 @@ def track(capture: Capture, convention: str) -> Tracking:
     return Tracking(capture.flame, {view.timestep for view in capture.views["train"]})
 
 
-def refining_share(progress: float) -> float:
+def refinement_rate(progress: float) -> float:
     """Share of the rates at a share of the budget; 0 before the splats show anything."""
     return 0.0 if progress < START else END ** min(1.0, (progress - START) / (1 - START))
 
@@ -148,14 +148,14 @@ def frame_gradient(
     return np.stack(sums[:3], -1) / frames.scale[:, None], np.stack(sums[3:6], -1), sums[6]
 
 
-def numbers_of(frame: FlameFrame) -> np.ndarray:
+def parameters_of(frame: FlameFrame) -> np.ndarray:
     """(P,) of a frame: expression, joints, translation."""
     return np.concatenate([frame.expr, frame.pose.ravel(), frame.translation])
 
 
-def with_numbers(frame: FlameFrame, numbers: np.ndarray) -> FlameFrame:
-    """The frame with other `numbers_of`."""
-    expr, pose, translation = np.split(numbers, [-JOINTS - PLACE, -PLACE])
+def with_parameters(frame: FlameFrame, numbers: np.ndarray) -> FlameFrame:
+    """The frame with other `parameters_of`."""
+    expr, pose, translation = np.split(numbers, [-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE])
     rotation, neck, jaw, eyes = np.split(pose, [3, 6, 9])
     return replace(
         frame, expr=expr, rotation=rotation, neck_pose=neck, jaw_pose=jaw, eyes_pose=eyes, translation=translation
@@ -165,7 +165,7 @@ def with_numbers(frame: FlameFrame, numbers: np.ndarray) -> FlameFrame:
 def write_tracking(folder: Path, tracking: Tracking) -> None:
     """Replace a run folder's tracking.npz: the motion of all timesteps, for `read_motion`, and what it began as."""
     sequence = tracking.sequence
-    frame = with_numbers(sequence.frame(sequence.timesteps[0]), tracking.numbers().T)
+    frame = with_parameters(sequence.frame(sequence.timesteps[0]), tracking.parameters().T)
     arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
     arrays["shape"] = sequence.shape
     if sequence.static_offset is not None:
@@ -174,7 +174,7 @@ def write_tracking(folder: Path, tracking: Tracking) -> None:
     write_npz(folder / TRACKING, arrays, compressed=True)
 
 
-def refined(capture: Capture, folder: Path) -> Capture:
+def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
     """The capture as the run in `folder` refined it; as it is where the run refined nothing.
 
     A timestep is taken from the run only where the capture has the parameters that the run began with, so that another
@@ -190,7 +190,7 @@ def refined(capture: Capture, folder: Path) -> Capture:
 
     def frame(timestep: int) -> FlameFrame:
         found = sequence.frame(timestep)
-        if timestep not in began or not np.array_equal(numbers_of(found), began[timestep]):
+        if timestep not in began or not np.array_equal(parameters_of(found), began[timestep]):
             return found
         return replace(motion.frame(timestep), dynamic_offset=found.dynamic_offset)
 

@@ -19,7 +19,7 @@ from .device import make_backend
 from .frames import FrameStore
 from .hull_points import hull_points
 from .state import TrainState, new_state
-from .tracking import refining_share, track
+from .tracking import refinable_tracking, refinement_rate
 
 SPLIT_SHARE = 0.02
 """Largest share of the splats that one round of density control splits."""
@@ -42,7 +42,7 @@ class Trainer:
     ) -> None:
         """device: one of `choose_device`."""
         self.capture, self.settings, self.selection = capture, settings, selection
-        self.tracking = track(capture, settings.convention) if settings.tracking else None
+        self.tracking = refinable_tracking(capture, settings.convention) if settings.tracking else None
         self.frames = FrameStore(capture, settings.convention, settings.strain_color, self.tracking)
         self._lengths = face_lengths(capture, settings.convention)
         state = new_state(initial_splats(capture, settings)) if state is None else state
@@ -91,7 +91,7 @@ class Trainer:
         if mask is not None:
             background = np.random.default_rng([settings.seed, self.iteration]).random(3, np.float32)
         selected = None if whole else self._selected(view.timestep)
-        refine = refining_share(progress) if self.tracking is not None and selected is None else 0.0
+        refine = refinement_rate(progress) if self.tracking is not None and selected is None else 0.0
         loss = self._step.train(
             Batch(
                 view,
@@ -108,9 +108,9 @@ class Trainer:
         self._maintain(progress)
         return loss
 
-    def draw(self, view: View, progress: float = 1.0) -> np.ndarray:
+    def render(self, view: View, progress: float = 1.0) -> np.ndarray:
         """The view as the splats' running average shows it: a new (3, H, W) float32 image over the background."""
-        return self._step.draw(view, self._background, sh_degree(self.settings, progress))
+        return self._step.render(view, self._background, sh_degree(self.settings, progress))
 
     def _selected(self, timestep: int) -> np.ndarray | None:
         """(F,) bool: the frame's selected triangles; None where nothing is selected."""
@@ -121,13 +121,13 @@ class Trainer:
         """Stray resets and density control, when their time has come."""
         settings = self.settings
         start, end = settings.density_span
-        stray = _is_due(settings.stray_every, self.iteration)
-        density = _is_due(settings.density_every, self.iteration) and start <= progress < end
+        stray = _is_due(settings.stray_reset_interval, self.iteration)
+        density = _is_due(settings.density_interval, self.iteration) and start <= progress < end
         if not stray and not density:
             return
         state = self.state
         if stray:
-            reset_strays(state, settings.stray_limit * self._lengths, settings.stray_to)
+            reset_strays(state, settings.stray_limit * self._lengths, settings.stray_reset_share)
         if density:
             room = round(self.initial_count * (1 + settings.growth)) - len(state)
             rng = np.random.default_rng([settings.seed, self.iteration])

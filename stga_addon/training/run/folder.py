@@ -28,9 +28,9 @@ from ...avatar.strain import STRAINS
 from ...errors import StgaError
 from ...files import partial_name, read_json, read_npz, replacing, write_json, write_npz
 from ...worker.lock import held, owner
-from ..effect_plan import TRACKING, EffectDecision, plan_from_json, plan_to_json
+from ..effect_plan import TRACKING, EffectDecision, effect_plan_from_json, effect_plan_to_json
 from ..optimize.state import TrainState, state_of, tensors_of
-from ..optimize.tracking import Refinement
+from ..optimize.tracking import RefinementState
 from ..settings import SCHEDULES, STRATEGIES, TrainingSettings, from_json, to_json
 from .metrics_log import METRICS, read_metrics
 
@@ -48,7 +48,7 @@ class Run:
     flame: Path | None
     principal_point: str
     settings: TrainingSettings
-    plan: tuple[EffectDecision, ...] = ()
+    effect_plan: tuple[EffectDecision, ...] = ()
 
 
 @dataclass
@@ -70,7 +70,7 @@ class Checkpoint:
     best_psnr: float
     evaluations: int
     losses: list[float]
-    tracking: Refinement | None = None
+    tracking: RefinementState | None = None
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -83,7 +83,7 @@ def write_run(folder: Path, run: Run) -> None:
             "flame": None if run.flame is None else str(run.flame),
             "principal_point": run.principal_point,
             "settings": to_json(run.settings),
-            "plan": plan_to_json(run.plan),
+            "effect_plan": effect_plan_to_json(run.effect_plan),
         },
     )
 
@@ -102,7 +102,7 @@ def read_run(folder: Path) -> Run:
         flame = values["flame"]
         settings = from_json(values["settings"])
         _check_settings(settings)
-        plan = plan_from_json(values.get("plan", []))
+        plan = effect_plan_from_json(values.get("effect_plan", []))
         model = None if flame is None else Path(flame)
         return Run(Path(values["capture"]), model, str(values["principal_point"]), settings, plan)
     except (KeyError, TypeError, ValueError) as error:
@@ -135,19 +135,19 @@ _RANGES: dict[str, tuple[float, float]] = {
     "lattice": (0, 16),
     "sh_degree": (0, MAX_SH_DEGREE),
     "views_per_visit": (0, math.inf),
-    "global_every": (1, math.inf),
-    "density_every": (0, math.inf),
-    "stray_every": (0, math.inf),
-    "averaging": (0, 1),
-    "stray_to": (0, 1),
+    "global_interval": (1, math.inf),
+    "density_interval": (0, math.inf),
+    "stray_reset_interval": (0, math.inf),
+    "ema_share": (0, 1),
+    "stray_reset_share": (0, 1),
     "growth": (0, 100),
-    "warm_up": (0, 1),
+    "warm_up_share": (0, 1),
     "ssim_weight": (0, 1),
     "sh_steps": (0, math.inf),
     "density_span": (0, math.inf),
     "background": (0, 1),
     "scale": (0.05, 1),
-    "coarse_span": (0, 1),
+    "coarse_share": (0, 1),
     "target_psnr": (0, 200),
 }
 
@@ -233,12 +233,12 @@ def _check_state(path: Path, state: TrainState) -> None:
             raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 
-def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> Refinement | None:
+def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | None:
     """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
     names = [name for name in arrays if name.startswith(REFINEMENT)]
     if not names:
         return None
-    found = Refinement(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
+    found = RefinementState(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
     whole = found.change.shape
     if len(whole) != 2:
         raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")

@@ -1,8 +1,6 @@
 """A whole training run: from a capture to an avatar in a folder, with evaluation, checkpoints and resumption."""
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,21 +11,23 @@ from ...avatar.file import Avatar, write_avatar
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture
 from ...errors import StgaError
+from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, look
-from ..evaluate.forecast import clock, curve_of, forecast, horizon, level_since
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
+from ..evaluate.forecast import curve_of, forecast, forecast_horizon, plateau_start
 from ..evaluate.metrics import evaluate, peak_memory_mb
-from ..optimize.exposure import even_exposure
+from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
 from ..optimize.tracking import write_tracking
 from ..optimize.trainer import Trainer
-from ..schedule import view_order
+from ..schedule import image_scale, view_order
 from ..settings import to_json
 from . import folder as run_folder
 from .folder import Checkpoint, Run
 from .metrics_log import read_metrics
+from .progress import Progress, Report
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
@@ -37,30 +37,6 @@ EVALUATION_SHARE = 0.04
 """Largest share of the training time that evaluations add to a budget in seconds; the last one comes on top."""
 MOST_EVALUATIONS = 40
 """Evaluations over a budget in seconds, however little they cost."""
-COARSE = 0.5
-"""Size of the images during `TrainingSettings.coarse_span`, as a share of the size trained at afterwards."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a person sees while it trains: share of the budget, iterations, speed, loss (mean of the last global
-    iterations), PSNR of the last evaluation or None, splat count, seconds left, what is going on, and what more time
-    is expected to bring. `avatar` makes the avatar as it is now; None before there is one."""
-
-    share: float
-    iteration: int
-    per_second: float
-    loss: float
-    psnr: float | None
-    splats: int
-    left_s: float
-    message: str = ""
-    forecast_text: str = ""
-    avatar: Callable[[], Avatar] | None = None
-
-
-Report = Callable[[Progress], bool]
-"""Called after every iteration; answers True to stop early, keeping what is trained."""
 
 
 def train(
@@ -80,7 +56,7 @@ def train(
     Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or the
     weights of LPIPS are named and are none.
     """
-    lpips.network()  # read now, because it is needed only when everything is trained
+    lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
@@ -88,7 +64,7 @@ def train(
     with run_folder.locked(out):
         if (out / "run.json").exists() and not resume:
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
-        report(Progress(0, 0, 0, np.nan, None, 0, np.nan, "compiling kernels"))
+        report(Progress(message="Compiling kernels"))
         precompile_kernels()
         loop = _Loop(capture, out, run, report, device)
         if resume and (out / "checkpoint.npz").exists():
@@ -112,11 +88,11 @@ class _Loop:
         self.lines: list[dict[str, Any]] = []
         self.psnr: float | None = None
         self.forecast_text = ""
-        self.evaluation_views = [look(capture, view) for view in choose_evaluation_views(capture)]
+        self.evaluation_views = [read_evaluation_view(capture, view) for view in choose_evaluation_views(capture)]
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start anew: choose triangles, place splats, and write down what is going to happen."""
-        self._tell("choosing triangles and placing splats")
+        self._tell("Placing splats")
         if selection is None:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
@@ -128,7 +104,7 @@ class _Loop:
 
     def resume(self) -> None:
         """Take up the folder's checkpoint."""
-        self._tell("reading the checkpoint")
+        self._tell("Reading the checkpoint")
         checkpoint = run_folder.read_checkpoint(self.out)
         selection = run_folder.read_selection(self.out, len(self.capture.faces))
         face = checkpoint.state.face
@@ -159,7 +135,7 @@ class _Loop:
         views = self.capture.views["train"]
         order = view_order(views, settings.views_per_visit, settings.seed, trainer.iteration)
         red, green, blue = (round(255 * c) for c in settings.background)
-        correct = even_exposure(settings)
+        correct = exposure_correction(settings)
         saved, started = self.elapsed, self.elapsed
         first = trainer.iteration
         self.clock_began = perf_counter() - (self.lines[-1].get("wall_s", 0.0) if self.lines else 0.0)
@@ -185,7 +161,7 @@ class _Loop:
                     break
         self._evaluate(perceptual=self._share() >= 1 or self._enough())  # who stops a run is not made to wait
         self._save()
-        self.report(self._progress(speed, "trained"))
+        self.report(self._progress(speed, "Finished"))
 
     def _share(self) -> float:
         """Share of the budget spent."""
@@ -195,9 +171,8 @@ class _Loop:
 
     def _size(self, iteration: int) -> float:
         """Size of an iteration's image, as a share of the captured one; by the clock, a few images ahead of it."""
-        settings = self.settings
-        share = self._share() if settings.iterations is None else iteration / settings.iterations
-        return settings.scale * (COARSE if share < settings.coarse_span else 1.0)
+        total = self.settings.iterations
+        return image_scale(self.settings, self._share() if total is None else iteration / total)
 
     def _due(self) -> bool:
         """Whether to evaluate now; at the end of the budget there is an evaluation anyway."""
@@ -215,7 +190,7 @@ class _Loop:
         curve, target = curve_of(self.lines), self.settings.target_psnr
         if target is not None and any(psnr >= target for _, psnr in curve):
             return True
-        return self.settings.stop_when_flat and level_since(curve) is not None
+        return self.settings.stop_when_flat and plateau_start(curve) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Look at the held-out views, keep the avatar if it is the best so far, and write the metrics down."""
@@ -230,7 +205,7 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.evaluation_views:
-            quality = evaluate(lambda view: self.trainer.draw(view, share), self.evaluation_views, perceptual)
+            quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
             self.psnr = quality.psnr
             line.update(quality.as_json())
         # Without held-out views the latest avatar counts as the best.
@@ -249,14 +224,14 @@ class _Loop:
     def _look_ahead(self, line: dict[str, Any]) -> None:
         """Say what more time will bring, and note it in the line so that it can be checked."""
         curve, left = curve_of(self.lines), self._left_s()
-        ahead = horizon(self.elapsed, left)
+        ahead = forecast_horizon(self.elapsed, left)
         coming = None if ahead is None else forecast(curve, ahead)
         self.forecast_text = "" if coming is None else str(coming)
         if coming is not None:
             line["forecast"] = coming.as_json()
-        level = level_since(curve) if left else None
+        level = plateau_start(curve) if left else None
         if level is not None:
-            self.forecast_text = f"no gain since {clock(level)}: more time no longer helps"
+            self.forecast_text = f"no gain since {format_duration(level)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None
         if target is not None and end is not None and end.psnr + end.error < target:
             far = f"{target:g} dB is out of reach ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"
@@ -285,7 +260,7 @@ class _Loop:
             ),
         )  # fmt: skip
 
-    def _progress(self, per_second: float, message: str = "training") -> Progress:
+    def _progress(self, per_second: float, message: str = "Training") -> Progress:
         return Progress(
             min(1.0, self._share()),
             self.trainer.iteration,
@@ -305,4 +280,4 @@ class _Loop:
         return max(0.0, self.elapsed * (1 / share - 1)) if share > 0 else np.nan
 
     def _tell(self, message: str) -> None:
-        self.report(Progress(0, 0, 0, np.nan, None, 0, np.nan, message))
+        self.report(Progress(message=message))

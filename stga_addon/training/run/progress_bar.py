@@ -2,7 +2,7 @@
 
 from tqdm import tqdm
 
-from .loop import Progress
+from .progress import Progress
 
 
 class ProgressBar:

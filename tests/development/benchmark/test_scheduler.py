@@ -17,10 +17,10 @@ from stga_addon.development.benchmark.variants import KNOBS, MAIN, chosen
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
 from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics, write_run
-from stga_addon.training.run.loop import Progress
+from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
 
-TINY = {"lattice": 0, "hull_points": False, "sh_degree": 0, "sh_steps": (), "density_every": 0}
+TINY = {"lattice": 0, "hull_points": False, "sh_degree": 0, "sh_steps": (), "density_interval": 0}
 VARIANTS = {"standard": TINY, "coarse": {**TINY, "scale": 0.5}}
 
 
@@ -56,7 +56,7 @@ def test_one_job(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     first, second, last = (json.loads(line) for line in answers.getvalue().splitlines())
     assert (first["iteration"], second["share"], last) == (1, 0.5, {"done": True})
     quality = json.loads((job.out / QUALITY).read_text())
-    assert {"psnr", "ssim", "psnr_mask", "psnr_selected"} <= set(quality["val"]) & set(quality["test"])
+    assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality["val"]) & set(quality["test"])
     assert job.finished
     answers = io.StringIO()
     write_run(tmp_path / "lost", replace(job.run, capture=tmp_path / "nowhere"))

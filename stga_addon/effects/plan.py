@@ -8,37 +8,37 @@ from ..capture.model import Capture
 from ..errors import StgaError
 from ..training.effect_plan import EffectDecision
 from ..training.settings import TrainingSettings
-from .facts import Facts
+from .facts import CaptureFacts
 from .rules import EFFECTS, Effect, Verdict
 
 if TYPE_CHECKING:
     from ..training.run.folder import Run
 
 
-def decide(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
+def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
     """The run with its effects decided, once, before it begins; one whose settings ask for none is left as it is.
 
     device: what it is to be trained on, one of `choose_device`.
     Raises StgaError for a choice that cannot work on this capture.
     """
-    if run.settings.effects is None or run.plan or not capture.views.get("train"):
+    if run.settings.effects is None or run.effect_plan or not capture.views.get("train"):
         return run
-    settings, plan = decide_effects(capture, run.settings, device)
-    return replace(run, settings=settings, plan=plan)
+    settings, plan = plan_effects(capture, run.settings, device)
+    return replace(run, settings=settings, effect_plan=plan)
 
 
-def decide_effects(
+def plan_effects(
     capture: Capture, settings: TrainingSettings, device: str = "cpu"
 ) -> tuple[TrainingSettings, tuple[EffectDecision, ...]]:
     """Look at a capture with training views for a few seconds; returns the settings that follow, and why.
 
     Raises StgaError where an image cannot be read, or for a choice in `settings.effects` that cannot work.
     """
-    facts, choices = Facts(capture, settings, device), settings.effects or {}
+    facts, choices = CaptureFacts(capture, settings, device), settings.effects or {}
     changes: dict[str, object] = {}
     plan = []
     for effect in EFFECTS:
-        choice, verdict = choices.get(effect.name, "auto"), effect.look(facts)
+        choice, verdict = choices.get(effect.name, "auto"), effect.rule(facts)
         if verdict is None:
             if choice == "on":
                 raise StgaError(f"--effect {effect.name}=on: {capture.root} has none: {_needs(effect)}")

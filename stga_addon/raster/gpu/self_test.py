@@ -7,12 +7,11 @@ import warp as wp
 
 from ...avatar.embedding import WORLD
 from ...capture.camera import Camera
-from ..cpu.rasterize import Parameters, camera_frames
-from . import blend, embed, image_loss, optimizer, project
-from . import tiles as bins
-from .rasterize import TYPES, DeviceFrames, Rasteriser, lens_of
+from ..cpu.rasterize import Parameters, frames_in_camera
+from . import blend, embed, image_loss, optimizer, project, tiles
+from .rasterize import PARAMETER_TYPES, DeviceFrames, Rasterizer, device_camera
 
-MODULES = (embed, project, bins, blend, image_loss, optimizer)
+MODULES = (embed, project, tiles, blend, image_loss, optimizer)
 
 
 def compile_kernels(device: str) -> None:
@@ -22,9 +21,9 @@ def compile_kernels(device: str) -> None:
 
 
 def passes(device: str) -> bool:
-    """Draw one grey splat over several tiles, and differentiate the sum of the image.
+    """Draw one gray splat over several tiles, and image_loss_gradient the sum of the image.
 
-    Both are known: the middle pixel is grey times opacity, and the gradient with respect to the opacity's logit is
+    Both are known: the middle pixel is gray times opacity, and the gradient with respect to the opacity's logit is
     (1 − opacity) times the sum. The latter comes out right only if no thread's part is lost or counted twice.
     """
     size, logit = 40, 2.0
@@ -34,21 +33,21 @@ def passes(device: str) -> bool:
         Parameters(
             *(
                 wp.array(factor * np.array(value, np.float32), dtype=kind, device=device)
-                for value, kind in zip(splat, TYPES, strict=True)
+                for value, kind in zip(splat, PARAMETER_TYPES, strict=True)
             )
         )
         for factor in (1, 0)
     )
-    seen = camera_frames(WORLD, camera)
+    camera_frames = frames_in_camera(WORLD, camera)
     frames = DeviceFrames(
-        wp.array(seen.origin, dtype=wp.vec3, device=device),
-        wp.array(seen.matrix, dtype=wp.mat33, device=device),
-        wp.array(seen.strain, dtype=wp.float32, device=device),
-        lens_of(camera, 0, 0),
+        wp.array(camera_frames.origin, dtype=wp.vec3, device=device),
+        wp.array(camera_frames.matrix, dtype=wp.mat33, device=device),
+        wp.array(camera_frames.strain, dtype=wp.float32, device=device),
+        device_camera(camera, 0, 0),
     )
-    rasteriser, face = Rasteriser(device), wp.zeros(1, wp.int32, device=device)
-    rendering = rasteriser.forward(parameters, face, frames)
-    rasteriser.backward(rendering, parameters, face, wp.full((3, size, size), 1.0, device=device), gradients)
+    rasterizer, face = Rasterizer(device), wp.zeros(1, wp.int32, device=device)
+    rendering = rasterizer.forward(parameters, face, frames)
+    rasterizer.backward(rendering, parameters, face, wp.full((3, size, size), 1.0, device=device), gradients)
     image, opacity = rendering.image.numpy(), 1 / (1 + math.exp(-logit))
     middle, gradient = image[:, size // 2, size // 2], gradients.opacity.numpy()[0]
     return bool(

@@ -1,0 +1,12 @@
+"""Human-readable formatting of quantities."""
+
+
+def format_duration(seconds: float) -> str:
+    """ "45 s", "2 min", "1 h 30 min"."""
+    whole = round(seconds)
+    if whole < 100:
+        return "1 min" if whole == 60 else f"{whole} s"
+    minutes = round(whole / 60)
+    if minutes < 100:
+        return f"{minutes} min" if minutes * 60 == whole or whole > 600 else f"{whole / 60:.1f} min"
+    return f"{minutes // 60} h {minutes % 60} min"
