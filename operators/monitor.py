@@ -126,7 +126,7 @@ def tick() -> float | None:
     for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive]:
         before, _snapshots[folder] = _snapshots[folder], _inspect(folder)
         if _snapshots[folder] != before:
-            _redraw()
+            redraw()
         intervals.append(CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None)
     return min((interval for interval in intervals if interval is not None), default=None)
 
@@ -213,7 +213,7 @@ def _carry_out(scene: Any, effects: Iterable[states.Effect]) -> None:
                 if has_timer():  # later: saving the scene's state takes as long as a slice
                     bpy.app.timers.register(_push_undo, first_interval=SLICE_INTERVAL_S)
             case states.Redraw():
-                _redraw()
+                redraw()
 
 
 def _read_curve(folder: Path) -> Curve | None:
@@ -297,13 +297,13 @@ def _start_timer() -> None:
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
-def _redraw() -> None:
+def redraw() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES"):
                 for region in area.regions:
                     if area.type == "PREFERENCES" or region.type == "UI":
-                        region.tag_redraw()
+                        region.tagredraw()
 
 
 @persistent
