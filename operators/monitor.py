@@ -21,7 +21,7 @@ from ..stga_addon.jobs import monitor_state as states
 from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
 from ..stga_addon.jobs.training_job import PREVIEW, job_folder
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.curve import curve_picture
+from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.scene.display.splat_object import (
     SplatAttributes,
     avatar_attributes,
@@ -218,7 +218,7 @@ def _carry_out(scene: Any, effects: Iterable[states.Effect]) -> None:
 
 def _read_curve(folder: Path) -> Curve | None:
     try:
-        return curve_picture(read_metrics(folder))
+        return curve_image(read_metrics(folder))
     except (StgaError, KeyError, TypeError, ValueError):
         return None  # training reports a damaged file
 
