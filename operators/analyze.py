@@ -161,9 +161,10 @@ def _show(scene: Any, analysis: _Analysis) -> None:
 
 
 def _fill(chosen: Any, found: dict[str, Any]) -> None:
-    chosen.effects.clear()
+    decisions = found["plan"]
     chosen.preset_timing = json.dumps({row["preset"]: row["seconds"] for row in found.get("presets", ())})
-    for decision in found["plan"]:
+    chosen.effects.clear()
+    for decision in decisions:
         row = chosen.effects.add()
         row.name = decision["effect"]
         for name in ("choice", "on", "reason", "cost"):

@@ -11,7 +11,7 @@ from ..stga_addon.flame.sequence import ALIASES, FRAME_FIELDS
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
 from .apply_motion import ApplyMotion
-from .common import file_path, reporting
+from .common import file_path, is_head, reporting, scene_settings
 
 MOTION_FIELDS = {*FRAME_FIELDS, *ALIASES, "pose"}
 
@@ -33,8 +33,9 @@ class OpenNpz(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         path = file_path(self.filepath, "avatar or motion")
-        kind = npz_kind(path)
-        if kind == "avatar":
+        if npz_kind(path) == "avatar":
+            if not is_head(scene_settings(context).head):
+                raise StgaError(f"{path}: is an avatar, which needs a head; import a capture first")
             operator = bpy.ops.stga.show_avatar
         else:
             operator = bpy.ops.stga.apply_motion if ApplyMotion.poll(context) else bpy.ops.stga.import_motion
@@ -51,7 +52,9 @@ def npz_kind(path: Path) -> str:
         with zipfile.ZipFile(path) as archive:
             names = {name.removesuffix(".npy") for name in archive.namelist()}
     except (OSError, zipfile.BadZipFile) as error:
-        raise StgaError(f"{path}: cannot be read as an .npz file ({getattr(error, 'strerror', None) or error})") from error
+        raise StgaError(
+            f"{path}: cannot be read as an .npz file ({getattr(error, 'strerror', None) or error})"
+        ) from error
     if {"header", "xyz"} <= names:
         return "avatar"
     if names & MOTION_FIELDS:

@@ -168,7 +168,7 @@ class CancelRuntime(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         folder = runtime.task_folder(runtime_folder())
         task.ask_to_stop(folder)
-        monitor.follow(folder)
+        monitor.monitor_worker(folder)
         return {"FINISHED"}
 
 
@@ -180,7 +180,7 @@ def _run(operator: Any, folder: Path, arguments: list[str]) -> set[str]:
     here = runtime.task_folder(folder)
     task.prepare(here)
     process = task.start(here, sys.executable, arguments)
-    monitor.started(here, process)
+    monitor.monitor_worker(here, process)
     if bpy.app.background:
         _wait(operator, here, process)
     return {"FINISHED"}

@@ -20,8 +20,8 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs import monitor_state as states
 from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
 from ..stga_addon.jobs.training_job import PREVIEW, job_folder
-from ..stga_addon.scene import tags
 from ..stga_addon.report.curve_image import curve_image
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.splat_object import (
     SplatAttributes,
     avatar_attributes,
@@ -303,7 +303,7 @@ def redraw() -> None:
             if area.type in ("VIEW_3D", "PREFERENCES"):
                 for region in area.regions:
                     if area.type == "PREFERENCES" or region.type == "UI":
-                        region.tagredraw()
+                        region.tag_redraw()
 
 
 @persistent

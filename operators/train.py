@@ -27,7 +27,7 @@ from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import failure_report, inspect_worker, remove_status_folder, request_cancel
 from . import ids, monitor
-from .common import file_path, head_of, needs_head, reporting, scene_settings
+from .common import file_path, head_of, needs_head, reporting
 from .environment import training_python
 
 
@@ -83,12 +83,15 @@ class Train(bpy.types.Operator):
     )
     minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
     iterations: bpy.props.IntProperty(
-        name="Iterations", description="Number of iterations, instead of a time; 0: train for Minutes", min=0
+        name="Iterations",
+        description="Number of iterations, instead of a time; 0: train for Minutes",
+        min=0,
+        options={"SKIP_SAVE"},
     )
     strategy: strategy_property()
     preset: preset_property()
     device: device_property()
-    seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0)
+    seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
         description="NAME=on or NAME=off, separated by spaces, for effects that the capture should not decide",

@@ -64,9 +64,9 @@ def _draw_choices(layout: Any, context: Any) -> None:
 def _draw_progress(layout: Any, context: Any, training: MonitorState) -> None:
     state, status = training.snapshot.state, training.snapshot.status
     text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(state, status.message)
-    layout.progress(factor=status.share, text=f"{100 * status.share:.0f} %  {text}")
+    layout.progress(factor=status.progress, text=f"{100 * status.progress:.0f} %  {text}")
     column = layout.column(align=True)
-    for line in (*describe_figures(status.figures), status.remark):
+    for line in (*describe_figures(status.figures), status.detail):
         draw_text(column, context, line)
     draw_curve(layout, training.folder)
     layout.prop(scene_settings(context), "live_preview")
@@ -83,7 +83,7 @@ def _draw_end(layout: Any, context: Any, training: MonitorState) -> None:
         draw_failure(box, context, f"{folder}: does not exist; choose its new folder and press Resume", (), None)
     elif state.failed:
         row.label(text="Training failed", icon="ERROR")
-        draw_failure(box, context, status.error, training.snapshot.tail, job_folder(folder))
+        draw_failure(box, context, status.error, training.snapshot.log_tail, job_folder(folder))
     else:
         done = {WorkerState.FINISHED: "Trained", WorkerState.CANCELLED: "Cancelled, avatar kept"}[state]
         row.label(text=done, icon="CHECKMARK")

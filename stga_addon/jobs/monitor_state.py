@@ -232,8 +232,6 @@ def _status_read(state: MonitorState, event: StatusRead) -> Outcome:
 
 def _loading_ended(state: MonitorState, error: str, effects: tuple[Effect, ...]) -> Outcome:
     was_result = state.loading is not None and state.loading.name == AVATAR
-    state = replace(
-        state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result
-    )
+    state = replace(state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result)
     stored = (StoreTraining(state.run, True),) if was_result else ()
     return state, (*stored, *effects, Redraw())
