@@ -224,7 +224,7 @@ def _read_curve(folder: Path) -> Curve | None:
 
 
 def _show_loaded(scene: Any) -> MonitorState:
-    """Show the avatar file that was loaded for the scene once it is read: in the object that shows this run already, or in a new one."""
+    """Show the avatar that was loaded for the scene, in the object that shows this run or in a new one."""
     chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == str(run)), None)
     if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):

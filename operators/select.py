@@ -149,7 +149,7 @@ class HeatMap(bpy.types.Operator):
 
 
 def possible_regions(head: Any) -> list[str]:
-    """Names of what can be selected as a whole: regions of the capture, and vertex groups for neither selection nor rig."""
+    """What can be selected as a whole: regions of the capture, and vertex groups of neither selection nor rig."""
     names = [name for name in head.data.attributes.keys() if name.startswith(tags.REGION_PREFIX)]  # noqa: SIM118
     rigs = [modifier.object for modifier in head.modifiers if modifier.type == "ARMATURE" and modifier.object]
     bones = {bone.name for rig in rigs for bone in rig.data.bones}

@@ -1,6 +1,6 @@
 """State of the training that a Blender scene shows, and its transitions, without Blender."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..worker.status import WorkerSnapshot, WorkerState
@@ -42,8 +42,8 @@ class MonitorState:
 
     run: Path | None = None
     folder: Path | None = None
-    snapshot: WorkerSnapshot = WorkerSnapshot()
-    files: RunFiles = RunFiles()
+    snapshot: WorkerSnapshot = field(default_factory=WorkerSnapshot)
+    files: RunFiles = field(default_factory=RunFiles)
     result_shown: bool = False
     shown_preview: Stamp | None = None
     loading: Path | None = None
@@ -98,7 +98,7 @@ class StatusRead:
 
     folder: Path
     snapshot: WorkerSnapshot
-    files: RunFiles = RunFiles()
+    files: RunFiles = field(default_factory=RunFiles)
     live_preview: bool = True
     show_result: bool = True
 
