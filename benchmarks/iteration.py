@@ -194,7 +194,7 @@ def queued_ms(step: Backend, batch: Batch, repeats: int) -> float:
         warp.synchronize()
         begin = perf_counter()
         for _ in range(count):
-            step.train(batch)
+            step.step(batch)
         warp.synchronize()
     return 1e3 * (perf_counter() - begin) / repeats
 
@@ -205,7 +205,7 @@ def kernel_times(step: Backend, batch: Batch, repeats: int) -> dict[str, float]:
 
     warp.timing_begin(cuda_filter=warp.TIMING_ALL, synchronize=True)
     for _ in range(repeats):
-        step.train(batch)
+        step.step(batch)
     total: dict[str, float] = {}
     for result in warp.timing_end(synchronize=True):
         total[result.name] = total.get(result.name, 0.0) + result.elapsed / repeats
@@ -233,7 +233,7 @@ def main() -> None:
 
     def measure(batch: Batch) -> float:
         if device == "cpu":
-            return median_ms(lambda: step.train(batch), options.repeats)
+            return median_ms(lambda: step.step(batch), options.repeats)
         return queued_ms(step, batch, options.repeats)
 
     whole = measure(batch)

@@ -47,7 +47,7 @@ def measure(x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, sha
     arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
     frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
     pairs = len(render_forward(arrays, head.face, frames, 3).pair_splat)
-    return Point(x, median_ms(lambda: step.train(batch), repeats), pairs)
+    return Point(x, median_ms(lambda: step.step(batch), repeats), pairs)
 
 
 def on_threads(count: int, repeats: int) -> Point:

@@ -9,7 +9,7 @@ from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
-from .environment import CancelRuntime, MakeRuntime, TestRuntime
+from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
@@ -34,9 +34,9 @@ CLASSES = (
     CancelTraining,
     DismissTraining,
     CopyReport,
-    MakeRuntime,
-    TestRuntime,
-    CancelRuntime,
+    MakeEnvironment,
+    TestEnvironment,
+    CancelEnvironment,
     ShowAvatar,
     StandardView,
     MoreBounces,

@@ -9,11 +9,9 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.training_job import (
-    JOB,
-    PREVIEW,
-    SELECTION,
     TrainingJob,
     job_folder,
+    remove_job,
     run_training_job,
     worker_arguments,
     write_job,
@@ -25,7 +23,7 @@ from ..stga_addon.training.effect_plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
-from ..stga_addon.worker.status import failure_report, inspect_worker, remove_status_folder, request_cancel
+from ..stga_addon.worker.status import failure_report, inspect_worker, request_cancel
 from . import ids, monitor
 from .common import file_path, head_of, needs_head, reporting
 from .environment import training_python
@@ -198,9 +196,7 @@ class DismissTraining(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = job_folder(_folder(context.scene))
-        if (folder / JOB).is_file():  # the path is stored in the .blend file: nothing but a job's files is removed
-            remove_status_folder(folder, (JOB, SELECTION, PREVIEW))
+        remove_job(_folder(context.scene))
         monitor.dismiss_training(context.scene)
         return {"FINISHED"}
 

@@ -8,7 +8,7 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
 from ..operators.common import is_head, package, scene_settings
-from ..operators.environment import has_runtime
+from ..operators.environment import has_training_python
 from ..stga_addon.format import format_duration
 from ..stga_addon.jobs.monitor_state import MonitorState
 from ..stga_addon.jobs.training_job import job_folder
@@ -56,7 +56,7 @@ def _draw_choices(layout: Any, context: Any) -> None:
         train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, resume
         train.strategy, train.preset, train.device = chosen.strategy, chosen.preset, chosen.device
         train.effects = " ".join(chosen_effects(chosen))
-    if not has_runtime(context):
+    if not has_training_python(context):
         layout.label(text="No training environment yet", icon="INFO")
         layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()
 

@@ -98,7 +98,7 @@ def draw(extension) -> list[str]:
 
 def test_drawing_reads_no_file(extension, trained, monkeypatch):
     """Catches panels that open, stat or list files: on a network drive, each redraw would block Blender."""
-    extension.operators.environment.has_runtime(bpy.context)
+    extension.operators.environment.has_training_python(bpy.context)
 
     def refuse(*arguments, **_):
         raise AssertionError(f"file access while drawing: {arguments}")

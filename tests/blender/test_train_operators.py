@@ -90,11 +90,11 @@ def test_a_worker_trains_the_same(head, tmp_path):
     assert not painted["00000"].any()
 
 
-def test_without_a_runtime_training_says_what_to_do(extension, head, tmp_path, monkeypatch):
-    """Catches a traceback about imports where a sentence should say which Python lacks what."""
+def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
+    """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
     monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)
     monkeypatch.setattr(extension.operators.train, "missing_packages", lambda: ["torch"])
-    expected = r"^Error: training needs a runtime.*Blender's own Python \(.*\) lacks torch, numba, scipy, pillow, "
+    expected = r"^Error: No training environment: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
     assert not (tmp_path / "run").exists()
@@ -260,9 +260,11 @@ def test_a_file_that_was_made_without_the_panel(extension, tmp_path):
 
 
 @pytest.mark.slow
-def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
-    """Catches a runtime that a script cannot make or test, and a network used although Blender is offline."""
-    monkeypatch.setattr(extension.operators.environment, "runtime_folder", lambda create=False: tmp_path / "runtime")
+def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch):
+    """Catches an environment that a script cannot make or test, and a network used although Blender is offline."""
+    monkeypatch.setattr(
+        extension.operators.environment, "environment_folder", lambda create=False: tmp_path / "environment"
+    )
     python = str(tmp_path / "python")
     with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
         bpy.ops.stga.test_environment(python=python)
@@ -272,6 +274,6 @@ def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="is not a folder; expected one of wheel files"):
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "none"))
     (tmp_path / "wheels").mkdir()
-    with pytest.raises(RuntimeError, match=r"installing from the folder of wheels: failed, .*No matching distribution"):
+    with pytest.raises(RuntimeError, match=r"Installing from the folder of wheels failed: .*No matching distribution"):
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
     assert not bpy.ops.stga.cancel_environment.poll()

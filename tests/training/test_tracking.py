@@ -129,7 +129,7 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     No closer than this: splats that change places in depth, and their rims, are steps that no gradient tells of.
     """
     trainer, capture = finished, finished.capture
-    step, tracking = trainer._step, trainer.tracking
+    step, tracking = trainer._backend, trainer.tracking
     assert isinstance(step, CpuBackend)
     assert tracking is not None
     view = next(view for view in capture.views["train"] if view.timestep == 3)
@@ -141,8 +141,8 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     def differentiate(share: float) -> tuple[np.ndarray, float]:
         tracking.tracked = before.copy()
         tracking.tracked[row] += share * away
-        trainer.frames.forget()
-        rows, _, loss = step._differentiate(view, target, WHITE, 0, None)
+        trainer.frames.clear()
+        rows, _, loss = step._backward(view, target, WHITE, 0, None)
         assert loss is not None
         return rows, loss
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ...errors import StgaError
 from ...training.run.folder import Run, read_run, write_run
-from ...worker.process import same_packages
+from ...worker.launch import same_interpreter_environment
 from .worker import QUALITY
 
 SLICE_S = 2.0
@@ -91,7 +91,7 @@ class _Runner:
                 stderr=log,
                 text=True,
                 encoding="utf-8",
-                env=same_packages(os.environ),
+                env=same_interpreter_environment(os.environ),
                 start_new_session=True,
             )
         self._listen()
