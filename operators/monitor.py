@@ -22,14 +22,8 @@ from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, 
 from ..stga_addon.jobs.training_job import PREVIEW, job_folder
 from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.splat_object import (
-    SplatAttributes,
-    avatar_attributes,
-    build_next_node_group,
-    can_update,
-    check_head,
-    update_splats,
-)
+from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
+from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
 from ..stga_addon.training.effect_plan import TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker

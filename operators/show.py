@@ -6,7 +6,8 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.display.hints import TRANSPARENT_BOUNCES, view_transform_hint
-from ..stga_addon.scene.display.splat_object import SplatAttributes, hide_object, show_avatar
+from ..stga_addon.scene.display.splat_attributes import SplatAttributes
+from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
 from .common import FileImport, file_path, head_of, needs_head, reporting, scene_settings
 
