@@ -34,8 +34,7 @@ def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -
     """Make a capture of a synthetic head, import it into Blender, select, train, and show the avatar.
 
     Leaves avatar.npz, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's bpy.
-    Raises StgaError where the folder cannot be written or a splat in Blender is farther than `MAX_POSITION_ERROR_M` from
-    numpy's.
+    Raises StgaError where the folder cannot be written or Blender places a splat elsewhere than numpy does.
     """
     begin = perf_counter()
     folder = out / "capture"
