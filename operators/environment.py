@@ -167,7 +167,7 @@ class CancelEnvironment(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         folder = status_folder(environment_folder())
         request_cancel(folder)
-        monitor.follow(folder)
+        monitor.monitor_worker(folder)
         return {"FINISHED"}
 
 
@@ -187,7 +187,7 @@ def _run(operator: Any, folder: Path, arguments: list[str]) -> set[str]:
     status = status_folder(folder)
     prepare_status_folder(status)
     process = start_worker(status, sys.executable, arguments)
-    monitor.started(status, process)
+    monitor.monitor_worker(status, process)
     if bpy.app.background:
         process.wait()
         final = inspect_worker(status, process)
