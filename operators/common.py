@@ -1,10 +1,11 @@
-"""What every operator needs: errors as sentences, and the way from the scene back to the capture."""
+"""Shared by the operators: error reports, polls, paths, and the capture behind a head."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bpy
+from bpy_extras.io_utils import ImportHelper
 
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
@@ -87,6 +88,20 @@ def needs_rig(operator: Any, context: Any) -> bool:
         operator.poll_message_set(str(error))
         return False
     return True
+
+
+class FileImport(ImportHelper):
+    """Mixin of operators that import a file: asks for it, unless called with one, as when a file is dropped."""
+
+    filepath: bpy.props.StringProperty(
+        name="File", description="File to import", subtype="FILE_PATH", options=PATH_OPTIONS | {"SKIP_SAVE"}
+    )
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        if self.filepath:
+            result: set[str] = self.execute(context)  # type: ignore[attr-defined]
+            return result
+        return super().invoke(context, event)  # type: ignore[no-any-return]
 
 
 def flame_property() -> Any:
