@@ -233,3 +233,20 @@ def test_a_head_that_is_not_there_is_a_sentence(tmp_path):
 def _made(folder: Path) -> Path:
     folder.mkdir(parents=True)
     return folder
+
+
+def test_removed_job_leaves_other_files(tmp_path, capture):
+    """Catches *Dismiss* removing a person's files along a path that a .blend file names."""
+    folder = job_folder(tmp_path / "run")
+    folder.mkdir(parents=True)
+    for name in (STATUS_FILE, LOG_FILE, "notes.txt"):
+        (folder / name).write_text("mine")
+    training_job.remove_job(tmp_path / "run")
+    assert len(list(folder.iterdir())) == 3  # no job
+    write_job(tmp_path / "run", new_job(capture), painted())
+    training_job.remove_job(tmp_path / "run")
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    write_job(tmp_path / "run", new_job(capture), painted())
+    training_job.remove_job(tmp_path / "run")
+    assert not folder.exists()
