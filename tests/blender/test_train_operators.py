@@ -142,6 +142,28 @@ def test_a_living_worker_is_not_disturbed(worker):
     assert not bpy.ops.stga.dismiss_training.poll()
 
 
+def test_dismiss_removes_a_jobs_files_only(worker):
+    """Catches a Dismiss that deletes what a user put into the job's folder."""
+    (worker.folder / "notes.txt").write_text("mine")
+    worker.leave()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
+
+
+def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
+    """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no training wrote."""
+    folder = tmp_path / "documents/job"
+    folder.mkdir(parents=True)
+    names = ["job.json", "preview.npz", "selection.npz", "status.json", "worker.log"]
+    for name in names:
+        (folder / name).write_text("[]")
+    bpy.context.scene.stga.training_run = str(tmp_path / "documents")
+    extension.operators.monitor.tick()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert bpy.context.scene.stga.training_run == ""
+
+
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
     """Catches a new object for each preview, display settings that are lost, and splats whose number may not change."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
