@@ -1,12 +1,14 @@
 """The exception whose message is shown to the user."""
 
+import re
 import reprlib
 
-MAX_MESSAGE_CHARACTERS = 2000
+MAX_MESSAGE_CHARACTERS = 1000
 MAX_VALUE_CHARACTERS = 80
 
 _repr = reprlib.Repr()
 _repr.maxlevel, _repr.maxstring, _repr.maxother = 2, MAX_VALUE_CHARACTERS, MAX_VALUE_CHARACTERS
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class StgaError(Exception):
@@ -17,8 +19,12 @@ class StgaError(Exception):
     """
 
     def __init__(self, message: str) -> None:
-        # A path may hold lone surrogates, which no output stream can encode.
-        super().__init__(_cut(message.encode("utf-8", "backslashreplace").decode("utf-8"), MAX_MESSAGE_CHARACTERS))
+        super().__init__(one_line(message))
+
+
+def one_line(message: str) -> str:
+    """The message in bounded length, with control characters and lone surrogates (of a path, say) as escapes."""
+    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS))
 
 
 def shorten(value: object) -> str:

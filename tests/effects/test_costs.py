@@ -11,9 +11,8 @@ from training.heads import write_head
 from stga_addon.capture.images import read_view
 from stga_addon.effects.plan import plan_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
-from stga_addon.training.optimize import cpu_backend, frames, trainer
+from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
-from stga_addon.training.optimize.trainer import initial_splats
 from stga_addon.training.run import loop
 from stga_addon.training.run.folder import Run, read_checkpoint
 from stga_addon.training.settings import make_settings
@@ -23,8 +22,8 @@ from .test_rules import unlike_cameras
 # What each effect calls, by where the call is made from.
 CALLS = {
     "background": (cpu_backend, "change_background"),
-    "hull-points": (trainer, "hull_points"),
-    "density": (trainer, "control_density"),
+    "hull-points": (initial_splats, "hull_points"),
+    "density": (strategies, "control_density"),
     "selection": (loop, "select_capture"),
     "strain-color": (frames, "strain_basis"),
 }
@@ -122,7 +121,7 @@ def test_no_splats_on_teeth(painted):
     flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
     toothed = replace(capture, faces=faces, neutral=np.concatenate([capture.neutral, rows]), flame=flame)
     for kept in (True, False):
-        splats = initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
+        splats = initial_splats.initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
         on_teeth = (splats.face >= len(capture.faces)).sum()
         assert on_teeth == (6 * TEETH_FACES if kept else 0)
         assert len(splats) - on_teeth == 6 * len(capture.faces)

@@ -140,12 +140,16 @@ class _Loop:
         first = trainer.iteration
         self.clock_began = perf_counter() - (self.lines[-1].get("wall_s", 0.0) if self.lines else 0.0)
         with ViewLoader(
-            order, lambda position: self._size(first + position), (red, green, blue), correct=correct
+            order,
+            lambda position: self._size(first + position),
+            (red, green, blue),
+            correct=correct,
+            mesh=self.capture.mesh if trainer.tracking is None else None,  # refined meshes change with every step
         ) as loader:
             while (share := self._share()) < 1:
                 begin = perf_counter()
-                view, image, mask = next(loader)
-                loss = trainer.step(view, image, share, mask)
+                view, image, mask, mesh = next(loader)
+                loss = trainer.step(view, image, share, mask, mesh)
                 self.elapsed += perf_counter() - begin
                 if loss is not None:
                     self.losses.append(loss)
