@@ -8,11 +8,12 @@ import pytest
 
 from stga_addon.effects import rules
 from stga_addon.effects.evidence import fit_cameras, stable_colors
-from stga_addon.effects.facts import CaptureFacts
+from stga_addon.effects.facts import MAX_TIMESTEPS, CaptureFacts
 from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.samples import MAX_VIEWS, sample_views, take_samples
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 from stga_addon.training.effect_plan import EFFECTS, parse_choices
 from stga_addon.training.settings import TrainingSettings, make_settings
 
@@ -299,3 +300,32 @@ def test_two_cameras_that_are_alike(painted):
     samples = take_samples(painted())
     found = fit_cameras(samples, stable_colors(samples.color.astype(float)))
     assert abs(found.gain * 120 + found.offset - 120).max() < 1.5
+
+
+def test_each_timestep_is_posed_once(painted):
+    """Catches a long capture of which every timestep is posed, or one several times, to decide its effects."""
+    neutral = np.random.default_rng(0).normal(size=(TEMPLATE_VERTICES + TEETH_VERTICES, 3))
+    posed: list[int] = []
+
+    def expression_mesh(timestep, zero_pose):
+        posed.append(timestep)
+        return neutral + 0.01
+
+    flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral))
+    capture = replace(
+        painted(), timesteps=tuple(range(500)), neutral=neutral, expression_mesh=expression_mesh, flame=flame
+    )
+    facts = CaptureFacts(capture, make_settings(iterations=1))
+    assert facts.selected_share == 1
+    assert facts.lip_gap_mm == pytest.approx(0)
+    assert len(posed) == len(set(posed)) == MAX_TIMESTEPS
+    assert {0, 499} <= set(posed)
+
+
+def test_a_sample_without_motion_does_not_forbid_selection(painted):
+    """Catches a choice that is refused because the few timesteps that were posed happen not to move."""
+    capture = painted()
+    still = replace(capture, timesteps=tuple(range(500)), expression_mesh=lambda timestep, zero_pose: capture.neutral)
+    verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
+    assert (verdict.on, verdict.only) == (False, False)
+    assert "any of 64 frames" in verdict.reason
