@@ -8,7 +8,7 @@ from . import analyze, ids, monitor
 from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
-from .environment import CancelRuntime, MakeRuntime, TestRuntime
+from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
@@ -32,9 +32,9 @@ CLASSES = (
     CancelTraining,
     DismissTraining,
     CopyReport,
-    MakeRuntime,
-    TestRuntime,
-    CancelRuntime,
+    MakeEnvironment,
+    TestEnvironment,
+    CancelEnvironment,
     ShowAvatar,
     StandardView,
     MoreBounces,

@@ -1,7 +1,6 @@
 """Which effects the capture calls for: asked of a worker, since looking takes seconds, and packages Blender lacks."""
 
 import json
-import os
 import subprocess
 from typing import Any, ClassVar
 
@@ -9,7 +8,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.worker import process as task
+from ..stga_addon.worker.launch import start_python
 from . import ids
 from .common import head_of, needs_head, reporting, scene_settings
 from .environment import training_python
@@ -36,14 +35,11 @@ class AnalyzeCapture(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        command = [training_python(context), "-m", "stga_addon", *_arguments(head_of(context), scene_settings(context))]
-        try:
-            process = subprocess.Popen(
-                command, env=task.environment(os.environ), stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8",
-            )  # fmt: skip
-        except OSError as error:
-            raise StgaError(f"{command[0]}: cannot be started as a Python interpreter ({error.strerror})") from error
+        arguments = _arguments(head_of(context), scene_settings(context))
+        process = start_python(
+            training_python(context), ["stga_addon", *arguments], stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8",
+        )  # fmt: skip
         if bpy.app.background:
             _show(context.scene, process)
             if scene_settings(context).analysis_error:

@@ -7,7 +7,7 @@ import bpy
 
 from ..stga_addon import __version__
 from ..stga_addon.jobs.training_job import job_folder
-from ..stga_addon.worker import process
+from ..stga_addon.worker.status import failure_report
 from . import ids, monitor
 from .common import file_path, reporting
 
@@ -28,6 +28,6 @@ class CopyReport(bpy.types.Operator):
         run = monitor.run_of(context.scene)
         folder = file_path(self.directory, "folder") if self.directory or run is None else job_folder(run)
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
-        context.window_manager.clipboard = f"{versions}\n{process.account(folder, monitor.snapshot(folder))}"
+        context.window_manager.clipboard = f"{versions}\n{failure_report(folder, monitor.snapshot(folder))}"
         self.report({"INFO"}, "Copied to the clipboard")
         return {"FINISHED"}

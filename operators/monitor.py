@@ -20,8 +20,7 @@ from ..stga_addon.scene.display.splat_object import (
     check_head,
     update_splats,
 )
-from ..stga_addon.worker import process as task
-from ..stga_addon.worker.process import Snapshot, State
+from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, inspect_worker
 from . import ids
 from .common import is_head
 from .show import show
@@ -30,7 +29,7 @@ INTERVAL_S = 0.5
 SLICE_S = 0.02
 """Until what was begun goes on: Blender never stands still for long, and not at all while nothing is to be shown."""
 
-_snapshots: dict[Path, Snapshot] = {}
+_snapshots: dict[Path, WorkerSnapshot] = {}
 _processes: dict[Path, "Popen[bytes]"] = {}
 """The workers that this Blender started; others are known by their folder alone."""
 _jobs: dict[int, str] = {}
@@ -46,15 +45,15 @@ def started(folder: Path, process: "Popen[bytes]") -> None:
 def follow(folder: Path | None = None) -> None:
     """Start the timer, which ends by itself; `folder` is looked after besides the scenes' jobs."""
     if folder is not None:
-        _snapshots[folder] = task.look(folder, _processes.get(folder))
+        _snapshots[folder] = inspect_worker(folder, _processes.get(folder))
     if not bpy.app.background and not bpy.app.timers.is_registered(tick):
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
-def snapshot(folder: Path) -> Snapshot:
+def snapshot(folder: Path) -> WorkerSnapshot:
     """The task as the timer last saw it; without a timer, as it is."""
     if bpy.app.background or folder not in _snapshots:
-        _snapshots[folder] = task.look(folder, _processes.get(folder))
+        _snapshots[folder] = inspect_worker(folder, _processes.get(folder))
     return _snapshots[folder]
 
 
@@ -76,10 +75,10 @@ def run_of(scene: Any) -> Path | None:
     return next((run for run in (began, beside) if job_folder(run).is_dir()), began)
 
 
-def snapshot_of(scene: Any) -> Snapshot:
-    """The scene's job as it is; `State.NONE` where there is none, or its folder is gone."""
+def snapshot_of(scene: Any) -> WorkerSnapshot:
+    """The scene's job as it is; `WorkerState.NONE` where there is none, or its folder is gone."""
     run = run_of(scene)
-    return Snapshot() if run is None else snapshot(job_folder(run))
+    return WorkerSnapshot() if run is None else snapshot(job_folder(run))
 
 
 def set_job(scene: Any, run: Path | None) -> None:
@@ -97,8 +96,8 @@ def tick() -> float | None:
     return min((wait for wait in waits if wait is not None), default=None)
 
 
-def _look(folder: Path) -> Snapshot:
-    before, now = _snapshots.get(folder), task.look(folder, _processes.get(folder))
+def _look(folder: Path) -> WorkerSnapshot:
+    before, now = _snapshots.get(folder), inspect_worker(folder, _processes.get(folder))
     _snapshots[folder] = now
     if now != before:
         _redraw()
@@ -120,7 +119,7 @@ def _follow_job(scene: Any) -> float | None:
     if state.is_alive:
         wait = _show(scene, job_folder(run) / PREVIEW) if chosen.live_preview else None
         return INTERVAL_S if wait is None else wait
-    if state not in (State.FINISHED, State.CANCELLED) or chosen.result_shown:
+    if state not in (WorkerState.FINISHED, WorkerState.CANCELLED) or chosen.result_shown:
         return None
     chosen.avatar = str(run / "avatar.npz")
     wait = _show(scene, run / "avatar.npz") if chosen.show_result else None

@@ -8,14 +8,22 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.training_job import TrainingJob, job_folder, run_training_job, worker_arguments, write_job
+from ..stga_addon.jobs.training_job import (
+    TrainingJob,
+    job_folder,
+    remove_job,
+    run_training_job,
+    worker_arguments,
+    write_job,
+)
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effect_plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
-from ..stga_addon.worker import process as task
-from ..stga_addon.worker.environment import missing_here
+from ..stga_addon.worker.environment import missing_packages
+from ..stga_addon.worker.launch import start_worker
+from ..stga_addon.worker.status import failure_report, inspect_worker, request_cancel
 from . import ids, monitor
 from .common import file_path, head_of, needs_head, reporting, scene_settings
 from .environment import training_python
@@ -75,7 +83,7 @@ class Train(bpy.types.Operator):
     )
     python: bpy.props.StringProperty(
         name="Python",
-        description="The interpreter that trains; empty: the runtime in the add-on's preferences",
+        description="The interpreter that trains; empty: the training environment",
         subtype="FILE_PATH",
     )
     wait: bpy.props.BoolProperty(
@@ -98,14 +106,14 @@ class Train(bpy.types.Operator):
         head = head_of(context)
         run = file_path(self.directory, "run folder").resolve()
         waits = self.wait or bpy.app.background
-        here = waits and not self.python and not missing_here()
+        here = waits and not self.python and not missing_packages()
         python = "" if here else training_python(context, self.python)
         write_job(run, self._job(head), training_selection(head))
         if here:
             monitor.set_job(context.scene, run)
             avatar = _work_here(context, run)
         else:
-            process = task.start(job_folder(run), python, worker_arguments(run))
+            process = start_worker(job_folder(run), python, worker_arguments(run))
             monitor.set_job(context.scene, run)
             monitor.started(job_folder(run), process)
             if not waits:
@@ -146,7 +154,7 @@ class CancelTraining(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         folder = job_folder(monitor.run_of(context.scene))
-        task.ask_to_stop(folder)
+        request_cancel(folder)
         monitor.follow(folder)
         return {"FINISHED"}
 
@@ -171,7 +179,7 @@ class DismissTraining(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         folder = job_folder(monitor.run_of(context.scene))
-        task.forget(folder)
+        remove_job(monitor.run_of(context.scene))
         monitor.forget(folder)
         monitor.set_job(context.scene, None)
         return {"FINISHED"}
@@ -194,8 +202,8 @@ def _work_here(context: Any, run: Path) -> Path:
 def _wait(run: Path, process: "subprocess.Popen[bytes]") -> Path:
     """Wait for the worker. Raises StgaError with its sentence where it failed; the traceback goes to the terminal."""
     process.wait()
-    last = task.look(job_folder(run), process)
+    last = inspect_worker(job_folder(run), process)
     if last.state.failed:
-        print(task.account(job_folder(run), last), file=sys.stderr)
+        print(failure_report(job_folder(run), last), file=sys.stderr)
         raise StgaError(last.status.error)
     return run / "avatar.npz"

@@ -8,13 +8,13 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
 from ..operators.common import package, scene_settings
-from ..operators.environment import has_runtime
+from ..operators.environment import has_training_python
 from ..stga_addon.format import format_duration
 from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effect_plan import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
-from ..stga_addon.worker.process import Snapshot, State
+from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
 from .curve import draw_curve
 from .failure import draw_failure
 from .properties import seconds_of_presets
@@ -53,17 +53,17 @@ def _draw_choices(layout: Any, context: Any) -> None:
         train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, resume
         train.strategy, train.preset = chosen.strategy, chosen.preset
         train.effects = " ".join(chosen_effects(chosen))
-    if not has_runtime(context):
-        layout.label(text="No training runtime yet", icon="INFO")
+    if not has_training_python(context):
+        layout.label(text="No training environment yet", icon="INFO")
         layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()
 
 
-def _draw_progress(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
+def _draw_progress(layout: Any, context: Any, run: Path, now: WorkerSnapshot) -> None:
     status = now.status
-    text = {State.STARTING: "starting", State.CANCELLING: "cancelling"}.get(now.state, status.message)
-    layout.progress(factor=status.share, text=f"{100 * status.share:.0f} %  {text}")
+    text = {WorkerState.STARTING: "starting", WorkerState.CANCELLING: "cancelling"}.get(now.state, status.message)
+    layout.progress(factor=status.progress, text=f"{100 * status.progress:.0f} %  {text}")
     column = layout.column(align=True)
-    for line in (*describe_figures(status.figures), status.remark):
+    for line in (*describe_figures(status.figures), status.detail):
         draw_text(column, context, line)
     draw_curve(layout, run)
     layout.prop(scene_settings(context), "live_preview")
@@ -71,17 +71,17 @@ def _draw_progress(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
     layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
 
 
-def _draw_end(layout: Any, context: Any, run: Path, now: Snapshot) -> None:
+def _draw_end(layout: Any, context: Any, run: Path, now: WorkerSnapshot) -> None:
     box = layout.box()
     row = box.row()
-    if now.state == State.NONE:
+    if now.state == WorkerState.NONE:
         row.label(text="The run is gone", icon="ERROR")
         draw_failure(box, context, f"{run}: is not there; was it moved? Choose its folder and press Resume", (), None)
     elif now.state.failed:
         row.label(text="Training failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.tail, job_folder(run))
+        draw_failure(box, context, now.status.error, now.log_tail, job_folder(run))
     else:
-        done = {State.FINISHED: "Trained", State.CANCELLED: "Cancelled, avatar kept"}[now.state]
+        done = {WorkerState.FINISHED: "Trained", WorkerState.CANCELLED: "Cancelled, avatar kept"}[now.state]
         row.label(text=done, icon="CHECKMARK")
         for line in describe_figures(now.status.figures)[1:]:
             draw_text(box, context, line)

@@ -20,7 +20,8 @@ from ..capture.open import open_capture
 from ..errors import StgaError
 from ..files import read_json, write_json, write_npz
 from ..training.settings import TrainingSettings, from_json, to_json
-from ..worker import process
+from ..worker.launch import prepare_status_folder
+from ..worker.status import StatusWriter, remove_status_folder, status_writer
 
 if TYPE_CHECKING:
     from ..training.run.progress import Progress, Report
@@ -58,7 +59,7 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
         raise StgaError(f"{run}: already holds a run; resume it, or choose another folder")
     if not has_run and job.settings is None:
         raise StgaError(f"{run}: holds no run that could be resumed (run.json is missing)")
-    process.prepare(folder)
+    prepare_status_folder(folder)
     for stale in (SELECTION, PREVIEW):
         (folder / stale).unlink(missing_ok=True)
     if selection is not None:
@@ -94,6 +95,18 @@ def read_job(run: Path) -> TrainingJob:
         raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
 
 
+def remove_job(run: Path) -> None:
+    """Remove the files of the run's job and its status; a folder that holds no job stays as it is.
+
+    Raises StgaError while its worker is running.
+    """
+    try:
+        read_job(run)
+    except StgaError:
+        return
+    remove_status_folder(job_folder(run), (JOB, SELECTION, PREVIEW))
+
+
 def worker_arguments(run: Path) -> list[str]:
     """What a worker's interpreter runs, after `-m`."""
     return ["stga_addon", "job", str(run.resolve())]
@@ -108,8 +121,8 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
     folder = job_folder(run)
     if not (folder / JOB).is_file():  # before anything is written into a folder that is none of ours
         raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
-    with process.telling(folder) as teller:
-        teller.tell(0.0, "Starting")
+    with status_writer(folder) as writer:
+        writer.update(0.0, "Starting")
         from ..effects.plan import with_effect_plan
         from ..training.optimize.device import choose_device
         from ..training.run.folder import Run, read_run, read_selection
@@ -121,25 +134,25 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
         if (folder / SELECTION).exists():
             selection = read_selection(folder, len(capture.faces))
         device, why = choose_device("auto")
-        teller.tell(0.0, why)
+        writer.update(0.0, why)
         if job.settings is None:
             wanted = read_run(run)
         else:
-            teller.tell(0.0, "Analyzing the capture")
+            writer.update(0.0, "Analyzing the capture")
             wanted = with_effect_plan(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
-        report = _Report(teller, also)
+        report = _Report(writer, also)
         return train(capture, run, wanted, selection, job.settings is None, report, device)
 
 
 class _Report:
     """What training calls after every iteration: passes it on, and leaves a preview now and then."""
 
-    def __init__(self, teller: process.Teller, also: "Report | None") -> None:
-        self.teller, self.also = teller, also
+    def __init__(self, writer: StatusWriter, also: "Report | None") -> None:
+        self.writer, self.also = writer, also
         self.previewed = time.monotonic()
 
     def __call__(self, progress: "Progress") -> bool:
-        stop = self.teller.tell(progress.share, progress.message, progress.forecast_text, progress.figures)
+        stop = self.writer.update(progress.share, progress.message, progress.forecast_text, progress.figures)
         if progress.avatar is not None and time.monotonic() - self.previewed > PREVIEW_S:
             self._preview(progress.avatar())
             self.previewed = time.monotonic()
@@ -147,4 +160,4 @@ class _Report:
 
     def _preview(self, avatar: Avatar) -> None:
         with suppress(StgaError):  # training goes on without; where the disk is full, it will say so itself
-            write_avatar(self.teller.folder / PREVIEW, avatar)
+            write_avatar(self.writer.folder / PREVIEW, avatar)

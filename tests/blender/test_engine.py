@@ -49,7 +49,7 @@ def _engine(empty_scene):
 
 
 def no_python() -> str:
-    raise StgaError("no runtime")
+    raise StgaError("no training environment")
 
 
 def camera_at(lens: float = 60.0, **data: object):

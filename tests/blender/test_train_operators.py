@@ -33,8 +33,8 @@ def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's job: the test says what it does."""
     from contextlib import ExitStack
 
-    task, job, watch = (
-        extension.stga_addon.worker.process,
+    status, job, watch = (
+        extension.stga_addon.worker.status,
         extension.stga_addon.jobs.training_job,
         extension.operators.monitor,
     )
@@ -43,10 +43,10 @@ def worker(extension, head, tmp_path):
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
         job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
         watch.set_job(bpy.context.scene, run)
-        teller = stack.enter_context(task.telling(job.job_folder(run)))
-        teller.tell(0.25, "training")
-        teller.run, teller.leave = run, stack.close
-        yield teller
+        writer = stack.enter_context(status.status_writer(job.job_folder(run)))
+        writer.update(0.25, "training")
+        writer.run, writer.leave = run, stack.close
+        yield writer
 
 
 def tick_until(watch, done: Callable[[], bool]) -> None:
@@ -94,11 +94,11 @@ def test_a_worker_trains_the_same(head, tmp_path):
     assert not painted["00000"].any()
 
 
-def test_without_a_runtime_training_says_what_to_do(extension, head, tmp_path, monkeypatch):
-    """Catches a traceback about imports where a sentence should say which Python lacks what."""
+def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
+    """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
     monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)
-    monkeypatch.setattr(extension.operators.train, "missing_here", lambda: ["torch"])
-    expected = r"^Error: training needs a runtime.*Blender's own Python \(.*\) lacks torch, numba, scipy, pillow, "
+    monkeypatch.setattr(extension.operators.train, "missing_packages", lambda: ["torch"])
+    expected = r"^Error: No training environment: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
     assert not (tmp_path / "run").exists()
@@ -136,7 +136,7 @@ def test_a_living_worker_is_not_disturbed(worker):
     assert not bpy.ops.stga.train.poll()
     assert not bpy.ops.stga.dismiss_training.poll()
     assert bpy.ops.stga.cancel_training() == {"FINISHED"}
-    assert worker.tell(0.5, "training")
+    assert worker.update(0.5, "training")
     worker.leave()
     assert not bpy.ops.stga.cancel_training.poll()
     assert bpy.ops.stga.train.poll()
@@ -244,7 +244,7 @@ def test_a_worker_that_died(extension, worker):
     write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
     last = watch.snapshot_of(bpy.context.scene)
     assert last.state.failed
-    assert last.tail == ("Killed",)
+    assert last.log_tail == ("Killed",)
     assert watch.tick() is None
 
 
@@ -264,9 +264,11 @@ def test_a_file_that_was_made_without_the_panel(extension, tmp_path):
 
 
 @pytest.mark.slow
-def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
-    """Catches a runtime that a script cannot make or test, and a network used although Blender is offline."""
-    monkeypatch.setattr(extension.operators.environment, "runtime_folder", lambda create=False: tmp_path / "runtime")
+def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch):
+    """Catches an environment that a script cannot make or test, and a network used although Blender is offline."""
+    monkeypatch.setattr(
+        extension.operators.environment, "environment_folder", lambda create=False: tmp_path / "environment"
+    )
     python = str(tmp_path / "python")
     with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
         bpy.ops.stga.test_environment(python=python)
@@ -276,6 +278,6 @@ def test_runtime_operators_without_a_window(extension, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="is not a folder; expected one of wheel files"):
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "none"))
     (tmp_path / "wheels").mkdir()
-    with pytest.raises(RuntimeError, match=r"installing from the folder of wheels: failed, .*No matching distribution"):
+    with pytest.raises(RuntimeError, match=r"Installing from the folder of wheels failed: .*No matching distribution"):
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
     assert not bpy.ops.stga.cancel_environment.poll()

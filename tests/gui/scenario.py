@@ -23,8 +23,9 @@ seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 watch = sys.modules[f"{extension}.operators.monitor"]
-runtime_folder = sys.modules[f"{extension}.operators.environment"].runtime_folder
-task_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].task_folder
+environment_folder = sys.modules[f"{extension}.operators.environment"].environment_folder
+status_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].status_folder
+lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
 
 
 def timed(name: str, action: Callable[..., Any]) -> Callable[..., Any]:
@@ -67,12 +68,12 @@ def job_folder() -> Path:
 
 def first() -> Iterator[Callable[[], bool]]:
     """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the worker at work."""
-    bpy.context.preferences.addons[extension].preferences.runtime_python = PYTHON
+    bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_environment()
-    runtime = task_folder(runtime_folder())
-    yield lambda: not watch.snapshot(runtime).state.is_alive
-    seen["runtime"] = watch.snapshot(runtime).status.message or watch.snapshot(runtime).status.error
+    environment = status_folder(environment_folder())
+    yield lambda: not watch.snapshot(environment).state.is_alive
+    seen["environment"] = watch.snapshot(environment).status.message or watch.snapshot(environment).status.error
     with in_window():
         bpy.ops.stga.import_capture(directory=CAPTURE)
     yield looks_at_head
@@ -92,7 +93,7 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.ops.stga.train(directory="//run", resume=True)
     yield is_training
     seen["resumed at"] = figures()["iteration"]
-    os.kill(int((job_folder() / "worker.lock").read_text()), signal.SIGKILL)
+    os.kill(lock_owner(job_folder() / "worker.lock"), signal.SIGKILL)
     yield lambda: state() == "lost"
     seen["lost"] = watch.snapshot_of(bpy.context.scene).status.error
     bpy.ops.stga.copy_report()
@@ -116,13 +117,13 @@ def first() -> Iterator[Callable[[], bool]]:
     before = figures()["iteration"]
     yield lambda: figures()["iteration"] > before
     seen["reopened"] = True
-    seen["left"] = int((job_folder() / "worker.lock").read_text())
+    seen["left"] = lock_owner(job_folder() / "worker.lock")
     bpy.ops.wm.save_mainfile()
 
 
 def second() -> Iterator[Callable[[], bool]]:
     """Find the worker that went on while Blender was closed; then a short run that ends by itself."""
-    seen["found"] = int((job_folder() / "worker.lock").read_text())
+    seen["found"] = lock_owner(job_folder() / "worker.lock")
     yield is_training
     bpy.ops.stga.cancel_training()
     yield lambda: state() == "cancelled" and chosen().result_shown

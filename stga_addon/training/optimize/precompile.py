@@ -16,7 +16,7 @@ from ...raster.cpu.layout import PROJECTED
 from ...raster.cpu.optimizer import distance_limit, scale_limit
 from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import Parameters, frames_in_camera, render_backward, render_forward, with_strain_color
-from ...worker.process import same_packages
+from ...worker.launch import same_interpreter_environment
 from . import adam
 from .losses import image_gradient, whole_image
 from .state import TrainState, new_state
@@ -55,7 +55,7 @@ def _second_process() -> "subprocess.Popen[bytes] | None":
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env=same_packages(os.environ),
+            env=same_interpreter_environment(os.environ),
         )
     except OSError:
         return None

@@ -12,7 +12,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
@@ -26,9 +26,9 @@ from ...avatar.file import SH_SIZES
 from ...avatar.splats import MAX_SH_DEGREE
 from ...avatar.strain import STRAINS
 from ...errors import StgaError
-from ...files import partial_name, read_json, read_npz, replacing, write_json, write_npz
-from ...worker.lock import held, owner
-from ..effect_plan import TRACKING, EffectDecision, effect_plan_from_json, effect_plan_to_json
+from ...files import read_json, read_npz, remove_leftovers, replacing, write_json, write_npz
+from ...worker.lock import hold_lock, lock_owner
+from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
 from ..optimize.state import TrainState, state_of, tensors_of
 from ..optimize.tracking import RefinementState
 from ..settings import SCHEDULES, STRATEGIES, TrainingSettings, from_json, to_json
@@ -36,7 +36,6 @@ from .metrics_log import METRICS, read_metrics
 
 FORMAT, VERSION = "stga-run", 1
 REFINEMENT = "tracking/"
-FILES = ("run.json", "selection.npz", "checkpoint.npz", "avatar.npz", TRACKING, METRICS)
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def read_selection(folder: Path, faces: int) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh."""
     path = folder / "selection.npz"
     selection = {}
-    for name, mask in read_npz(path, max_packing=faces // 100 + 16).items():  # an entry of a zip has some 200 bytes
+    for name, mask in read_npz(path, max_compression=faces // 100 + 16).items():  # an entry of a zip has some 200 bytes
         if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
             raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep")
         selection[int(name)] = mask
@@ -278,12 +277,10 @@ def locked(folder: Path) -> Iterator[None]:
     with ExitStack() as lock:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock.enter_context(held(path))
+            lock.enter_context(hold_lock(path))
         except BlockingIOError as error:
-            raise StgaError(f"{folder}: another run is working in this folder (process {owner(path)})") from error
+            raise StgaError(f"{folder}: another run is working in this folder (process {lock_owner(path)})") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
-        for litter in (path for name in FILES for path in folder.glob(partial_name(name, "*"))):
-            with suppress(OSError):
-                litter.unlink()
+        remove_leftovers(folder)
         yield
