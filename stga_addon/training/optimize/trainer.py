@@ -10,7 +10,7 @@ from ...avatar.lattice import lattice_splats
 from ...avatar.splats import Splats
 from ...avatar.strain import STRAINS
 from ...capture.model import Capture, View
-from ..run.folder import Checkpoint
+from ..run.checkpoint import Checkpoint
 from ..schedule import learning_rates, sh_degree, trains_globally
 from ..settings import TrainingSettings
 from .backend import Batch
