@@ -1,9 +1,37 @@
-"""The one exception a person is meant to read."""
+"""The exception whose message is shown to the user."""
+
+import re
+import reprlib
+
+MAX_MESSAGE_CHARACTERS = 1000
+MAX_VALUE_CHARACTERS = 80
+
+_repr = reprlib.Repr()
+_repr.maxlevel, _repr.maxstring, _repr.maxother = 2, MAX_VALUE_CHARACTERS, MAX_VALUE_CHARACTERS
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class StgaError(Exception):
-    """A mistake or a mishap outside the code: bad file, bad option, full disk.
+    """A failure with a cause outside the code: bad file, bad option, full disk.
 
     The message is one sentence that names the file, the field and what was expected. The command line
     prints it and exits with 2; Blender's operators report it; neither shows a traceback.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
+
+
+def one_line(message: str) -> str:
+    """The message in bounded length, with control characters and lone surrogates (of a path, say) as escapes."""
+    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS))
+
+
+def shorten(value: object) -> str:
+    """The value as a message quotes it: its repr, with the middle of a long one left out."""
+    return _cut(_repr.repr(value), MAX_VALUE_CHARACTERS)
+
+
+def _cut(text: str, limit: int) -> str:
+    half = (limit - 1) // 2
+    return text if len(text) <= limit else f"{text[:half]}…{text[-half:]}"

@@ -65,11 +65,19 @@ def read_json(path: Path) -> Any:
     if size > MAX_JSON_BYTES:
         raise StgaError(f"{path}: has {size} bytes, more than the {MAX_JSON_BYTES} allowed")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_bytes())
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, RecursionError) as error:
         raise StgaError(f"{path}: is not valid JSON ({error})") from error
+
+
+def parse_json(data: bytes) -> Any:
+    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds text that nothing can print."""
+    value = json.loads(data.decode("utf-8"))
+    if b"\\u" in data:  # the only way to write a lone surrogate
+        json.dumps(value, ensure_ascii=False).encode("utf-8")
+    return value
 
 
 def write_json(path: Path, value: Any) -> None:

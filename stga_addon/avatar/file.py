@@ -11,7 +11,7 @@ import numpy as np
 
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..errors import StgaError
-from ..files import read_npz, write_npz
+from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_frames
 from .splats import MAX_SH_DEGREE, Splats
 from .strain import STRAINS, StrainBasis, strain_basis
@@ -121,7 +121,7 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if "header" not in arrays or arrays["header"].dtype != np.uint8:
         raise StgaError(f"{path}: is not an avatar file (it has no header)")
     try:
-        header = json.loads(arrays["header"].tobytes())
+        header = parse_json(arrays["header"].tobytes())
     except (ValueError, RecursionError) as error:
         raise StgaError(f"{path}: header is not valid JSON ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:

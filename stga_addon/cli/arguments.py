@@ -1,7 +1,11 @@
 """Arguments that several commands share, and the types of their values."""
 
 import argparse
+import errno
+import math
+import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +13,15 @@ from ..capture.transforms import PRINCIPAL_POINTS
 from ..jobs.delegate import OpenHead
 from ..training.settings import DEVICES
 
+MAX_NAME_BYTES = 255
+"""Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
+
 
 def add_capture(command: argparse.ArgumentParser, head: OpenHead | None) -> None:
     """CAPTURE, --flame and --principal-point; CAPTURE may be left out where a head is open."""
     optional: dict[str, Any] = {} if head is None else {"nargs": "?"}
-    command.add_argument("capture", type=Path, metavar="CAPTURE", help="folder of the capture", **optional)
-    command.add_argument("--flame", type=Path, metavar="FILE", help="FLAME model file (.pkl or .npz)")
+    command.add_argument("capture", type=usable_path, metavar="CAPTURE", help="folder of the capture", **optional)
+    command.add_argument("--flame", type=usable_path, metavar="FILE", help="FLAME model file (.pkl or .npz)")
     add_principal_point(command)
 
 
@@ -27,7 +34,7 @@ def add_principal_point(command: argparse.ArgumentParser) -> None:
 def add_avatar(command: argparse.ArgumentParser, name: str, metavar: str, head: OpenHead | None) -> None:
     """An avatar's file or run folder, which may be left out where the open file shows an avatar."""
     optional: dict[str, Any] = {} if head is None or head.avatar is None else {"nargs": "?", "default": head.avatar}
-    command.add_argument(name, type=Path, metavar=metavar, **optional)
+    command.add_argument(name, type=usable_path, metavar=metavar, **optional)
 
 
 def add_effects(command: argparse.ArgumentParser) -> None:
@@ -49,13 +56,55 @@ def add_device(command: argparse.ArgumentParser) -> None:
     )
 
 
+def usable_path(text: str) -> Path:
+    """Raises argparse.ArgumentTypeError for a name that no file can have: empty, too long or with a NUL."""
+    try:
+        os.lstat(text)
+        too_long = False
+    except OSError as error:
+        too_long = error.errno == errno.ENAMETOOLONG
+    except ValueError as error:  # a NUL, or a character that file names cannot encode
+        raise argparse.ArgumentTypeError(f"'{text}' is not a usable path ({error})") from error
+    # The system looks at names in turn and stops at the first that is missing.
+    if too_long or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(text).parts):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a usable path (too long)")
+    if not text:
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
+
+
+def whole_number(minimum: int) -> Callable[[str], int]:
+    """Type of a whole number from `minimum` up."""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch(r"\d{1,18}", text, re.ASCII) or int(text) < minimum:
+            raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from {minimum} up")
+        return int(text)
+
+    return parse
+
+
+def real_number(text: str) -> float:
+    """A finite number from 0 up. Raises argparse.ArgumentTypeError for anything else."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 up")
+    return value
+
+
 def duration(text: str) -> float:
-    """Seconds in "90", "90s", "10m", "1h30m". Raises argparse.ArgumentTypeError for anything else."""
-    match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    """Seconds in "90", "90s", "10m", "1h30m", more than 0. Raises argparse.ArgumentTypeError for anything else."""
+    match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII)
     if not match or not any(match.groups()):
         raise argparse.ArgumentTypeError(f"'{text}' is not a time such as 90s, 10m or 1h30m")
     hours, minutes, seconds = (float(part or 0) for part in match.groups())
-    return 3600 * hours + 60 * minutes + seconds
+    total = 3600 * hours + 60 * minutes + seconds
+    if not 0 < total < math.inf:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive time")
+    return total
 
 
 def color(text: str) -> tuple[float, float, float]:

@@ -1,12 +1,12 @@
 """Measure PSNR, SSIM and LPIPS of a run's avatar on a split; print them and write them into the run's folder."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import StgaError
 from ..files import write_json
 from ..jobs.delegate import OpenHead
+from .arguments import usable_path
 from .inputs import open_avatar
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ NAME, HELP = "eval", "PSNR, SSIM and LPIPS on held-out views"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
-    parser.add_argument("run_folder", type=Path, metavar="RUN")
+    parser.add_argument("run_folder", type=usable_path, metavar="RUN")
     parser.add_argument("--split", choices=("train", "val", "test"), default="val")
 
 

@@ -2,7 +2,6 @@
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from ..avatar.file import Avatar
 from ..capture.model import Capture
 from ..errors import StgaError
 from ..jobs.delegate import OpenHead
-from .arguments import add_avatar
+from .arguments import add_avatar, usable_path, whole_number
 from .inputs import check_topology, open_avatar
 
 NAME, HELP = "export", "write an avatar in another format"
@@ -20,10 +19,10 @@ NAME, HELP = "export", "write an avatar in another format"
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_avatar(parser, "avatar", "RUN|AVATAR", head)
     parser.add_argument("--format", choices=FORMATS, required=True)
-    parser.add_argument("--capture", type=Path, help="whose frames to bake (default: the run's)")
-    parser.add_argument("--flame", type=Path, help="FLAME model file of that capture")
-    parser.add_argument("--timestep", type=int, help="frame of a single PLY (default: the neutral mesh)")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--capture", type=usable_path, help="whose frames to bake (default: the run's)")
+    parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture")
+    parser.add_argument("--timestep", type=whole_number(0), help="frame of a single PLY (default: the neutral mesh)")
+    parser.add_argument("--out", type=usable_path, required=True)
 
 
 def run(options: Namespace) -> None:

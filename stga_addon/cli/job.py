@@ -2,15 +2,15 @@
 
 import sys
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 
 from ..jobs.delegate import OpenHead
+from .arguments import usable_path
 
 NAME, HELP = "job", "carry out the training job that Blender's panel wrote into a run's folder"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
-    parser.add_argument("run_folder", type=Path, metavar="RUN")
+    parser.add_argument("run_folder", type=usable_path, metavar="RUN")
 
 
 def run(options: Namespace) -> None:

@@ -1,14 +1,18 @@
 """Entry point of the command line: `python -m stga_addon …` and `blender --background … --command stga …`."""
 
 import argparse
+import os
 import sys
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
+from typing import NoReturn
 
 from .. import __version__
-from ..errors import StgaError
-from ..jobs.delegate import OpenHead
+from ..errors import StgaError, one_line
+from ..jobs.delegate import FOLDER, OpenHead, read_head
+from .streams import safe_streams
 
 COMMANDS = (
     ".train",
@@ -25,30 +29,60 @@ COMMANDS = (
 """A module per command: NAME, HELP, add_arguments(parser, head) and run(options)."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Its messages quote the command line, which may be long or hold control characters."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(one_line(message))
+
+
 def main(arguments: list[str] | None = None, head: OpenHead | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 after a mistake that one sentence on stderr explains, 130 after
-    Ctrl-C."""
-    options = _with_head(make_parser(head).parse_args(arguments), head)
+    Ctrl-C.
+
+    `head`: that of the file that Blender has open; by default the one in the folder that STGA_HEAD names.
+    """
+    with safe_streams() as stdout:
+        code = _run(arguments, head)
+        sys.stdout.flush()
+        if stdout is not None and stdout.error is not None and not isinstance(stdout.error, BrokenPipeError):
+            return _fail(f"standard output cannot be written ({stdout.error.strerror})")
+        return code
+
+
+def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
+    command = ""
     try:
+        folder = os.environ.get(FOLDER)
+        if head is None and folder:
+            head = read_head(Path(folder))
+        options = _with_head(make_parser(head).parse_args(arguments), head)
+        command = options.command
         options.run(options)
     except StgaError as error:
-        print(f"stga: {error}", file=sys.stderr)
-        return 2
+        return _fail(str(error))
     except ModuleNotFoundError as error:
         if (error.name or "").startswith(__package__.rpartition(".")[0]):
             raise
-        missing = f"'{options.command}' needs the package '{error.name}', which {sys.executable} lacks"
-        print(f"stga: {missing}", file=sys.stderr)
-        return 2
+        return _fail(f"'{command}' needs the package '{error.name}', which {sys.executable} lacks")
+    except MemoryError:
+        return _fail(f"'{command}' needs more memory than there is")
+    except RecursionError:
+        return _fail(f"'{command}': its input is nested too deeply")
     except KeyboardInterrupt:
-        print("stga: interrupted", file=sys.stderr)
+        _fail("interrupted")
         return 130
     return 0
 
 
+def _fail(message: str) -> int:
+    print(f"stga: {one_line(message)}", file=sys.stderr)
+    return 2
+
+
 def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     """The parser of all commands; what the head of the open file provides may be left out."""
-    top = argparse.ArgumentParser(prog="stga", description="Selective-training Gaussian head avatars.")
+    top = _Parser(prog="stga", description="Selective-training Gaussian head avatars.")
     top.add_argument("--version", action="version", version=__version__)
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in command_modules():

@@ -3,7 +3,7 @@
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..files import replacing
 from ..flame.motion import driven
 from ..flame.sequence import sequence_mesh
 from ..jobs.delegate import OpenHead
-from .arguments import add_avatar, add_principal_point, color
+from .arguments import add_avatar, add_principal_point, color, usable_path
 from .inputs import check_topology, open_avatar
 
 NAME, HELP = "render", "render an avatar, one PNG per camera entry"
@@ -25,16 +25,16 @@ NAME, HELP = "render", "render an avatar, one PNG per camera entry"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_avatar(parser, "source", "RUN|AVATAR|PLY", head)
-    parser.add_argument("--cameras", type=Path, required=True, metavar="TRANSFORMS.json")
-    parser.add_argument("--capture", type=Path, help="whose meshes drive the avatar (default: the run's)")
-    parser.add_argument("--flame", type=Path, help="FLAME model file of that capture, or of the motion")
+    parser.add_argument("--cameras", type=usable_path, required=True, metavar="TRANSFORMS.json")
+    parser.add_argument("--capture", type=usable_path, help="whose meshes drive the avatar (default: the run's)")
+    parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture, or of the motion")
     parser.add_argument(
         "--motion",
-        type=Path,
+        type=usable_path,
         metavar="FILE",
         help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=usable_path, required=True, metavar="DIR")
     parser.add_argument("--background", type=color, default="white", help="white, black or R,G,B in 0…1")
     add_principal_point(parser)
 

@@ -1,12 +1,11 @@
 """Show which triangles each frame selects for training."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 
 from ..files import write_npz
 from ..jobs.delegate import OpenHead
 from ..selection import SelectionOptions, select_capture
-from .arguments import add_capture
+from .arguments import add_capture, real_number, usable_path
 from .inputs import open_named_capture
 
 NAME, HELP = "select", "show which triangles each frame selects for training"
@@ -14,9 +13,9 @@ NAME, HELP = "select", "show which triangles each frame selects for training"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
-    parser.add_argument("--threshold", type=float, default=SelectionOptions.threshold, metavar="METERS")
+    parser.add_argument("--threshold", type=real_number, default=SelectionOptions.threshold, metavar="METERS")
     parser.add_argument("--zero-pose", choices=("head", "all"), default="head")
-    parser.add_argument("--out", type=Path, metavar="NPZ", help="also write timestep -> triangles")
+    parser.add_argument("--out", type=usable_path, metavar="NPZ", help="also write timestep -> triangles")
 
 
 def run(options: Namespace) -> None:

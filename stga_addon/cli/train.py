@@ -1,7 +1,6 @@
 """Train an avatar from a capture, or continue a run."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import Any
 
 from ..capture.model import Capture
@@ -11,7 +10,7 @@ from ..jobs.delegate import OpenHead
 from ..selection import SelectionOptions
 from ..training.effect_plan import parse_choices
 from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, make_settings
-from .arguments import add_capture, add_device, add_effects, duration
+from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number
 from .inputs import open_named_capture
 from .table import print_table
 
@@ -20,10 +19,10 @@ NAME, HELP = "train", "train an avatar from a capture"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder of the run")
+    parser.add_argument("--out", type=usable_path, required=True, metavar="RUN", help="folder of the run")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
-    budget.add_argument("--iterations", type=int, help="number of iterations instead")
+    budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
     parser.add_argument(
         "--strategy",
         choices=STRATEGIES,
@@ -33,15 +32,15 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), help="quality and training time; `stga presets` shows the times"
     )
-    parser.add_argument("--target-psnr", type=float, metavar="DB", help="stop when the held-out views reach it")
+    parser.add_argument("--target-psnr", type=real_number, metavar="DB", help="stop when the held-out views reach it")
     parser.add_argument(
         "--stop-when-flat", action="store_true", default=None, help="stop when more time no longer helps"
     )
-    parser.add_argument("--threshold", type=float, metavar="METERS", help="selection threshold")
+    parser.add_argument("--threshold", type=real_number, metavar="METERS", help="selection threshold")
     add_effects(parser)
     parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
     add_device(parser)
-    parser.add_argument("--seed", type=int, help="fixes every random choice (default 0)")
+    parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
 
 
 def run(options: Namespace) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +19,6 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.ply import read_ply
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import info
-from stga_addon.cli.arguments import color, duration
 from stga_addon.cli.main import main, make_parser
 from stga_addon.errors import StgaError
 from stga_addon.training.run.folder import read_checkpoint, read_run
@@ -360,31 +360,41 @@ def test_frames_that_the_capture_has_not(
     assert "has no mesh for timestep 2" in message
 
 
-def test_budgets_that_are_none(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches nonsense that trains nothing or for ever; what is no number at all the parser refuses."""
-    out = tmp_path / "run"
-    for budget in (["--iterations", 0], ["--iterations", -3], ["--budget", "0s"]):
-        assert "more than nothing" in refused(capsys, "train", root, "--out", out, *budget)
-    for budget in (["--iterations", "many"], ["--budget", "soon"], ["--budget", "-5"], ["--budget=-5"]):
-        with pytest.raises(SystemExit, match="2"):
-            main(["train", str(root), "--out", str(out), *budget])
-    with pytest.raises(SystemExit, match="2"):
-        main(["train", str(root), "--out", str(out), "--budget", "5m", "--iterations", "5"])
-    assert not out.exists()
+NONSENSE_OPTIONS = [
+    *(("--iterations", value) for value in ("0", "-3", "many", "1.5", "1e3", "9" * 5000)),
+    *(("--budget", value) for value in ("0s", "soon", "-5", "9" * 400)),
+    *(("--seed", value) for value in ("-1", "nan", "9" * 30)),
+    *(("--threshold", value) for value in ("nan", "inf", "-1", "1mm")),
+    *(("--target-psnr", value) for value in ("nan", "inf", "-1")),
+    *(("--out", value) for value in ("", "a" * 300, "no/" + "a" * 300, "a\0b", "\ud800")),
+]
 
 
-@pytest.mark.parametrize("option", [("--seed", "-1"), ("--threshold", "nan"), ("--threshold", "-1")])
-def test_numbers_that_make_no_sense(
+@pytest.mark.parametrize("option", NONSENSE_OPTIONS, ids=lambda option: f"{option[0]}={ascii(option[1])[:20]}")
+def test_option_values_without_meaning(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[str, str]
 ) -> None:
-    """Catches a traceback from deep inside, or a run that silently selects nothing or everything."""
-    try:
-        code = main(["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2", *option])
-    except SystemExit as error:  # the parser's way
-        code = error.code
-    assert code == 2
-    assert option[0].strip("-") in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
+    """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, and a long sentence."""
+    name, value = option
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", str(root), "--out", str(tmp_path / "run"), f"{name}={value}"])
+    error = capsys.readouterr().err
+    assert f"argument {name}: " in error
+    assert len(error) < 3000
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_budgets_exclude_each_other(root: Path, tmp_path: Path) -> None:
+    """Catches one of two budgets being ignored."""
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", str(root), "--out", str(tmp_path / "run"), "--budget", "5m", "--iterations", "5"])
+
+
+@pytest.mark.parametrize("threshold", ["nan", "-1", "inf"])
+def test_select_refuses_thresholds_that_are_no_distance(root: Path, threshold: str) -> None:
+    """Catches a selection of nothing or everything without a word."""
+    with pytest.raises(SystemExit, match="2"):
+        main(["select", str(root), f"--threshold={threshold}"])
 
 
 def test_an_image_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -422,40 +432,7 @@ def test_splits_that_are_not_there(
     assert "has no views in the split 'test'" in refused(capsys, "eval", moved, "--split", "test")
 
 
-# The parser
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1h", 3600), ("1.5m", 90), ("1m30", 90), (" 2m ", 120)],
-)
-def test_durations(text: str, seconds: float) -> None:
-    """Catches minutes taken for seconds."""
-    assert duration(text) == seconds
-
-
-@pytest.mark.parametrize("text", ["", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m"])
-def test_durations_that_are_none(text: str) -> None:
-    """Catches a budget that means something else than what was typed."""
-    with pytest.raises(argparse.ArgumentTypeError, match="is not a time such as"):
-        duration(text)
-
-
-def test_colors() -> None:
-    """Catches channels in another order or range."""
-    assert color("white") == (1, 1, 1)
-    assert color("black") == (0, 0, 0)
-    assert color("0.25,1,0") == (0.25, 1, 0)
-    assert color("0, .5 ,1.0") == (0, 0.5, 1)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "-1,0,0", "nan,0,0", "0,0,inf", "a,b,c"]
-)
-def test_colors_that_are_none(text: str) -> None:
-    """Catches 0…255 taken for 0…1, and values that would wrap around in the image."""
-    with pytest.raises(argparse.ArgumentTypeError, match="is not white, black or R,G,B"):
-        color(text)
+# The entry point
 
 
 def test_every_command_is_there() -> None:
@@ -480,6 +457,12 @@ def test_interruption_and_mistakes_have_their_codes(
     assert main(["info", str(root)]) == 130
     fails_with(StgaError("the sentence"))
     assert refused(capsys, "info", root) == "stga: the sentence"
+    fails_with(StgaError("long " * 100_000 + "\n\ud800"))
+    assert len(refused(capsys, "info", root)) < 1100
+    fails_with(MemoryError())
+    assert refused(capsys, "info", root) == "stga: 'info' needs more memory than there is"
+    fails_with(RecursionError())
+    assert "nested too deeply" in refused(capsys, "info", root)
     fails_with(RuntimeError("a bug"))
     with pytest.raises(RuntimeError, match="a bug"):
         main(["info", str(root)])
@@ -519,3 +502,17 @@ def test_training_as_a_module(root: Path, tmp_path: Path) -> None:
     assert "100%" in done.stderr
     assert "PSNR" in done.stderr
     assert len(read_avatar(out / "avatar.npz").splats) == 320
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])
+def test_damaged_folder_of_the_open_head(tmp_path: Path, content: str | None) -> None:
+    """Catches a traceback for a folder in STGA_HEAD that is damaged, empty or missing."""
+    if content is not None:
+        (tmp_path / "head.json").write_text(content)
+    command = [sys.executable, "-m", "stga_addon", "select"]
+    environment = {**os.environ, "STGA_HEAD": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 2
+    assert done.stderr.startswith("stga: ")
+    assert "head.json" in done.stderr
+    assert "Traceback" not in done.stderr

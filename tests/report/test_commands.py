@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from capture import factory
 
 from stga_addon.cli.main import main
 from stga_addon.report import preset_timing
@@ -59,29 +58,3 @@ def test_a_preset_is_trained_for_its_time(
     assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)
     assert main([*train, str(tmp_path / "counted"), "--resume", "--preset", "draft"]) == 2
     assert "--preset: this run began with final" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--only", "fast"], "--only: 'fast' is not one of draft, standard"),
-        (["--only", "draft", "--knobs"], "--only: 'draft' is not one of standard, scale-0.5"),
-        (["--seeds", "0"], "--seeds: 0 is not a number of runs"),
-        (["--budget", "0s"], "the budget must be more than nothing"),
-    ],
-)
-def test_impossible_benchmarks(
-    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    """Catches a mistake found only after the first hour."""
-    assert main(["benchmark", str(toy_root), "--out", str(tmp_path / "out"), *arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_benchmark_needs_held_out_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches an hour of training of which nothing can be said."""
-    root = factory.write_mesh_capture(tmp_path / "one", (0,), range(2))
-    (root / "transforms_val.json").unlink()
-    assert main(["benchmark", str(root), "--out", str(tmp_path / "out")]) == 2
-    assert "has no views to" in capsys.readouterr().err

@@ -146,8 +146,8 @@ def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest
     settings = settings_of()
     batches = [batch_of(toy, settings, timestep, selected=s) for timestep, s in ((1, None), (3, toy.regions["mouth"]))]
     results = []
-    for capacity in (warp_render.FIRST_CAPACITY, 10):
-        monkeypatch.setattr(warp_render, "FIRST_CAPACITY", capacity)
+    for capacity in (warp_render.INITIAL_PAIR_CAPACITY, 10):
+        monkeypatch.setattr(warp_render, "INITIAL_PAIR_CAPACITY", capacity)
         _, step = pair(toy, settings)
         for batch in (*batches, *batches):
             step.train(batch)

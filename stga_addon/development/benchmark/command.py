@@ -4,7 +4,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from ...cli.arguments import add_capture, duration
+from ...cli.arguments import add_capture, duration, usable_path, whole_number
 from ...cli.inputs import open_named_capture
 from ...errors import StgaError
 from ...jobs.delegate import OpenHead
@@ -17,11 +17,11 @@ NAME, HELP = "benchmark", "compare accuracy and training time of strategies and 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
     parser.add_argument("--budget", type=duration, default=180.0, metavar="TIME", help="of each run (default 3m)")
-    parser.add_argument("--seeds", type=int, default=3, help="runs of each variant (default 3)")
+    parser.add_argument("--seeds", type=whole_number(1), default=3, help="runs of each variant (default 3)")
     parser.add_argument("--knobs", action="store_true", help="compare single settings instead")
     parser.add_argument("--only", nargs="+", metavar="VARIANT", help="some of the variants")
     parser.add_argument(
-        "--out", type=Path, default=Path("out/benchmark"), metavar="DIR", help="keeps the runs, to be continued"
+        "--out", type=usable_path, default=Path("out/benchmark"), metavar="DIR", help="keeps the runs, to be continued"
     )
 
 
@@ -30,8 +30,6 @@ def run(options: Namespace) -> None:
     from .benchmark import run_benchmark
 
     variants = chosen(KNOBS if options.knobs else MAIN, options.only)
-    if options.seeds < 1:
-        raise StgaError(f"--seeds: {options.seeds} is not a number of runs")
     settings = make_settings(seconds=options.budget)
     capture = open_named_capture(options)
     for split, purpose in (("train", "train on"), ("val", "measure with")):

@@ -1,0 +1,68 @@
+"""Standard streams that never raise: closed ones, closed pipes, full devices and ASCII-only encodings."""
+
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+class Output(io.FileIO):
+    """A descriptor whose first write error is kept in `error` instead of raised; what follows is dropped.
+
+    So a training whose terminal or pipe goes away still finishes.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            if self.error is None:
+                return super().write(data)
+        except OSError as error:
+            self.error = error
+        return len(data)
+
+
+@contextmanager
+def safe_streams() -> Iterator[Output | None]:
+    """Let stdout and stderr of the process be written without errors; yields the one behind stdout.
+
+    Characters that the encoding lacks are written as escapes. Streams that were replaced already (by tests, by
+    Blender's console) are left alone, and None is yielded. What the process was started with comes back at the end.
+    """
+    _reserve_descriptors()
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _safe(sys.stdout, sys.__stdout__), _safe(sys.stderr, sys.__stderr__)
+    replaced = sys.stdout is not before[0]
+    try:
+        yield sys.stdout.buffer.raw if replaced else None
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def _reserve_descriptors() -> None:
+    """Open closed descriptors 0 to 2 on the null device, so that no file of ours gets one and is written by C code."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gives the lowest free one
+
+
+def _safe(stream: Any, original: Any) -> Any:
+    if stream is None:  # Python found the descriptor closed
+        return io.TextIOWrapper(io.BufferedWriter(Output(os.devnull, "w")), encoding="utf-8")
+    if stream is not original or not isinstance(stream, io.TextIOWrapper):
+        return stream
+    stream.flush()
+    return io.TextIOWrapper(
+        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)),
+        encoding=stream.encoding,
+        errors="backslashreplace",
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )

@@ -1,0 +1,88 @@
+"""Standard streams of the command line: closed pipes, full devices, ASCII, closed descriptors, interruption."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from capture import factory
+
+STGA = f'"{sys.executable}" -m stga_addon'
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return factory.write_mesh_capture(tmp_path_factory.mktemp("streams") / "ball")
+
+
+def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a bash command line in which `stga` is the command line and PIPESTATUS[0] is its exit code."""
+    script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
+    return subprocess.run(
+        ["bash", "-c", script], capture_output=True, text=True, cwd=ROOT, env={**os.environ, **environment}, timeout=120
+    )
+
+
+@pytest.mark.parametrize("command", ["info", "select", "presets --help"])
+def test_closed_pipe(capture: Path, command: str) -> None:
+    """Catches a traceback, or "Exception ignored", where the reader of a pipe has gone."""
+    done = shell(f"stga {command} {capture} | head -c0")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
+def test_full_device(capture: Path) -> None:
+    """Catches a traceback, and success although nothing could be printed."""
+    done = shell(f"stga info {capture} > /dev/full")
+    assert done.returncode == 2
+    assert done.stderr == "stga: standard output cannot be written (No space left on device)\n"
+    assert shell(f"stga info {capture} 2> /dev/full").returncode == 0
+    assert shell("stga info /none 2> /dev/full").returncode == 2
+
+
+@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}])
+def test_ascii_streams(tmp_path: Path, environment: dict[str, str]) -> None:
+    """Catches a UnicodeEncodeError for a folder's name, in what is printed and in the error sentence."""
+    capture = factory.write_mesh_capture(tmp_path / "Käthe−²")
+    done = shell(f"stga info {capture}", PYTHONUTF8="0", **environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "320 triangles" in done.stdout
+    done = shell(f"stga info {capture / 'none'}", PYTHONUTF8="0", **environment)
+    assert done.returncode == 2
+    assert done.stderr.startswith("stga: ")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_descriptors(capture: Path, tmp_path: Path, closed: str) -> None:
+    """Catches a progress bar that cannot do without stderr, and files that get the descriptor of a closed stream."""
+    out = tmp_path / "run"
+    training = f"train {capture} --out {out} --iterations 2 --strategy gaussian-avatars"
+    done = shell(f"stga {training} {closed}")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    assert (out / "avatar.npz").exists()
+    cameras = capture / "transforms_val.json"
+    done = shell(f"stga render {out} --cameras {cameras} --out {tmp_path / 'pictures'} {closed}")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    assert list((tmp_path / "pictures").glob("*.png"))
+    assert shell(f"stga info /none {closed}").returncode == 2
+
+
+def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path) -> None:
+    """Catches a traceback, another exit code than 130 and a lost checkpoint after Ctrl-C."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out), "--budget", "60s"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    end = time.monotonic() + 60
+    while not (out / "run.json").exists() and time.monotonic() < end:
+        time.sleep(0.1)
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, error
+    assert error.splitlines()[-1] == "stga: interrupted"
+    assert "Traceback" not in error

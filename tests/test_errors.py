@@ -1,0 +1,23 @@
+"""Messages that can be printed, of a length that can be read."""
+
+from stga_addon.errors import MAX_MESSAGE_CHARACTERS, MAX_VALUE_CHARACTERS, StgaError, shorten
+
+
+def test_message_is_printable():
+    """Catches a message that no terminal or log file can encode, because a path in it holds a lone surrogate."""
+    assert str(StgaError("a\ud800b: does not exist")) == "a\\ud800b: does not exist"
+
+
+def test_message_length_is_bounded():
+    """Catches a message of megabytes, and one whose beginning or end is lost with the middle."""
+    message = str(StgaError("capture: " + "x" * 1_000_000 + " is too long"))
+    assert len(message) <= MAX_MESSAGE_CHARACTERS
+    assert message.startswith("capture: x")
+    assert message.endswith("is too long")
+
+
+def test_quoted_values_are_short():
+    """Catches values of a file that are quoted whole, whatever they are."""
+    assert shorten("left") == "'left'"
+    for value in ("x" * 10**6, ["y" * 10**6] * 100, {"k" * 1000: [1] * 1000}, 10**4000, [[[[1] * 50] * 50] * 50] * 50):
+        assert len(shorten(value)) <= MAX_VALUE_CHARACTERS
