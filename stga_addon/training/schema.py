@@ -107,8 +107,8 @@ def _expected_number(value: Any, kind: type, limits: Mapping[str, Any]) -> str |
         fits = fits or (isinstance(value, int) and abs(value) <= MAX_COUNT)
     if fits and not isinstance(value, bool) and low <= value <= high and value > above:
         return None
-    bounds = [f"above {above:g}"] if above > -math.inf else [f"from {low:g}"] if low > -math.inf else []
-    bounds += [f"up to {high:g}"] if high < math.inf else []
+    bounds = [f"above {above}"] if above > -math.inf else [f"from {low}"] if low > -math.inf else []
+    bounds += [f"up to {high}"] if high < math.inf else []
     return " ".join(["a whole number" if kind is int else "a finite number", *bounds])
 
 

@@ -21,7 +21,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli import info
 from stga_addon.cli.main import main, make_parser
 from stga_addon.errors import StgaError
-from stga_addon.training.run.folder import read_checkpoint, read_run
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import read_run
 
 TIMESTEPS, CAMERAS = (0, 1, 3), range(3)
 

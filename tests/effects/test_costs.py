@@ -15,7 +15,8 @@ from stga_addon.training.optimize import cpu_backend, frames, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.optimize.trainer import initial_splats
 from stga_addon.training.run import loop
-from stga_addon.training.run.folder import Run, read_checkpoint
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
 
 from .test_rules import unlike_cameras

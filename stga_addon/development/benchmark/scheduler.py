@@ -80,7 +80,8 @@ class _Runner:
 
     def start(self) -> None:
         """Start the process and wait until it could train."""
-        write_run(self.job.out, self.job.run)
+        if not (self.job.out / "run.json").exists():
+            write_run(self.job.out, self.job.run)
         package = __package__
         # A process of its own group: an interruption reaches only us, and we let it save.
         with (self.job.out / "log.txt").open("a", encoding="utf-8") as log:

@@ -23,6 +23,7 @@ VERSION = 2
 REFINEMENT, IDENTITY = "tracking/", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
+OTHER_RUN = "belongs to another run than run.json beside it; remove it, or train into another folder"
 
 
 @dataclass
@@ -32,6 +33,7 @@ class Checkpoint:
     elapsed_s  seconds of training so far, evaluation not counted
     best_psnr  of avatar.npz, dB; −inf before the first evaluation
     losses     of the last global iterations
+    identity   digest of the run's identity
     tracking   of refined FLAME parameters; None where they are not refined
     """
 
@@ -45,21 +47,22 @@ class Checkpoint:
     evaluations: int
     losses: list[float]
     tracking: RefinementState | None = None
+    identity: str = ""
 
 
-def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity: str = "") -> None:
-    """Write timestep -> (F,) bool. identity: digest of the run that it belongs to, if any."""
+def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity: str) -> None:
+    """Write timestep -> (F,) bool of the run with this digest of its identity."""
     arrays = {f"{timestep:05d}": faces for timestep, faces in selection.items()}
-    if identity:
-        arrays[IDENTITY] = _packed(identity)
-    write_npz(folder / SELECTION, arrays, compressed=True)
+    write_npz(folder / SELECTION, {**arrays, IDENTITY: _packed(identity)}, compressed=True)
 
 
-def read_selection(folder: Path, faces: int, identity: str = "") -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or is of another run."""
+def read_selection(folder: Path, faces: int, identity: str | None = None) -> dict[int, np.ndarray]:
+    """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or has not this `identity`."""
     path = folder / SELECTION
     arrays = read_npz(path, max_packing=faces // 100 + 16)  # an entry of a zip has some 200 bytes
-    _check_identity(path, arrays.pop(IDENTITY, None), identity)
+    stored = arrays.pop(IDENTITY, None)
+    if identity is not None and (stored is None or stored.tobytes() != identity.encode()):
+        raise StgaError(f"{path}: {OTHER_RUN}")
     selection = {}
     for name, mask in arrays.items():
         if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
@@ -68,25 +71,20 @@ def read_selection(folder: Path, faces: int, identity: str = "") -> dict[int, np
     return selection
 
 
-def write_checkpoint(folder: Path, checkpoint: Checkpoint, identity: str) -> None:
-    """Replace the checkpoint as a whole. identity: digest of the run that it belongs to.
-
-    Gradients are not kept: they are overwritten before they are read.
-    """
+def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
     arrays = {k: t.numpy() for k, t in tensors_of(checkpoint.state).items() if not k.startswith("gradients/")}
     if checkpoint.tracking is not None:
         arrays.update({REFINEMENT + name: array for name, array in vars(checkpoint.tracking).items()})
     values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
     arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
-    arrays[IDENTITY] = _packed(identity)
     write_npz(folder / CHECKPOINT, arrays)
 
 
-def read_checkpoint(folder: Path, identity: str) -> Checkpoint:
-    """Raises StgaError where there is none, or it is damaged or of another run."""
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """Raises StgaError where there is none, or it is damaged."""
     path = folder / CHECKPOINT
     arrays = read_npz(path)
-    _check_identity(path, arrays.pop(IDENTITY, None), identity)
     try:
         meta = _meta(arrays.pop("meta"))
         if meta.pop("version") != VERSION:
@@ -108,11 +106,6 @@ def _packed(text: str) -> np.ndarray:
     return np.frombuffer(text.encode(), np.uint8)
 
 
-def _check_identity(path: Path, stored: np.ndarray | None, identity: str) -> None:
-    if (b"" if stored is None else stored.tobytes()) != identity.encode():
-        raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it or use another folder")
-
-
 def _meta(packed: np.ndarray) -> dict[str, Any]:
     """Everything of a checkpoint that is no array. Raises ValueError for what training cannot continue with."""
     meta = json.loads(packed.tobytes())
@@ -131,6 +124,8 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
         raise ValueError(f"best_psnr is {meta.get('best_psnr')!r:.40}, expected a number of dB")
     if not isinstance(losses, list) or not all(_is_number(loss) for loss in losses):
         raise ValueError("losses is no list of numbers")
+    if not isinstance(meta.get("identity"), str):
+        raise ValueError("identity is no text")
     return meta
 
 

@@ -30,16 +30,8 @@ from ..optimize.tracking import write_tracking
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import to_json
-from .checkpoint import (
-    CHECKPOINT,
-    SELECTION,
-    Checkpoint,
-    read_checkpoint,
-    read_selection,
-    write_checkpoint,
-    write_selection,
-)
-from .folder import Run, locked, read_run, write_run
+from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
+from .folder import CHECKPOINT, SELECTION, Run, locked, read_run, write_run
 from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
 from .open_run import check_identity
 from .progress import Progress, Report
@@ -148,7 +140,9 @@ class _Loop:
     def resume(self) -> None:
         """Continue from the folder's checkpoint."""
         self.report(Progress(message="Reading the checkpoint"))
-        checkpoint = read_checkpoint(self.out, self.digest)
+        checkpoint = read_checkpoint(self.out)
+        if checkpoint.identity != self.digest:
+            raise StgaError(f"{self.out / CHECKPOINT}: {OTHER_RUN}")
         selection = read_selection(self.out, len(self.capture.faces), self.digest)
         self._check(checkpoint.state)
         self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state, self.run.device)
@@ -314,9 +308,9 @@ class _Loop:
         checkpoint = Checkpoint(
             trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
             self.elapsed, self.best, self.evaluations, list(self.losses),
-            None if trainer.tracking is None else trainer.tracking.state,
+            None if trainer.tracking is None else trainer.tracking.state, self.digest,
         )  # fmt: skip
-        write_checkpoint(self.out, checkpoint, self.digest)
+        write_checkpoint(self.out, checkpoint)
 
     def _progress(self, message: str) -> Progress:
         return Progress(
