@@ -23,7 +23,8 @@ lint: .venv/ready
 	$(BIN)/mypy
 
 fuzz: .venv/ready
-	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} $(BIN)/python -m pytest tests/fuzz tests/numerics/test_generated.py
+	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} STGA_FUZZ_CASES=$${STGA_FUZZ_CASES:-5000} \
+		$(BIN)/python -m pytest tests/fuzz tests/numerics/test_generated.py
 
 extension: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --out dist
