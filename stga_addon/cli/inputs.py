@@ -24,18 +24,11 @@ def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | Non
     Raises StgaError where the run's own capture has changed, or a given one has other triangles.
     """
     given, flame = getattr(options, "capture", None), getattr(options, "flame", None)
-    avatar, capture = read_avatar(avatar_path(source)), None
+    capture = None
     if source.is_dir():
-        from ..training.optimize.tracking import with_refined_tracking
-        from ..training.run.folder import read_run
-        from ..training.run.open_run import open_run
-
-        if given is None:
-            capture = open_run(source, flame=flame).capture
-        else:
-            capture = open_capture(given, flame or read_run(source).flame, avatar.principal_point)
-        capture = with_refined_tracking(capture, source)
-    elif given is not None:
+        capture = _run_capture(source, given, flame)
+    avatar = read_avatar(avatar_path(source))
+    if capture is None and given is not None:
         capture = open_capture(given, flame, avatar.principal_point)
         if avatar.settings.get("tracking"):
             print(f"warning: {source}: was trained on refined meshes, which only its run's folder has", file=sys.stderr)
@@ -43,6 +36,18 @@ def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | Non
         return avatar, None
     check_topology(capture, avatar)
     return avatar, capture if options.head is None else options.head.played(capture)
+
+
+def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
+    """The capture of a run, or another one whose meshes are to drive its avatar; with the run's refined tracking."""
+    from ..training.optimize.tracking import with_refined_tracking
+    from ..training.run.folder import read_run
+    from ..training.run.open_run import open_run
+
+    if given is None:
+        return with_refined_tracking(open_run(folder, flame=flame).capture, folder)
+    run = read_run(folder)
+    return with_refined_tracking(open_capture(given, flame or run.flame, run.principal_point), folder)
 
 
 def avatar_path(source: Path) -> Path:

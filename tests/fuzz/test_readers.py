@@ -124,7 +124,8 @@ def seen(path: Path) -> None:
 
 def metrics(path: Path) -> None:
     for n in range(3):
-        metrics_log.append_metrics(path.parent, {"iteration": n, "psnr": 20.5})
+        times = {"seconds": float(n), "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
+        metrics_log.append_metrics(path.parent, {"iteration": n, **times, "psnr": 20.5, "ssim": 0.9})
 
 
 TARGETS = {
@@ -156,7 +157,7 @@ TARGETS = {
     ),
     "selection": Target(
         "selection.npz",
-        lambda path: checkpoints.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}),
+        lambda path: checkpoints.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}, "a"),
         lambda path: checkpoints.read_selection(path.parent, 5),
     ),
     "metrics": Target("metrics.jsonl", metrics, lambda path: metrics_log.read_metrics(path.parent)),

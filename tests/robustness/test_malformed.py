@@ -705,17 +705,18 @@ def test_runs_with_impossible_settings(tmp_path: Path, change: dict[str, Any]) -
     assert "run.json: " in behaves(lambda: run_folder.read_run(tmp_path), tmp_path)
 
 
-METRICS = [b"3\n", b"{}\n", b'{"iteration": "x"}\n', b"\xff\xff\n", b"\0" * 100, b"[" * 100_000, b'{"iteration": null}']
+METRICS = [b"\xff\xff\n", b"\0" * 100, b"[" * 100_000, b'{"iteration": 20, "sec']
+LINE = {"seconds": 1.0, "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
 
 
 @pytest.mark.parametrize("damage", METRICS)
 def test_metrics_after_a_power_cut(tmp_path: Path, damage: bytes) -> None:
     """Catches a run that cannot be resumed because of a line of its log: what was whole before it stays."""
-    metrics_log.append_metrics(tmp_path, {"iteration": 10})
+    metrics_log.append_metrics(tmp_path, {"iteration": 10, **LINE})
     with (tmp_path / "metrics.jsonl").open("ab") as out:
         out.write(damage)
     assert not behaves(lambda: metrics_log.read_metrics(tmp_path), tmp_path)
-    assert metrics_log.read_metrics(tmp_path) == [{"iteration": 10}]
+    assert metrics_log.read_metrics(tmp_path) == [{"iteration": 10, **LINE}]
     metrics_log.cut_metrics(tmp_path, 20)
-    metrics_log.append_metrics(tmp_path, {"iteration": 20})
+    metrics_log.append_metrics(tmp_path, {"iteration": 20, **LINE})
     assert [line["iteration"] for line in metrics_log.read_metrics(tmp_path)] == [10, 20]

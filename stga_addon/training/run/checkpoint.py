@@ -122,7 +122,7 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
         raise ValueError(f"elapsed_s is {meta.get('elapsed_s')!r:.40}, expected seconds from 0 up")
     if not _is_number(meta.get("best_psnr")) or math.isnan(meta["best_psnr"]):
         raise ValueError(f"best_psnr is {meta.get('best_psnr')!r:.40}, expected a number of dB")
-    if not isinstance(losses, list) or not all(_is_number(loss) for loss in losses):
+    if not isinstance(losses, list) or not all(_is_number(loss) and not math.isnan(loss) for loss in losses):
         raise ValueError("losses is no list of numbers")
     if not isinstance(meta.get("identity"), str):
         raise ValueError("identity is no text")
