@@ -1,14 +1,15 @@
-"""What a person can do: one file an action."""
+"""Operators, one module for each step of the panel."""
 
 from typing import Any
 
 import bpy
 
 from . import analyze, ids, monitor
-from .analyze import AnalyzeCapture
+from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
-from .environment import CancelRuntime, MakeRuntime, TestRuntime
+from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
+from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
@@ -28,19 +29,24 @@ CLASSES = (
     CountSelected,
     HeatMap,
     AnalyzeCapture,
+    CancelAnalysis,
     Train,
     CancelTraining,
     DismissTraining,
     CopyReport,
-    MakeRuntime,
-    TestRuntime,
-    CancelRuntime,
+    MakeEnvironment,
+    TestEnvironment,
+    CancelEnvironment,
     ShowAvatar,
     StandardView,
     MoreBounces,
     ApplyMotion,
     ImportPly,
     ExportAvatar,
+    OpenNpz,
+    CaptureDrop,
+    AvatarDrop,
+    PlyDrop,
 )
 
 

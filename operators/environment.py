@@ -1,7 +1,7 @@
-"""The Python that trains: made here, or one that is there already."""
+"""Operators that make, test and cancel the training environment, and the choice of the Python that trains."""
 
-import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -9,68 +9,71 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.worker import environment as runtime
-from ..stga_addon.worker import process as task
+from ..stga_addon.worker.environment import (
+    SIZES_GB,
+    check_arguments,
+    find_training_python,
+    make_arguments,
+    status_folder,
+)
+from ..stga_addon.worker.launch import prepare_status_folder, start_worker
+from ..stga_addon.worker.status import WorkerState, inspect_worker, request_cancel
 from . import ids, monitor
 from .common import file_path, package, preferences, reporting
 
+OFFLINE = "Allow Online Access in Preferences → System → Network first"
+
 
 def training_python(context: Any, given: str = "") -> str:
-    """The interpreter that trains: the one given, the preferences', the one made here, or Blender's own.
+    """The interpreter that trains: the one given, else that of `find_training_python`.
 
     Raises StgaError where none of them can.
     """
-    stored = preferences(context)
-    chosen = given or (stored.runtime_python if stored else "")
-    if chosen:
-        return bpy.path.abspath(chosen)
-    made = runtime.made_python(runtime_folder())
-    if made is not None:
-        return str(made)
-    missing = runtime.missing_here()
-    if missing:
-        own = f"{sys.executable}, {sys.version.split()[0]}"
-        raise StgaError(
-            "training needs a runtime, which the add-on's preferences make or take: "
-            f"Blender's own Python ({own}) lacks {', '.join(missing)}"
-        )
-    return sys.executable
+    return bpy.path.abspath(given) if given else find_training_python(environment_folder(), preferred_python(context))
 
 
-def has_runtime(context: Any) -> bool:
-    """Whether `training_python` has an answer."""
+def has_training_python(context: Any) -> bool:
+    """Whether `training_python` finds one, for panels: looked up when the environment's worker changes its state."""
+    folder = environment_folder()
+    return bool(_lookup(folder, preferred_python(context), monitor.snapshot(status_folder(folder)).state))
+
+
+@lru_cache(maxsize=1)
+def _lookup(folder: Path, preferred: str, state: WorkerState) -> str:
     try:
-        return bool(training_python(context))
+        return find_training_python(folder, preferred)
     except StgaError:
-        return False
+        return ""
 
 
-def runtime_folder(create: bool = False) -> Path:
-    """Where this add-on makes its runtime; a checkout, which is no extension, has it beside the user's scripts."""
+def preferred_python(context: Any) -> str:
+    """The Python in the preferences; "" where none is."""
+    stored = preferences(context)
+    return bpy.path.abspath(stored.training_python) if stored and stored.training_python else ""
+
+
+def environment_folder(create: bool = False) -> Path:
+    """The folder of the training environment; a checkout, which is no extension, has it among Blender's user data."""
     try:
-        return Path(bpy.utils.extension_path_user(package(), path="runtime", create=create))
+        return Path(bpy.utils.extension_path_user(package(), path="environment", create=create))
     except ValueError:
-        return Path(bpy.utils.user_resource("DATAFILES", path="stga_runtime", create=create))
+        return Path(bpy.utils.user_resource("DATAFILES", path="stga_environment", create=create))
 
 
-def needs_quiet(operator: Any) -> bool:
-    """Poll: whether the runtime is not being made or tested."""
-    if monitor.snapshot(runtime.task_folder(runtime_folder())).state.is_alive:
-        operator.poll_message_set("The runtime is being made or tested; wait, or cancel that")
-        return False
-    return True
+def _is_busy() -> bool:
+    return monitor.snapshot(status_folder(environment_folder())).state.is_alive
 
 
-class MakeRuntime(bpy.types.Operator):
+class MakeEnvironment(bpy.types.Operator):
     """Make a Python environment with PyTorch for training, in Blender's folder for user files"""
 
     bl_idname = ids.MAKE_ENVIRONMENT
-    bl_label = "Make Runtime"
+    bl_label = "Make Training Environment"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     device: bpy.props.EnumProperty(
         name="Device",
-        description="What the environment is to train on",
+        description="Device that the environment supports",
         items=(
             ("auto", "Automatic", "An NVIDIA GPU where its driver is found, else the CPU"),
             ("cpu", "CPU", "Smaller; trains on every machine"),
@@ -85,17 +88,17 @@ class MakeRuntime(bpy.types.Operator):
     )
     python: bpy.props.StringProperty(
         name="Python",
-        description="Python 3.11 or newer that the environment is made of; empty: Blender's own",
+        description="Python 3.11 or newer to make the environment from; empty: Blender's own",
         subtype="FILE_PATH",
     )
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_quiet(cls)
+        return needs_idle_environment(cls)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         return context.window_manager.invoke_props_dialog(
-            self, width=480, title="Make Training Runtime", confirm_text="Make"
+            self, width=480, title="Make Training Environment", confirm_text="Make"
         )
 
     def draw(self, context: Any) -> None:
@@ -104,13 +107,12 @@ class MakeRuntime(bpy.types.Operator):
         for name in ("device", "wheels", "python"):
             layout.prop(self, name)
         column = layout.column(align=True)
-        cpu, cuda = runtime.SIZES_GB["cpu"], runtime.SIZES_GB["cuda"]
-        column.label(text=f"Takes about {cpu:.1f} GB for the CPU, {cuda:.1f} GB for CUDA, in")
-        column.label(text=str(runtime_folder()))
+        column.label(text=f"Takes about {SIZES_GB['cpu']:.1f} GB for the CPU, {SIZES_GB['cuda']:.1f} GB for CUDA, in")
+        column.label(text=str(environment_folder()))
         if not self.wheels and sys.platform == "linux":
-            column.label(text=f"Where pytorch.org cannot be reached: {runtime.SIZES_GB['pypi']:.1f} GB")
+            column.label(text=f"Where pytorch.org cannot be reached: {SIZES_GB['pypi']:.1f} GB")
         if not self.wheels:
-            source = "Downloads from pypi.org and pytorch.org" if sys.platform == "linux" else "Downloads from pypi.org"
+            source = "Downloads from PyPI and pytorch.org" if sys.platform == "linux" else "Downloads from PyPI"
             offline = not bpy.app.online_access
             column.label(text=OFFLINE if offline else source, icon="ERROR" if offline else "URL")
 
@@ -121,37 +123,34 @@ class MakeRuntime(bpy.types.Operator):
             raise StgaError(f"{OFFLINE}, or give a folder of wheels")
         if wheels is not None and not wheels.is_dir():
             raise StgaError(f"{wheels}: is not a folder; expected one of wheel files")
-        folder = runtime_folder(create=True)
+        folder = environment_folder(create=True)
         base = bpy.path.abspath(self.python) if self.python else sys.executable
-        return _run(self, folder, runtime.making_arguments(folder, base, self.device, wheels))
+        return _run(self, folder, make_arguments(folder, base, self.device, wheels))
 
 
-OFFLINE = "Allow Online Access in Preferences → System → Network first"
-
-
-class TestRuntime(bpy.types.Operator):
-    """Start the Python that would train, and say which torch, numba and device it finds, or what it lacks"""
+class TestEnvironment(bpy.types.Operator):
+    """Start the Python that trains, and report its versions of torch and numba and its device, or what it lacks"""
 
     bl_idname = ids.TEST_ENVIRONMENT
     bl_label = "Test"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     python: bpy.props.StringProperty(
-        name="Python", description="The interpreter to test; empty: the one that would train", subtype="FILE_PATH"
+        name="Python", description="The interpreter to test; empty: the one that trains", subtype="FILE_PATH"
     )
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_quiet(cls)
+        return needs_idle_environment(cls)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = runtime_folder(create=True)
-        return _run(self, folder, runtime.testing_arguments(folder, training_python(context, self.python)))
+        folder = environment_folder(create=True)
+        return _run(self, folder, check_arguments(folder, training_python(context, self.python)))
 
 
-class CancelRuntime(bpy.types.Operator):
-    """Stop making the runtime, and remove what there is of it"""
+class CancelEnvironment(bpy.types.Operator):
+    """Stop making the training environment, and remove the incomplete one"""
 
     bl_idname = ids.CANCEL_ENVIRONMENT
     bl_label = "Cancel"
@@ -159,36 +158,40 @@ class CancelRuntime(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if monitor.snapshot(runtime.task_folder(runtime_folder())).state.is_alive:
+        if _is_busy():
             return True
-        cls.poll_message_set("No runtime is being made")
+        cls.poll_message_set("No training environment is being made")
         return False
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = runtime.task_folder(runtime_folder())
-        task.ask_to_stop(folder)
-        monitor.follow(folder)
+        folder = status_folder(environment_folder())
+        request_cancel(folder)
+        monitor.monitor_worker(folder)
         return {"FINISHED"}
 
 
+def needs_idle_environment(operator: Any) -> bool:
+    """Poll: whether the training environment is not being made or tested."""
+    if _is_busy():
+        operator.poll_message_set("The training environment is being made or tested; wait, or cancel that")
+        return False
+    return True
+
+
 def _run(operator: Any, folder: Path, arguments: list[str]) -> set[str]:
-    """Start a worker of Blender's own Python for the runtime; without a window, wait for it.
+    """Start a worker of Blender's own Python for the environment; without a window, wait for it.
 
-    Raises StgaError with the worker's sentence where it failed.
+    Raises StgaError with the worker's error where it failed.
     """
-    here = runtime.task_folder(folder)
-    task.prepare(here)
-    process = task.start(here, sys.executable, arguments)
-    monitor.started(here, process)
+    status = status_folder(folder)
+    prepare_status_folder(status)
+    process = start_worker(status, sys.executable, arguments)
+    monitor.monitor_worker(status, process)
     if bpy.app.background:
-        _wait(operator, here, process)
+        process.wait()
+        final = inspect_worker(status, process)
+        if final.state.failed:
+            raise StgaError(final.status.error)
+        operator.report({"INFO"}, final.status.message)
     return {"FINISHED"}
-
-
-def _wait(operator: Any, folder: Path, process: "subprocess.Popen[bytes]") -> None:
-    process.wait()
-    last = task.look(folder, process)
-    if last.state.failed:
-        raise StgaError(last.status.error)
-    operator.report({"INFO"}, last.status.message)

@@ -1,13 +1,19 @@
-"""Reading without trust and writing without halves: JSON, npz and atomic replacement."""
+"""Atomic file writes and bounded reads of JSON and npz."""
 
+import ctypes
 import json
 import math
 import os
+import platform
+import re
+import secrets
 import stat
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,27 +22,27 @@ import numpy as np
 from .errors import StgaError
 
 MAX_JSON_BYTES = 256 << 20
-MAX_PACKING = 16
-"""Unpacked bytes that a byte of an npz may stand for; Deflate's best is 1030, arrays of numbers reach 5."""
-FREE_BYTES = 128 << 20
+MAX_COMPRESSION = 16
+"""Unpacked bytes per byte of an npz; Deflate reaches 1030, arrays of numbers reach 5."""
+MIN_NPZ_ALLOWANCE_BYTES = 128 << 20
 """What any npz may unpack to, however small it is."""
 MAX_HEADER_BYTES = 1 << 16
-
-
-def partial_name(name: str, process: int | str) -> str:
-    """The temporary name that a process writes the file `name` under."""
-    return f".{name}.{process}.partial"
+PARTIAL_NAME = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL)
+"""Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
+_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
+"""Computers that share a disk cannot see each other's processes."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path`; rename it over `path` when the block ends well, else delete it.
+    """Yield an empty temporary file beside `path`; rename it over `path` when the block succeeds, else delete it.
 
+    The first call for a folder also removes what killed processes left there (`remove_leftovers`).
     Raises StgaError where the folder cannot be written.
     """
-    partial = path.with_name(partial_name(path.name, os.getpid()))
+    partial = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _create(partial)
         yield partial
         with partial.open("rb+") as written:
             os.fsync(written.fileno())
@@ -44,8 +50,45 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
-        with suppress(OSError):  # where the folder is the problem, that was said above
+        with suppress(OSError, ValueError):  # where it was never created
             partial.unlink()
+
+
+def _create(partial: Path) -> None:
+    """Create the file and its folder. Raises OSError, also for a name that no file can have."""
+    try:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers_once(partial.parent)
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # O_EXCL follows no symbolic link
+    except ValueError as error:  # a null character or a lone surrogate
+        raise OSError(str(error)) from error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that processes of this computer, killed while writing, left in the folder."""
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            match = PARTIAL_NAME.fullmatch(name)
+            if match and match["host"] == _HOST and not _is_running(int(match["process"])):
+                with suppress(OSError):
+                    (folder / name).unlink()
+
+
+_remove_leftovers_once = cache(remove_leftovers)
+
+
+def _is_running(process: int) -> bool:
+    if os.name == "nt":  # where os.kill(process, 0) would send Ctrl-C
+        kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+        handle = kernel.OpenProcess(0x1000, False, process)  # PROCESS_QUERY_LIMITED_INFORMATION
+        return bool(handle and kernel.CloseHandle(handle))
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def file_size(path: Path) -> int:
@@ -86,15 +129,15 @@ def write_json(path: Path, value: Any) -> None:
         partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
-def read_npz(path: Path, max_bytes: int | None = None, max_packing: int = MAX_PACKING) -> dict[str, np.ndarray]:
+def read_npz(path: Path, max_bytes: int | None = None, max_compression: int = MAX_COMPRESSION) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle.
 
     `max_bytes` bounds the unpacked size, so that a small hostile file cannot fill the memory; by default 128 MiB and
-    `max_packing` times the file's own size.
+    `max_compression` times the file's own size.
     Raises StgaError naming the file where it is missing, truncated, too large or holds objects.
     """
     size = file_size(path)
-    allowed = FREE_BYTES + max_packing * size if max_bytes is None else max_bytes
+    allowed = MIN_NPZ_ALLOWANCE_BYTES + max_compression * size if max_bytes is None else max_bytes
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())

@@ -1,4 +1,4 @@
-"""What holds for every .blend file of this user."""
+"""Preferences of the add-on: the FLAME model and the training environment."""
 
 from typing import Any
 
@@ -6,10 +6,10 @@ import bpy
 
 from ..operators import ids, monitor
 from ..operators.common import register_classes, unregister_classes
-from ..operators.environment import runtime_folder
+from ..operators.environment import environment_folder, has_training_python
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.worker.environment import made_python, task_folder
-from ..stga_addon.worker.process import State
+from ..stga_addon.worker.environment import PYTHON_VARIABLE, status_folder
+from ..stga_addon.worker.status import WorkerState
 from .failure import draw_failure
 
 
@@ -24,39 +24,39 @@ class Preferences(bpy.types.AddonPreferences):
         options=PATH_OPTIONS,
     )
 
-    runtime_python: bpy.props.StringProperty(
+    training_python: bpy.props.StringProperty(
         name="Python",
-        description="An interpreter that has torch, numba and what else training needs; empty: the runtime made here",
+        description="An interpreter that has torch, numba and what else training needs; empty: the one chosen with "
+        f"`stga environment use`, or the environment made here. The variable {PYTHON_VARIABLE} takes precedence",
         subtype="FILE_PATH",
     )
 
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "flame_model")
-        _draw_runtime(self.layout.box(), context, self)
+        _draw_environment(self.layout.box(), context, self)
 
 
-def _draw_runtime(box: Any, context: Any, stored: Any) -> None:
-    folder = task_folder(runtime_folder())
+def _draw_environment(box: Any, context: Any, stored: Any) -> None:
+    folder = status_folder(environment_folder())
     now = monitor.snapshot(folder)
-    box.label(text="Training Runtime")
+    box.label(text="Training Environment")
     row = box.split(factor=0.8, align=True)
-    row.prop(stored, "runtime_python")
+    row.prop(stored, "training_python")
     row.operator(ids.TEST_ENVIRONMENT)
-    made = made_python(runtime_folder())
-    if made is not None:
-        box.label(text=f"Made here: {made}", icon="CHECKMARK")
     if now.state.is_alive:
         row = box.row(align=True)
-        row.progress(factor=now.status.share, text=now.status.message)
+        row.progress(factor=now.status.progress, text=now.status.message)
         row.operator(ids.CANCEL_ENVIRONMENT, text="", icon="CANCEL")
-        box.label(text=now.status.remark)
+        box.label(text=now.status.detail)
         return
     if now.state.failed:
         box.label(text="Failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.tail, folder)
-    elif now.state == State.FINISHED:
+        draw_failure(box, context, now.status.error, now.log_tail, folder)
+    elif now.state == WorkerState.FINISHED:
         box.label(text=now.status.message, icon="CHECKMARK")
-    box.operator(ids.MAKE_ENVIRONMENT, text="Make Runtime…", icon="IMPORT")
+    elif not has_training_python(context):
+        box.label(text="No training environment yet", icon="INFO")
+    box.operator(ids.MAKE_ENVIRONMENT, text="Make Training Environment…", icon="IMPORT")
 
 
 def register() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..operators.environment import has_runtime
+from ..operators.environment import has_training_python
 from ..stga_addon.raster.render_client import missing_packages
 from ..stga_addon.scene.render.engine import ENGINE
 
@@ -26,5 +26,6 @@ class RenderPanel(bpy.types.Panel):
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages():
-            drawn_by = "Drawn by the training runtime" if has_runtime(context) else "Nothing here can draw"
+            has_environment = has_training_python(context)
+            drawn_by = "Rendered by the training environment" if has_environment else "Nothing here can render"
             layout.label(text=f"{drawn_by}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")

@@ -1,4 +1,4 @@
-"""A thread that holds the next views ready, so that training never waits for the disk."""
+"""Background loading of views, so that training does not wait for the disk."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -6,26 +6,39 @@ from pathlib import Path
 from threading import Condition, Thread
 from time import perf_counter
 from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
 
 from .images import WHITE, read_view
 from .model import View
 
-LoadedView = tuple[View, np.ndarray, np.ndarray | None]
+
+class LoadedView(NamedTuple):
+    """A view with its image (H, W, 3) uint8, mask (H, W) uint8 and mesh (V, 3), which are None if there is none."""
+
+    view: View
+    image: np.ndarray
+    mask: np.ndarray | None = None
+    mesh: np.ndarray | None = None
+
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in self[1:] if isinstance(array, np.ndarray))
 
 
 class ViewLoader:
-    """Yields (view, image (H, W, 3) uint8, mask (H, W) uint8 or None) for each of `views`, in order.
+    """Iterator over the `LoadedView` of each of `views`, read ahead by a thread.
 
-    views   drawn in the loader's thread, only as far ahead as the queue reaches; may be endless, must not block
-    scale   position in `views` -> size in (0, 1], for coarse-to-fine; the yielded view's camera is scaled alike
-    correct   (view, image, mask) -> the image to yield instead, applied once to each that is read; None for none
-    queue_bytes, cache_bytes  bounds on what is ready ahead (at least one view), and on decoded views kept for
-            their next visit; memory depends on these, not on how long the sequence is
-    waited_s  seconds that the consumer has waited so far
+    views    consumed in the thread, only as far ahead as the queue allows; may be endless, must not block
+    scale    position in `views` -> image scale in (0, 1], for coarse-to-fine; the yielded view's camera is scaled too
+    correct  (view, image, mask) -> the image to yield instead, applied once per image read; None leaves images as read
+    mesh     timestep -> mesh (V, 3), read in the thread as well; None yields no meshes
+    queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded images that are kept for
+             later epochs; memory does not depend on the length of the sequence
+    waited_s seconds that the consumer has waited so far
 
-    Arrays are read-only and shared with the cache. What fails in the thread is raised where its view would have
+    Arrays are read-only and shared with the cache. An exception in the thread is raised where its view would have
     come. Use as a context manager, or call `close`.
     """
 
@@ -37,9 +50,10 @@ class ViewLoader:
         queue_bytes: int = 16 << 20,
         cache_bytes: int = 224 << 20,
         correct: Callable[[View, np.ndarray, np.ndarray | None], np.ndarray] | None = None,
+        mesh: Callable[[int], np.ndarray] | None = None,
     ) -> None:
         self.waited_s = 0.0
-        self._scale, self._background, self._correct = scale, background, correct
+        self._scale, self._background, self._correct, self._mesh = scale, background, correct, mesh
         self._queue_bytes = queue_bytes
         self._cache = _Cache(cache_bytes)
         self._ready: deque[LoadedView] = deque()
@@ -60,7 +74,7 @@ class ViewLoader:
             self.waited_s += perf_counter() - start
             if self._ready and not self._closed:
                 loaded = self._ready.popleft()
-                self._ready_bytes -= _size(loaded)
+                self._ready_bytes -= loaded.nbytes
                 self._changed.notify_all()
                 return loaded
             if self._error is not None and not self._closed:
@@ -76,7 +90,7 @@ class ViewLoader:
         self.close()
 
     def close(self) -> None:
-        """End the thread and let go of everything it holds; may be called twice."""
+        """End the thread and release its memory; may be called twice."""
         with self._changed:
             self._closed = True
             self._ready.clear()
@@ -88,9 +102,12 @@ class ViewLoader:
     def _work(self, views: Iterator[View]) -> None:
         try:
             for position, view in enumerate(views):
-                if not self._offer(self._load(view, self._scale(position))):
+                loaded = self._load(view, self._scale(position))
+                if self._mesh is not None:
+                    loaded = loaded._replace(mesh=self._mesh(view.timestep))
+                if not self._offer(loaded):
                     return
-        except BaseException as error:  # Whatever it is, it belongs to the consumer.
+        except BaseException as error:  # raised again in the consumer's thread
             self._error = error
         finally:
             with self._changed:
@@ -98,8 +115,8 @@ class ViewLoader:
                 self._changed.notify_all()
 
     def _offer(self, loaded: LoadedView) -> bool:
-        """Wait for room, then queue; False once closed."""
-        size = _size(loaded)
+        """Queue the view once there is room; False if closed."""
+        size = loaded.nbytes
         with self._changed:
             self._changed.wait_for(
                 lambda: self._closed or not self._ready or self._ready_bytes + size <= self._queue_bytes
@@ -115,11 +132,11 @@ class ViewLoader:
         key = (view.image, view.mask, view.timestep, view.camera_index, scale)
         kept = self._cache.get(key)
         if kept is None:
-            kept = read_view(view, scale, self._background)
+            kept = LoadedView(*read_view(view, scale, self._background))
             if self._correct is not None:
-                kept = kept[0], self._correct(*kept), kept[2]
-            for array in kept[1:]:
-                if isinstance(array, np.ndarray):
+                kept = kept._replace(image=self._correct(kept.view, kept.image, kept.mask))
+            for array in (kept.image, kept.mask):
+                if array is not None:
                     array.setflags(write=False)
             self._cache.put(key, kept)
         return kept
@@ -129,10 +146,10 @@ Key = tuple[Path, Path | None, int, int, float]
 
 
 class _Cache:
-    """The views of one size that came first, up to a number of bytes.
+    """The first views of one scale, up to a number of bytes.
 
-    Views are visited in random order, every one once an epoch: what is thrown out to make room would be asked for
-    sooner than what replaces it, so nothing is thrown out until another size is asked for.
+    Views come in random order, each once per epoch: an entry evicted to make room would be needed sooner than the one
+    that replaces it, so nothing is evicted until another scale is asked for.
     """
 
     def __init__(self, limit: int) -> None:
@@ -146,15 +163,10 @@ class _Cache:
         if key[-1] != self._scale:
             self.clear()
             self._scale = key[-1]
-        if self._held + _size(loaded) <= self._limit:
+        if self._held + loaded.nbytes <= self._limit:
             self._entries[key] = loaded
-            self._held += _size(loaded)
+            self._held += loaded.nbytes
 
     def clear(self) -> None:
         self._entries.clear()
         self._held = 0
-
-
-def _size(loaded: LoadedView) -> int:
-    _, image, mask = loaded
-    return image.nbytes + (0 if mask is None else mask.nbytes)

@@ -23,6 +23,7 @@ COMMANDS = (
     ".export",
     ".info",
     ".presets",
+    ".environment",
     "..development.benchmark.command",
     "..development.demo.command",
 )

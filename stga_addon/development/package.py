@@ -17,8 +17,9 @@ from ..files import replacing
 
 ROOT = Path(__file__).resolve().parents[2]
 MANIFEST = "blender_manifest.toml"
-# Pure Python, so one wheel serves every platform and Blender; the manifest names the same files.
+# Pure Python: one wheel serves every platform and Blender version. The manifest names the same files.
 WHEELS = {
+    "filelock-4.2.11-py3-none-any.whl": "020e229e4bb9d410fc799c07ddf45fa217cba970278f40b30751d94f309b69e2",
     "trimesh-5.2.0-py3-none-any.whl": "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29",
     "tqdm-4.70.1-py3-none-any.whl": "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73",
 }

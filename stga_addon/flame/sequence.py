@@ -122,7 +122,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     plain files of expression and pose, by the names in `ALIASES` too; `pose` holds the joints of `POSES`. Timesteps
     count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
     """
-    arrays = _spelled_out(path, read_npz(path, max_packing=MOTION_PACKING))
+    arrays = _spelled_out(path, read_npz(path, max_compression=MOTION_PACKING))
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
         raise StgaError(f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of")

@@ -24,7 +24,8 @@ from ..training.optimize.device import choose_device
 from ..training.run.folder import SELECTION, Run
 from ..training.run.open_run import device_of, open_run
 from ..training.settings import DEVICES, TrainingSettings, from_json, to_json
-from ..worker import process
+from ..worker.launch import prepare_status_folder
+from ..worker.status import StatusWriter, remove_status_folder, status_writer
 
 if TYPE_CHECKING:
     from ..training.run.progress import Progress, Report
@@ -67,7 +68,7 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
         open_run(run, job.capture, job.flame, job.principal_point)
     elif (run / "run.json").exists():
         raise StgaError(f"{run}: already holds a run; resume it, or choose another folder")
-    process.prepare(folder)
+    prepare_status_folder(folder)
     for stale in (SELECTION, PREVIEW):
         (folder / stale).unlink(missing_ok=True)
     if selection is not None:
@@ -109,6 +110,18 @@ def read_job(run: Path) -> TrainingJob:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
 
 
+def remove_job(run: Path) -> None:
+    """Remove the files of the run's job and its status; a folder that holds no job stays as it is.
+
+    Raises StgaError while its worker is running.
+    """
+    try:
+        read_job(run)
+    except StgaError:
+        return
+    remove_status_folder(job_folder(run), (JOB, SELECTION, PREVIEW))
+
+
 def worker_arguments(run: Path) -> list[str]:
     """Arguments of the worker's interpreter, after `-m`."""
     return ["stga_addon", "job", str(run.resolve())]
@@ -123,32 +136,32 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
     folder = job_folder(run)
     if not (folder / JOB).is_file():  # before anything is written into a folder that may be of something else
         raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
-    with process.telling(folder) as teller:
-        teller.tell(0.0, "Starting")
+    with status_writer(folder) as writer:
+        writer.update(0.0, "Starting")
         from ..training.run.checkpoint import read_selection
         from ..training.run.loop import train
 
         job = read_job(run)
-        wanted, capture = _open(run, job, lambda stage: teller.tell(0.0, stage))
+        wanted, capture = _open(run, job, lambda stage: writer.update(0.0, stage))
         selection = None
         if (folder / SELECTION).exists():
             selection = read_selection(folder, len(capture.faces))
-        return train(capture, run, wanted, selection, job.settings is None, _Report(teller, also))
+        return train(capture, run, wanted, selection, job.settings is None, _Report(writer, also))
 
 
-def _open(folder: Path, job: TrainingJob, tell: Callable[[str], object]) -> tuple[Run, Capture]:
+def _open(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> tuple[Run, Capture]:
     """The run to train, new or resumed, and its capture."""
     from ..effects.plan import with_effect_plan
 
     if job.settings is None:
         opened = open_run(folder, job.capture, job.flame, job.principal_point)
         device, reason = device_of(opened.run, job.device)
-        tell(reason)
+        report(reason)
         return replace(opened.run, device=device), opened.capture
     capture = open_capture(job.capture, job.flame, job.principal_point)
     device, reason = choose_device(job.device)
-    tell(reason)
-    tell("Analyzing the capture")
+    report(reason)
+    report("Analyzing the capture")
     run = Run(capture.root, job.flame, job.principal_point, job.settings, device=device)
     return with_effect_plan(run, capture, device), capture
 
@@ -156,12 +169,12 @@ def _open(folder: Path, job: TrainingJob, tell: Callable[[str], object]) -> tupl
 class _Report:
     """The report of a training job: status, and a preview every few seconds."""
 
-    def __init__(self, teller: process.Teller, also: "Report | None") -> None:
-        self.teller, self.also = teller, also
+    def __init__(self, writer: StatusWriter, also: "Report | None") -> None:
+        self.writer, self.also = writer, also
         self.previewed = time.monotonic()
 
     def __call__(self, progress: "Progress") -> bool:
-        stop = self.teller.tell(progress.share, progress.message, progress.forecast_text, progress.figures)
+        stop = self.writer.update(progress.share, progress.message, progress.forecast_text, progress.figures)
         if progress.avatar is not None and time.monotonic() - self.previewed > PREVIEW_S:
             self._preview(progress.avatar())
             self.previewed = time.monotonic()
@@ -169,4 +182,4 @@ class _Report:
 
     def _preview(self, avatar: Avatar) -> None:
         with suppress(StgaError):  # training continues without a preview, and reports a full disk itself
-            write_avatar(self.teller.folder / PREVIEW, avatar)
+            write_avatar(self.writer.folder / PREVIEW, avatar)

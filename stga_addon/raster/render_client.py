@@ -1,6 +1,5 @@
 """Who draws: this process where it can, else a worker in another interpreter. Importing this needs numpy alone."""
 
-import os
 import subprocess
 import sys
 import threading
@@ -13,7 +12,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..errors import StgaError
-from ..worker import process as task
+from ..worker.launch import start_python
 from .posed_splats import ComposedImage, PosedSplats
 from .render_protocol import pack_layers, receive, send
 
@@ -74,13 +73,9 @@ class RenderClient:
 
     def _start(self) -> tuple[str, subprocess.Popen[bytes]]:
         python = self._python()
-        command = [python, "-m", "stga_addon.raster.render_server"]
-        try:
-            worker = subprocess.Popen(
-                command, env=task.environment(os.environ), stdin=subprocess.PIPE, stdout=subprocess.PIPE
-            )
-        except OSError as error:
-            raise StgaError(f"{python}: cannot be started as a Python interpreter ({error.strerror})") from error
+        worker = start_python(
+            python, ["stga_addon.raster.render_server"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         self._worker = python, worker
         return self._worker
 
@@ -91,7 +86,7 @@ class RenderClient:
             own = f"{sys.executable}, {sys.version.split()[0]}"
             raise StgaError(
                 f"drawing splats needs {' and '.join(missing_packages())} in Blender's own Python ({own}), "
-                "or a training runtime, which the add-on's preferences make or take"
+                "or a training environment, which the add-on's preferences or `stga environment` make or choose"
             ) from error
 
 

@@ -1,4 +1,4 @@
-"""How long each preset would take on this machine, from a few seconds of training on the capture itself."""
+"""Preset timing: how long each preset would train on this machine, measured on the capture itself."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,19 +18,19 @@ from ..training.optimize.trainer import Trainer
 from ..training.schedule import image_scale, view_order
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 
-SECONDS = 2.0
-"""Seconds of training that a calibration takes, kernels and splats being ready."""
-VIEWS = 8
-"""Views that it goes through again and again."""
-SETTLING = 3
-"""First iterations, which only fetch memory, are not counted."""
-MOST_ITERATIONS = 2000
-"""A capture of a few pixels needs no more to be timed."""
+CALIBRATION_S = 2.0
+"""Training time that is measured per preset."""
+CALIBRATION_VIEWS = 8
+"""Views that the calibration trains, in turn."""
+WARM_UP_ITERATIONS = 3
+"""First iterations that are not measured: they allocate memory."""
+MAX_ITERATIONS = 2000
+"""Limit for captures of a few pixels."""
 
 
 @dataclass(frozen=True)
 class PresetTiming:
-    """A preset on this capture and machine: iterations, and the seconds of training that they will take."""
+    """A preset's iterations for a capture, and the seconds of training that they are expected to take."""
 
     preset: str
     purpose: str
@@ -42,52 +42,55 @@ class PresetTiming:
 
 
 def time_presets(
-    capture: Capture, names: Iterable[str] = tuple(PRESETS), seconds: float = SECONDS, device: str = "cpu"
+    capture: Capture, names: Iterable[str] = tuple(PRESETS), seconds: float = CALIBRATION_S, device: str = "cpu"
 ) -> list[PresetTiming]:
-    """Time each preset for a few `seconds` on a device of `choose_device`.
+    """Measure each preset for `seconds` on a device of `choose_device`.
 
-    Raises StgaError where the capture has no training views.
+    Raises StgaError if the capture has no training views.
     """
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
-    plans = []
+    timings = []
     for name in names:
         iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
         settings, _ = plan_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
         pace = seconds_per_iteration(capture, settings, seconds, device)
-        plans.append(PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace))
-    return plans
+        timings.append(PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace))
+    return timings
 
 
 def seconds_per_iteration(
-    capture: Capture, settings: TrainingSettings, seconds: float = SECONDS, device: str = "cpu"
+    capture: Capture, settings: TrainingSettings, seconds: float = CALIBRATION_S, device: str = "cpu"
 ) -> float:
-    """Mean time of an iteration, from a run in small of which nothing is kept.
+    """Mean time of an iteration, measured by a short run whose result is discarded.
 
-    Shares of the budget pass as in the whole run, so that coarse images, degrees of colour and local iterations count
-    as much as they will. Reading images is not counted: the loader's thread does that meanwhile.
+    The run passes through the whole schedule in `seconds`, so that coarse images, spherical harmonics and local
+    iterations have the weight that they have in a real run. Reading files is not measured: in a real run, the loader's
+    thread does it.
     """
     precompile_kernels()
-    wanted = settings.strategy == "selective"
-    trainer = Trainer(capture, settings, select_capture(capture, settings.selection) if wanted else {}, device=device)
-    views = list(islice(view_order(capture.views["train"], settings.views_per_visit, settings.seed), VIEWS))
-    sizes = {image_scale(settings, share) for share in (0.0, 1.0)}
-    images = {size: cycle([_ready(view, size, settings.background) for view in views]) for size in sizes}
+    selective = settings.strategy == "selective"
+    selection = select_capture(capture, settings.selection) if selective else {}
+    trainer = Trainer(capture, settings, selection, device=device)
+    order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
+    views = list(islice(order, CALIBRATION_VIEWS))
+    scales = {image_scale(settings, 0.0), settings.scale}
+    loaded = {scale: cycle([_load(capture, view, scale, settings.background) for view in views]) for scale in scales}
     times: list[float] = []
-    while sum(times[SETTLING:]) < seconds and len(times) < MOST_ITERATIONS:
-        share = min(1.0, sum(times[SETTLING:]) / seconds)
-        view, image, mask = next(images[image_scale(settings, share)])
+    while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
+        progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
+        view, image, mask, mesh = next(loaded[image_scale(settings, progress)])
         begin = perf_counter()
-        trainer.step(view, image, share, mask)
+        trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)
-    return float(np.mean(times[SETTLING:]))
+    return float(np.mean(times[WARM_UP_ITERATIONS:]))
 
 
-def _ready(view: View, size: float, background: tuple[float, ...]) -> LoadedView:
-    """A view as the loader gives it: read-only arrays, for which the kernels are compiled."""
+def _load(capture: Capture, view: View, scale: float, background: tuple[float, ...]) -> LoadedView:
+    """A view as the loader yields it: with read-only arrays, for which the kernels are compiled."""
     red, green, blue = (round(255 * c) for c in background)
-    small, image, mask = read_view(view, size, (red, green, blue))
-    image.setflags(write=False)
-    if mask is not None:
-        mask.setflags(write=False)
-    return small, image, mask
+    loaded = LoadedView(*read_view(view, scale, (red, green, blue)), capture.mesh(view.timestep))
+    for array in (loaded.image, loaded.mask):
+        if array is not None:
+            array.setflags(write=False)
+    return loaded

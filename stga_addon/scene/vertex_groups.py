@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import StgaError
 from . import tags
 from .arrays import mesh_triangles
-from .display.color_nodes import FACE
+from .display.splat_attributes import FACE
 
 
 def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""When what is trained: the order of views, local or global, degrees and rates over the budget."""
+"""Schedules over the training budget: order of views, degree of spherical harmonics, learning rates, image scale."""
 
 from collections.abc import Iterator, Sequence
 
@@ -35,14 +35,6 @@ def _epoch(views: Sequence[View], per_visit: int, seed: int, epoch: int) -> list
         size = per_visit or len(shuffled)
         visits += [shuffled[n : n + size] for n in range(0, len(shuffled), size)]
     return [view for n in rng.permutation(len(visits)) for view in visits[n]]
-
-
-def trains_globally(settings: TrainingSettings, iteration: int, visit: int, progress: float) -> bool:
-    """Whether this iteration trains all splats; `visit` counts frame visits, `progress` is the share of budget."""
-    if settings.strategy != "selective" or progress < settings.warm_up_share:
-        return True
-    count = iteration if settings.global_unit == "iteration" else visit
-    return count % (settings.global_interval + 1) == settings.global_interval
 
 
 def sh_degree(settings: TrainingSettings, progress: float) -> int:

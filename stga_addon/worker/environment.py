@@ -1,8 +1,8 @@
-"""The training runtime: a Python with torch that trains beside Blender; found, tested or made here.
+"""Training environment: the Python with torch that trains beside Blender; found, checked, made and removed here.
 
-`python -m stga_addon.worker.environment test FOLDER PYTHON` and `… make FOLDER` are workers with a status in
-FOLDER/task (`process`).
-FOLDER/venv-… is an environment that was made, `ready` in it is there once it has passed the test.
+`python -m stga_addon.worker.environment check FOLDER PYTHON` and `… make FOLDER` are workers with their status in
+FOLDER/status. In FOLDER, `venv-N` is an environment made here, in which the file `ready` says that it passed the check,
+and `choice.json` names an interpreter that is used instead.
 """
 
 import argparse
@@ -13,104 +13,180 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
-from . import process as task
-from .environment_check import NEEDED
+from ..files import read_json, write_json
+from .environment_use import READY, environment_users
+from .launch import start_python
+from .requirements import GPU_REQUIREMENT, REQUIREMENTS, package_name
+from .status import StatusWriter, log_lines, status_writer
 
+PYTHON_VARIABLE = "STGA_PYTHON"
+"""Environment variable that names the interpreter that trains, above every other choice: for render farms."""
+CHOICE_FILE = "choice.json"
 DEVICES = ("auto", "cpu", "cuda")
-OLDEST = 3, 11
-"""Python that can train."""
+MIN_PYTHON = 3, 11
 SIZES_GB = {"cpu": 1.5, "cuda": 2.0, "pypi": 6.0}
-"""Room that a runtime takes: measured; with the package warp-lang, which is all that a GPU needs beside; and with the
-torch that PyPI has for Linux, measured."""
-OLDEST_CUDA = 12
+"""Measured size of an environment: for the CPU; with the package warp-lang, all that a GPU needs in addition; and with
+the CUDA build of torch that PyPI has for Linux."""
+MIN_CUDA_VERSION = 12
 """Of the driver, for warp-lang."""
-INDEX = "https://download.pytorch.org/whl/cpu"
-"""PyTorch's CPU build: on a GPU, too, the kernels are ours, and the CUDA build, which PyPI has for Linux, takes
-gigabytes. Everything else comes from PyPI, or the mirror of it that pip is configured for."""
-REASONS = {
+TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+"""PyTorch's CPU build serves GPUs as well, since the kernels are Warp's; the CUDA build, which PyPI has for Linux,
+takes gigabytes. Everything else comes from PyPI, or the mirror that pip is configured for."""
+FAILURE_REASONS = {
     "No space left on device": "the disk is full",
     "ensurepip": "this Python has no ensurepip; choose another one (3.11 or newer), or install python3-venv",
-    "connection broken by": "the package indexes cannot be reached; check network and proxy, or use a folder of wheels",
-    "No matching distribution": "{}: none that fits this Python and system",
+    "connection broken by": "the package index cannot be reached; check network and proxy, or use a folder of wheels",
+    "No matching distribution": "{}: no version fits this Python and system",
 }
-"""What a failing step printed, {} -> what to tell a person; the first that fits."""
-READY, PROMPT = "ready", "$ "
-PROBE_S = 180.0
+"""Text in a failing command's output -> reason to show; {} is the line. The first that matches."""
+COMMAND_PREFIX = "$ "
+CHECK_TIMEOUT_S = 180.0
 """The first import of torch from a slow disk."""
+POLL_INTERVAL_S = 0.2
 
 
-def task_folder(folder: Path) -> Path:
-    return folder / "task"
+# Choosing
+
+
+def find_training_python(folder: Path, preferred: str = "") -> str:
+    """The interpreter that trains.
+
+    In this order: $STGA_PYTHON, `preferred` (Blender's preferences), the stored choice, the environment made in
+    `folder`, this interpreter. Raises StgaError where this one is left and lacks packages.
+    """
+    chosen = os.environ.get(PYTHON_VARIABLE) or preferred or stored_choice(folder) or str(made_python(folder) or "")
+    if chosen:  # without a folder, a program that is found on PATH
+        return os.path.abspath(chosen) if os.path.dirname(chosen) else chosen
+    missing = missing_packages()
+    if missing:
+        version = sys.version.split()[0]
+        raise StgaError(
+            f"No training environment: {sys.executable} (Python {version}) lacks {', '.join(missing)}. Make one in the "
+            "add-on's preferences or with `blender --background --command stga environment make`, choose one with "
+            f"`… environment use PATH`, or set {PYTHON_VARIABLE}"
+        )
+    return sys.executable
+
+
+def stored_choice(folder: Path) -> str:
+    """The interpreter chosen with `stga environment use`; "" where none was.
+
+    Raises StgaError where the file is malformed.
+    """
+    path = folder / CHOICE_FILE
+    if not path.exists():
+        return ""
+    values = read_json(path)
+    python = values.get("python") if isinstance(values, dict) else None
+    if not isinstance(python, str):
+        raise StgaError(f"{path}: 'python' is not a path; remove the file or choose an interpreter again")
+    return python
+
+
+def store_choice(folder: Path, python: str) -> str:
+    """Use the interpreter `python` from now on; "": none. Returns the line of `check_python`, "" for none.
+
+    Raises StgaError where it cannot train.
+    """
+    if not python:
+        with suppress(OSError):
+            (folder / CHOICE_FILE).unlink()
+        return ""
+    python = os.path.abspath(python)
+    line = check_python(python)
+    write_json(folder / CHOICE_FILE, {"python": python})
+    return line
+
+
+def status_folder(folder: Path) -> Path:
+    return folder / "status"
 
 
 def made_python(folder: Path) -> Path | None:
-    """The interpreter of the runtime that was made in `folder`; None where there is none, or it never got ready."""
-    made = (venv_python(ready.parent) for ready in folder.glob(f"venv-*/{READY}"))
-    return next((python for python in made if python.exists()), None)
+    """The interpreter of the newest environment in `folder` that passed its check; None where there is none."""
+    pythons = (venv_python(venv) for venv in reversed(_environments(folder)) if (venv / READY).exists())
+    return next((python for python in pythons if python.exists()), None)
 
 
 def venv_python(venv: Path) -> Path:
     return venv / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def missing_here() -> list[str]:
-    """What training needs and this interpreter lacks, as pip calls it."""
-    return [package for module, package in NEEDED.items() if find_spec(module) is None]
+def missing_packages() -> list[str]:
+    """What training needs and this interpreter lacks, by the names pip uses."""
+    return [package_name(text) for module, text in REQUIREMENTS.items() if find_spec(module) is None]
 
 
-def testing_arguments(folder: Path, python: str) -> list[str]:
-    """What a worker's interpreter runs, after `-m`, to test another one."""
-    return ["stga_addon.worker.environment", "test", str(folder), python]
+# Checking
 
 
-def making_arguments(folder: Path, python: str, device: str, wheels: Path | None) -> list[str]:
-    """The same to make a runtime of the interpreter `python`."""
-    offline = ["--wheels", str(wheels)] if wheels else []
-    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, "--device", device, *offline]
-
-
-def probe(python: str) -> str:
+def check_python(python: str) -> str:
     """One line on an interpreter that can train: versions and device.
 
     Raises StgaError where it cannot be started or lacks something, which the sentence names.
     """
-    command = [python, "-m", "stga_addon.worker.environment_check"]
-    environment = task.environment(os.environ)
+    with start_python(
+        python, ["stga_addon.worker.environment_check"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, errors="replace",
+    ) as child:  # fmt: skip
+        try:
+            output, errors = child.communicate(timeout=CHECK_TIMEOUT_S)
+        except subprocess.TimeoutExpired as error:
+            child.kill()
+            raise StgaError(f"{python}: did not answer within {CHECK_TIMEOUT_S:.0f} s") from error
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PROBE_S, check=False)
-    except OSError as error:
-        raise StgaError(f"{python}: cannot be started as a Python interpreter ({error.strerror or error})") from error
-    except subprocess.TimeoutExpired as error:
-        raise StgaError(f"{python}: did not answer within {PROBE_S:.0f} s") from error
-    print(done.stdout + done.stderr, flush=True)
-    try:
-        return describe(python, json.loads(done.stdout.strip().splitlines()[-1]))
-    except (ValueError, IndexError) as error:
-        raise StgaError(f"{python}: is no Python that can run this add-on (exit status {done.returncode})") from error
+        return describe_check(python, json.loads(output.strip().splitlines()[-1]))
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        with suppress(OSError):  # the stream may be closed
+            print(output + errors, file=sys.stderr, flush=True)
+        raise StgaError(f"{python}: is not a Python that runs this add-on (exit status {child.returncode})") from error
 
 
-def describe(python: str, report: dict[str, Any]) -> str:
-    """The line of `probe` from what probe.py prints. Raises StgaError where something is missing."""
-    version, found, broken = report["python"], report["found"], report["broken"]
-    if tuple(int(part) for part in version.split(".")[:2]) < OLDEST:
+def describe_check(python: str, report: dict[str, Any]) -> str:
+    """The line of `check_python` from what environment_check.py prints. Raises StgaError where something is missing."""
+    version, versions, failures = report["python"], report["versions"], report["failures"]
+    if tuple(int(part) for part in version.split(".")[:2]) < MIN_PYTHON:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
-    missing = [package for module, package in NEEDED.items() if module in broken]
+    missing = [package_name(text) for module, text in REQUIREMENTS.items() if module in failures]
     if missing:
-        why = next((text for text in broken.values() if not text.startswith("ModuleNotFoundError")), "")
+        why = next((text for text in failures.values() if not text.startswith("ModuleNotFoundError")), "")
         failed = f" ({why})" if why else ""
         raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that with pip")
-    return f"Python {version}, torch {found['torch']}, numba {found['numba']}, {report['device']}"
+    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"
 
 
-def device_for(device: str, nvidia_smi: str | None) -> str:
+def check_in_worker(folder: Path, python: str) -> str:
+    """`check_python`, with its status in the environment folder."""
+    with status_writer(status_folder(folder)) as writer:
+        writer.update(0.0, "Testing")
+        line = check_python(python)
+        writer.update(1.0, line)
+    return line
+
+
+def check_arguments(folder: Path, python: str) -> list[str]:
+    """What a worker runs after `python -m` for `check_in_worker`."""
+    return ["stga_addon.worker.environment", "check", str(folder), python]
+
+
+# Making and removing
+
+
+def make_arguments(folder: Path, python: str, device: str, wheels: Path | None) -> list[str]:
+    """What a worker runs after `python -m` for `make_environment`."""
+    offline = ["--wheels", str(wheels)] if wheels else []
+    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, "--device", device, *offline]
+
+
+def choose_device(device: str, nvidia_smi: str | None) -> str:
     """The device to install for: "cpu", or "cuda" where the driver that `nvidia-smi` reports is new enough.
 
     device: "auto" takes what there is. nvidia_smi: its output, None where there is none.
@@ -119,16 +195,16 @@ def device_for(device: str, nvidia_smi: str | None) -> str:
     if device == "cpu":
         return "cpu"
     reported = re.search(r"CUDA Version:\s*((\d+)\.\d+)", nvidia_smi or "")
-    if reported and int(reported[2]) >= OLDEST_CUDA:
+    if reported and int(reported[2]) >= MIN_CUDA_VERSION:
         return "cuda"
     if device == "auto":
         return "cpu"
-    has = f"the NVIDIA driver goes up to CUDA {reported[1]}" if reported else "nvidia-smi finds no NVIDIA GPU"
-    raise StgaError(f"{has}, training needs CUDA {OLDEST_CUDA} or newer: update the driver or choose the CPU")
+    found = f"the NVIDIA driver supports CUDA {reported[1]}" if reported else "nvidia-smi finds no NVIDIA GPU"
+    raise StgaError(f"{found}, training needs CUDA {MIN_CUDA_VERSION} or newer: update the driver or choose the CPU")
 
 
 def nvidia_smi() -> str | None:
-    """What nvidia-smi prints; None where it is not there or finds no GPU."""
+    """What nvidia-smi prints; None where it is missing or finds no GPU."""
     try:
         done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=20, check=False)
     except (OSError, subprocess.TimeoutExpired):
@@ -138,122 +214,151 @@ def nvidia_smi() -> str | None:
 
 @dataclass(frozen=True)
 class InstallStep:
-    """What a person reads, a command, and whether making the runtime goes on where it fails."""
+    """A command, the message shown meanwhile, and whether installation goes on where it fails."""
 
     message: str
     command: list[str]
     optional: bool = False
 
 
-def steps(venv: Path, python: str, device: str, wheels: Path | None, system: str = sys.platform) -> list[InstallStep]:
-    """What makes a runtime, in turn; `wheels` is a folder to install from without a network."""
+def install_steps(
+    venv: Path, python: str, device: str, wheels: Path | None, system: str = sys.platform
+) -> list[InstallStep]:
+    """The commands that make an environment; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-    packages = [*NEEDED.values(), *(["warp-lang"] if device == "cuda" else [])]
-    too_old = f"sys.version_info < {OLDEST} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
+    packages = [*REQUIREMENTS.values(), *([GPU_REQUIREMENT] if device == "cuda" else [])]
+    too_old = f"sys.version_info < {MIN_PYTHON} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
     first = [
-        InstallStep("looking at that Python", [python, "-c", f"import sys; sys.exit({too_old})"]),
-        InstallStep("making the environment", [python, "-m", "venv", str(venv)]),
+        InstallStep("Checking the Python version", [python, "-c", f"import sys; sys.exit({too_old})"]),
+        InstallStep("Creating the virtual environment", [python, "-m", "venv", str(venv)]),
     ]
     if wheels is not None:
         offline = ["--no-index", "--find-links", str(wheels)]
-        return [*first, InstallStep("installing from the folder of wheels", [*pip, *offline, *packages])]
-    small = InstallStep(
-        "installing PyTorch's CPU build", [*pip, "--no-deps", "--index-url", INDEX, "torch"], optional=True
-    )
-    rest = InstallStep("installing torch and other packages", [*pip, *packages])
-    return [*first, small, rest] if system == "linux" else [*first, rest]
+        return [*first, InstallStep("Installing from the folder of wheels", [*pip, *offline, *packages])]
+    torch = [*pip, "--no-deps", "--index-url", TORCH_CPU_INDEX, REQUIREMENTS["torch"]]
+    rest = InstallStep("Installing torch and other packages", [*pip, *packages])
+    if system != "linux":
+        return [*first, rest]
+    return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest]
 
 
-def make(folder: Path, python: str, device: str = "auto", wheels: Path | None = None) -> str:
-    """Make a runtime in `folder` of the interpreter `python` and return the line of `probe`.
+def make_environment(folder: Path, python: str, device: str = "auto", wheels: Path | None = None) -> str:
+    """Make an environment in `folder` from the interpreter `python`; returns the line of `check_python`.
 
-    It takes the place of an earlier one only once it has passed. Cancelled, it leaves nothing behind and returns "".
-    Raises StgaError with the step that failed.
+    It replaces earlier ones once it has passed the check; those that processes run in stay until the next time.
+    Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
     """
-    with task.telling(task_folder(folder)) as teller:
-        device = device_for(device, nvidia_smi())
+    with status_writer(status_folder(folder)) as writer:
+        device = choose_device(device, nvidia_smi())
         free = shutil.disk_usage(folder).free / 1e9
         if free < SIZES_GB[device]:
-            raise StgaError(f"{folder}: has {free:.1f} GB free, the runtime needs {SIZES_GB[device]:.1f} GB")
-        venv = next(path for number in count(1) if not (path := folder / f"venv-{number}").exists())
-        todo = steps(venv, python, device, wheels)
+            raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {SIZES_GB[device]:.1f} GB")
+        numbers = [_number(venv) for venv in _environments(folder)]
+        venv = folder / f"venv-{max(numbers, default=0) + 1}"
+        steps = install_steps(venv, python, device, wheels)
         try:
-            for number, step in enumerate(todo):
-                if not _run(teller, number / (len(todo) + 1), step):
+            for number, step in enumerate(steps):
+                if not _run(writer, number / (len(steps) + 1), step):
                     shutil.rmtree(venv, ignore_errors=True)
                     return ""
-            teller.tell(len(todo) / (len(todo) + 1), "testing")
-            line = probe(str(venv_python(venv)))
+            writer.update(len(steps) / (len(steps) + 1), "Testing")
+            line = check_python(str(venv_python(venv)))
         except StgaError:
             shutil.rmtree(venv, ignore_errors=True)
             raise
         (venv / READY).touch()
-        _remove_others(folder, venv)
-        teller.tell(1.0, line)
+        store_choice(folder, "")
+        _remove_environments(venv for venv in _environments(folder)[:-1])
+        writer.update(1.0, line)
     return line
 
 
-def _remove_others(folder: Path, venv: Path) -> None:
-    """Remove the environments beside `venv`: the one that it replaces, and what killed makers left."""
-    for other in folder.glob("venv-*"):
-        if other != venv:
-            (other / READY).unlink(missing_ok=True)  # on Windows, a worker at work keeps the rest from being removed
-            shutil.rmtree(other, ignore_errors=True)
+def remove_environment(folder: Path) -> int:
+    """Remove the environments made in `folder`, and the stored choice; returns how many.
 
-
-def try_python(folder: Path, python: str) -> str:
-    """`probe`, telling in the folder's task."""
-    with task.telling(task_folder(folder)) as teller:
-        teller.tell(0.0, "testing")
-        line = probe(python)
-        teller.tell(1.0, line)
-    return line
-
-
-def _run(teller: task.Teller, share: float, step: InstallStep) -> bool:
-    """Run a step whose output goes where this process' goes; False where it was cancelled.
-
-    Raises StgaError where it fails and must not.
+    Raises StgaError while a process runs in one of them, or where one cannot be removed.
     """
-    print(PROMPT + " ".join(step.command), flush=True)
+    with status_writer(status_folder(folder)) as writer:
+        writer.update(0.0, "Removing")
+        environments = _environments(folder)
+        for venv in environments:
+            users = environment_users(venv)
+            if users:
+                raise StgaError(f"{venv}: is in use by process {', '.join(map(str, users))}; wait, or cancel training")
+        store_choice(folder, "")
+        _remove_environments(environments)
+        left = _environments(folder)
+        if left:
+            raise StgaError(f"{left[0]}: cannot be removed completely; remove the folder by hand")
+        writer.update(1.0, "Removed")
+    return len(environments)
+
+
+def _environments(folder: Path) -> list[Path]:
+    """The environments in `folder`, complete or not, oldest first."""
+    return sorted((venv for venv in folder.glob("venv-*") if _number(venv)), key=_number)
+
+
+def _number(venv: Path) -> int:
+    number = venv.name.removeprefix("venv-")
+    return int(number) if re.fullmatch(r"[1-9]\d{0,8}", number, re.ASCII) else 0
+
+
+def _remove_environments(environments: Iterable[Path]) -> None:
+    for venv in environments:
+        with suppress(OSError):
+            (venv / READY).unlink(missing_ok=True)  # first, so that no new worker starts from it
+        if not environment_users(venv):
+            shutil.rmtree(venv, ignore_errors=True)
+
+
+def _run(writer: StatusWriter, progress: float, step: InstallStep) -> bool:
+    """Run a step with this process' output; False where it was cancelled.
+
+    Raises StgaError where it fails and is not optional.
+    """
+    # Else pip takes what lies on this worker's path for installed.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    with suppress(OSError):  # the stream may be closed
+        print(COMMAND_PREFIX + " ".join(step.command), flush=True)
     try:
-        child = subprocess.Popen(step.command, stdin=subprocess.DEVNULL)
+        child = subprocess.Popen(step.command, env=environment, stdin=subprocess.DEVNULL)
     except OSError as error:
         raise StgaError(f"{step.command[0]}: cannot be started ({error.strerror or error})") from error
     while child.poll() is None:
-        line = task.log_lines(teller.folder, 9)[-1:]  # pip's may be long
-        if teller.tell(share, step.message, line[0].strip() if line else ""):
+        line = log_lines(writer.folder, 9)[-1:]  # 9: pip's lines are long
+        if writer.update(progress, step.message, line[0].strip() if line else ""):
             child.terminate()
             child.wait()
             return False
-        time.sleep(0.2)
+        time.sleep(POLL_INTERVAL_S)
     if child.returncode and not step.optional:
-        raise StgaError(f"{step.message}: failed, {_reason(task.log_lines(teller.folder, 20), child.returncode)}")
+        raise StgaError(f"{step.message} failed: {_failure_reason(log_lines(writer.folder, 20), child.returncode)}")
     return True
 
 
-def _reason(lines: Sequence[str], code: int) -> str:
-    """Why a step failed, from the end of what it and those before it printed."""
-    lines = lines[max((row for row, line in enumerate(lines) if line.startswith(PROMPT)), default=-1) + 1 :]
-    known = [reason.format(line) for sign, reason in REASONS.items() for line in lines if sign in line]
-    errors = [line for line in reversed(lines) if "error" in line.lower()]
+def _failure_reason(lines: Sequence[str], code: int) -> str:
+    """Why a step failed, from the last lines of the log."""
+    begin = max((row for row, line in enumerate(lines) if line.startswith(COMMAND_PREFIX)), default=-1) + 1
+    known = [reason.format(line) for sign, reason in FAILURE_REASONS.items() for line in lines[begin:] if sign in line]
+    errors = [line for line in reversed(lines[begin:]) if "error" in line.lower()]
     return next(iter([*known, *errors]), f"exit status {code}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     top = argparse.ArgumentParser(prog="python -m stga_addon.worker.environment", description=__doc__)
     commands = top.add_subparsers(dest="command", required=True)
-    tested = commands.add_parser("test")
-    tested.add_argument("folder", type=Path)
-    tested.add_argument("python")
-    made = commands.add_parser("make")
-    made.add_argument("folder", type=Path)
-    made.add_argument("--python", default=sys.executable)
-    made.add_argument("--device", choices=DEVICES, default="auto")
-    made.add_argument("--wheels", type=Path)
+    check = commands.add_parser("check")
+    check.add_argument("folder", type=Path)
+    check.add_argument("python")
+    make = commands.add_parser("make")
+    make.add_argument("folder", type=Path)
+    make.add_argument("--python", default=sys.executable)
+    make.add_argument("--device", choices=DEVICES, default="auto")
+    make.add_argument("--wheels", type=Path)
     options = vars(top.parse_args(arguments))
     try:
-        print({"test": try_python, "make": make}[options.pop("command")](**options))
+        print({"check": check_in_worker, "make": make_environment}[options.pop("command")](**options))
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2

@@ -5,26 +5,22 @@ import json
 import os
 import platform
 
-NEEDED = {
-    "torch": "torch",
-    "numba": "numba",
-    "scipy": "scipy",
-    "PIL": "pillow",
-    "platformdirs": "platformdirs",
-    "trimesh": "trimesh",
-    "tqdm": "tqdm",
-}
-"""Module -> what pip calls it."""
+from .requirements import REQUIREMENTS
 
 
 def main() -> None:
-    found, broken = {}, {}
-    for name in NEEDED:
+    versions, failures = {}, {}
+    for name in REQUIREMENTS:
         try:
-            found[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
-        except Exception as error:  # a library that does not load raises what it likes
-            broken[name] = f"{type(error).__name__}: {error}".splitlines()[0]
-    report = {"python": platform.python_version(), "found": found, "broken": broken, "device": _device()}
+            versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
+        except Exception as error:  # a library that fails to load raises what it likes
+            failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
+    report = {
+        "python": platform.python_version(),
+        "versions": versions,
+        "failures": failures,
+        "device": _device(),
+    }
     print(json.dumps(report))
 
 
@@ -35,7 +31,7 @@ def _device() -> str:
         warp.config.quiet = True
         if warp.is_cuda_available():
             return str(warp.get_cuda_device().name)
-    except Exception:  # without the package or a driver that works, there is the CPU
+    except Exception:  # the package is missing, or its driver fails: the CPU trains
         pass
     return f"CPU with {os.cpu_count()} threads"
 

@@ -1,101 +1,72 @@
-"""A file that one process holds: the system's own lock, which ends with its process, however that ends."""
+"""Lock files that end with the process that holds them."""
 
 import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
-PATIENCE_S = 0.3
-"""How long a lock is asked for again: somebody may only be looking whether it is held."""
+from filelock import FileLock, Timeout
+
+from ..errors import StgaError
+from ..files import file_size
+
+ACQUIRE_TIMEOUT_S = 0.3
+"""How long a lock is waited for: a process that only asks whether it is held has it for a moment."""
+PROBE_TIMEOUT_S, PROBE_INTERVAL_S = 0.03, 0.002
+"""The same between two processes that only ask."""
+OWNER_OFFSET = 1
+"""Where the owner's process number starts: on Windows, other processes cannot read the first byte, which is locked."""
 
 
 @contextmanager
-def held(path: Path) -> Iterator[None]:
-    """Hold the file for this process, whose number it contains, for people.
+def hold_lock(path: Path) -> Iterator[None]:
+    """Hold the lock file for this process, and write the process number into it.
 
-    Raises BlockingIOError while another process holds it, OSError where it cannot be written.
+    Raises BlockingIOError while another process holds it, OSError where it cannot be written or is a symbolic link.
     """
-    file = _hold_patiently(path)
+    lock = FileLock(path, timeout=ACQUIRE_TIMEOUT_S)
     try:
+        lock.acquire()
+    except Timeout as error:
+        raise BlockingIOError(f"{path} is held by another process") from error
+    try:
+        _write_owner(path)
         yield
     finally:
-        if os.name == "nt":  # where an open file cannot be removed; elsewhere its name goes before the lock does
-            file.close()
-        with suppress(OSError):
+        with suppress(OSError):  # Windows removes no open file, which leaves an empty lock behind
             path.unlink()
-        file.close()
+        lock.release()
 
 
-def is_held(path: Path) -> bool:
-    """Whether a living process holds the file; False where there is none, or none that can be read."""
+def is_locked(path: Path) -> bool:
+    """Whether a living process holds the lock; False where the file is missing or cannot be opened."""
+    if not path.is_file() or path.is_symlink():
+        return False
     try:
-        with path.open("r+" if os.name == "nt" else "r", encoding="ascii") as file:
-            _lock(file, shared=True)
+        with FileLock(path, timeout=PROBE_TIMEOUT_S, poll_interval=PROBE_INTERVAL_S):
             return False
-    except BlockingIOError:
+    except Timeout:
         return True
     except OSError:
         return False
 
 
-def owner(path: Path) -> int:
-    """The process that the file names; 0 where it names none."""
+def lock_owner(path: Path) -> int:
+    """Number of the process that holds the lock; 0 where it is unknown."""
     try:
-        return int(path.read_text(encoding="ascii"))
-    except (OSError, ValueError):
+        file_size(path)  # refuses pipes, whose reading need never end
+        with path.open("rb") as file:
+            file.seek(OWNER_OFFSET)
+            return int(file.read(20))
+    except (StgaError, OSError, ValueError):
         return 0
 
 
-def _hold_patiently(path: Path) -> IO[str]:
-    until = time.monotonic() + PATIENCE_S
-    while True:
+def _write_owner(path: Path) -> None:
+    with suppress(OSError):  # only messages need it
+        descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0))
         try:
-            return _hold(path)
-        except BlockingIOError:
-            if time.monotonic() > until:
-                raise
-            time.sleep(0.02)
-
-
-def _hold(path: Path) -> IO[str]:
-    while True:
-        file = path.open("a+", encoding="ascii")
-        try:
-            _lock(file)
-            # Its last owner may have removed the name between our opening and locking it: then it guards nothing.
-            if os.name == "nt" or _is_named(path, file):
-                file.truncate(0)
-                file.write(str(os.getpid()))
-                file.flush()
-                return file
-        except BaseException:
-            file.close()
-            raise
-        file.close()
-
-
-def _is_named(path: Path, file: IO[str]) -> bool:
-    try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except FileNotFoundError:
-        return False
-
-
-if os.name == "nt":
-    import msvcrt
-
-    def _lock(file: IO[str], shared: bool = False) -> None:
-        file.seek(1 << 30)  # far behind the content, which stays readable
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
-        except OSError as error:
-            raise BlockingIOError(error.errno, error.strerror) from error
-        file.seek(0)
-
-else:
-    import fcntl
-
-    def _lock(file: IO[str], shared: bool = False) -> None:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            os.lseek(descriptor, OWNER_OFFSET, os.SEEK_SET)
+            os.write(descriptor, b"%-20d" % os.getpid())
+        finally:
+            os.close(descriptor)

@@ -93,10 +93,10 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
 
 @pytest.fixture
 def bare(extension, monkeypatch):
-    """Call it, and Blender's Python lacks what commands need; the runtime is the Python of this test."""
+    """Call it, and Blender's Python lacks what commands need; the training environment is the Python of this test."""
 
     def make_bare() -> None:
-        monkeypatch.setattr(extension.operators.command_line, "missing_here", lambda: ["torch"])
+        monkeypatch.setattr(extension.operators.command_line, "missing_packages", lambda: ["torch"])
         monkeypatch.setattr(extension.operators.command_line, "training_python", lambda context: sys.executable)
 
     return make_bare
@@ -104,7 +104,7 @@ def bare(extension, monkeypatch):
 
 @pytest.mark.slow
 def test_render_of_the_open_head(stga, bare, tmp_path):
-    """Catches a render verb that cannot find avatar or capture in the file, and a runtime that draws another motion."""
+    """Catches a render verb that cannot find avatar or capture in the file, or draws another motion."""
     pytest.importorskip("numba")
     folder, model = write_flame_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
@@ -127,12 +127,12 @@ def test_render_of_the_open_head(stga, bare, tmp_path):
     assert here != tracked
 
 
-def test_no_runtime_is_one_sentence(stga, extension, folder, monkeypatch, capsys):
+def test_missing_training_environment(stga, extension, folder, monkeypatch, capsys):
     """Catches a traceback, or success, where nothing can train."""
-    for module in (extension.operators.command_line, extension.operators.environment.runtime):
-        monkeypatch.setattr(module, "missing_here", lambda: ["torch"])
+    for module in (extension.operators.command_line, extension.stga_addon.worker.environment):
+        monkeypatch.setattr(module, "missing_packages", lambda: ["torch"])
     assert stga("train", folder, "--out", folder / "run") == 2
-    assert "training needs a runtime" in capsys.readouterr().err
+    assert "blender --background --command stga environment make" in capsys.readouterr().err
     bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 
@@ -153,8 +153,8 @@ def test_training_is_the_panels(stga, bare, folder, tmp_path):
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert stga("train", "--out", tmp_path / "headless", *arguments) == 0
     bare()
-    assert stga("train", "--out", tmp_path / "runtime", *arguments) == 0
-    runs = ("panel", "headless", "runtime")
+    assert stga("train", "--out", tmp_path / "environment", *arguments) == 0
+    runs = ("panel", "headless", "environment")
     for run in runs:
         with np.load(tmp_path / run / "selection.npz") as stored:
             for timestep, faces in painted.items():

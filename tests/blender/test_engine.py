@@ -49,7 +49,7 @@ def _engine(empty_scene):
 
 
 def no_python() -> str:
-    raise StgaError("no runtime")
+    raise StgaError("no training environment")
 
 
 def camera_at(lens: float = 60.0, **data: object):
@@ -376,7 +376,7 @@ def test_cameras_that_cannot_be_drawn_through(kind):
     """Catches a picture that is silently of another kind than the camera."""
     if kind is not None:
         camera_at(type=kind)
-    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is no perspective camera"):
+    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"):
         bpy.ops.render.render()
 
 

@@ -26,10 +26,10 @@ from stga_addon.development.package import ROOT, build_zip, fetch_wheels
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import read_motion
-from stga_addon.worker.environment import missing_here
+from stga_addon.worker.environment import missing_packages
 
 # bpy that the tests themselves run in, and others: (version, the variable with the path of a Python that has it)
-RUNTIME = "" if missing_here() else sys.executable
+TRAINING_PYTHON = "" if missing_packages() else sys.executable
 VERSIONS = {"this": None, "4.2": "STGA_BPY_4_2", "4.5": "STGA_BPY_4_5", "5.2": "STGA_BPY_5_2"}
 
 
@@ -69,7 +69,7 @@ def test_the_whole_workflow(version: str, zip_file: Path, tmp_path: Path) -> Non
     assert version == "this" or result["version"].startswith(version)
     assert max(result["counted"]) > 0
     assert result["left"] == []
-    if result["can train"] or RUNTIME:
+    if result["can train"] or TRAINING_PYTHON:
         assert result["trained"] == len(read_avatar(tmp_path / "run/avatar.npz").splats)
     assert (tmp_path / "pictures").is_dir() == result["can train"]
     own = capture.flame
@@ -89,7 +89,7 @@ def test_the_whole_workflow(version: str, zip_file: Path, tmp_path: Path) -> Non
 def run(python: str, archive: Path, folder: Path) -> dict[str, object]:
     """What `workflow.py` reports, from a fresh Blender profile."""
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile")}
-    command = [python, str(Path(__file__).with_name("workflow.py")), str(archive), str(folder), RUNTIME]
+    command = [python, str(Path(__file__).with_name("workflow.py")), str(archive), str(folder), TRAINING_PYTHON]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))

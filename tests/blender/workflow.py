@@ -1,8 +1,8 @@
 """An artist's way through the installed extension; run by `test_versions.py` in a Python of its own with some bpy.
 
-    python workflow.py ZIP FOLDER RUNTIME
+    python workflow.py ZIP FOLDER PYTHON
 
-FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. RUNTIME is the Python that trains
+FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. PYTHON is the one that trains
 where this one cannot; "" if there is none. Prints RESULT and JSON.
 """
 
@@ -18,7 +18,7 @@ import bpy
 MODULE = "bl_ext.user_default.stga"
 
 
-def main(archive: str, folder: Path, runtime: str) -> dict[str, object]:
+def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.preferences.addon_enable(module=MODULE)
@@ -30,9 +30,9 @@ def main(archive: str, folder: Path, runtime: str) -> dict[str, object]:
     ops.heat_map()
     ops.heat_map(show=False)
     if not can_train():
-        bpy.context.preferences.addons[MODULE].preferences.runtime_python = runtime
+        bpy.context.preferences.addons[MODULE].preferences.training_python = python
     trained = 0
-    if can_train() or runtime:
+    if can_train() or python:
         ops.train(directory=str(folder / "run"), iterations=3)
         ops.show_avatar(filepath=bpy.context.scene.stga.avatar)
         trained = len(positions()) // 3

@@ -56,8 +56,8 @@ def test_order_and_content(views: list[View]) -> None:
     order = [views[i] for i in (3, 1, 1, 8, 0)]
     with ViewLoader(order) as loader:
         loaded = list(loader)
-    assert [view for view, _, _ in loaded] == order
-    for view, image, mask in loaded:
+    assert [item.view for item in loaded] == order
+    for view, image, mask, _ in loaded:
         np.testing.assert_array_equal(image, factory.picture(view.timestep, view.camera_index))
         np.testing.assert_array_equal(mask, factory.silhouette() * 255)
 
@@ -82,7 +82,7 @@ def test_another_size_makes_room(views: list[View], decoded: list[str]) -> None:
     """Catches a coarse-to-fine run whose small images fill the cache for good."""
     sizes = [0.5, 0.5, 1.0, 1.0]
     with ViewLoader([views[0]] * 4, scale=sizes.__getitem__, cache_bytes=VIEW_BYTES) as loader:
-        shapes = [image.shape[0] for _, image, _ in loader]
+        shapes = [image.shape[0] for _, image, *_ in loader]
     assert shapes == [factory.HEIGHT // 2] * 2 + [factory.HEIGHT] * 2
     assert len(decoded) == 2
 
@@ -160,15 +160,15 @@ def test_scales_by_position(views: list[View]) -> None:
     sizes = [0.5, 1.0, 0.5, 0.25]
     with ViewLoader([views[0]] * 4, scale=lambda position: sizes[position]) as loader:
         loaded = list(loader)
-    shapes = [image.shape[:2] for _, image, _ in loaded]
+    shapes = [image.shape[:2] for _, image, *_ in loaded]
     assert shapes == [(30, 20), (60, 40), (30, 20), (15, 10)]
-    assert shapes == [(view.camera.height, view.camera.width) for view, _, _ in loaded]
+    assert shapes == [(view.camera.height, view.camera.width) for view, *_ in loaded]
 
 
 def test_shared_arrays_are_read_only(views: list[View]) -> None:
     """Catches a consumer that changes the cached image under the next visit's feet."""
     with ViewLoader(views[:1]) as loader:
-        _, image, mask = next(loader)
+        _, image, mask, _ = next(loader)
     assert mask is not None
     for array in (image, mask):
         with pytest.raises(ValueError, match="read-only"):
@@ -190,3 +190,29 @@ def test_waiting_is_counted(views: list[View], monkeypatch: pytest.MonkeyPatch) 
         wait_until(lambda: loader_threads() == 0)
         list(loader)
         assert loader.waited_s < 0.05
+
+
+def test_meshes_are_read_in_the_thread_and_bounded(views: list[View]) -> None:
+    """Catches meshes of another timestep, read by the consumer, or queued without limit."""
+    read: list[tuple[int, str]] = []
+
+    def mesh(timestep: int) -> np.ndarray:
+        read.append((timestep, threading.current_thread().name))
+        return np.full((1000, 3), float(timestep))
+
+    item_bytes = VIEW_BYTES + 24_000
+    with ViewLoader(itertools.cycle(views), queue_bytes=2 * item_bytes, cache_bytes=0, mesh=mesh) as loader:
+        first = next(loader)
+        wait_until(lambda: len(read) == 4)
+        time.sleep(0.1)
+        assert len(read) == 4  # one taken, two ready, one waiting for room
+        for loaded in (first, *itertools.islice(loader, 8)):
+            assert loaded.mesh is not None
+            assert (loaded.mesh == loaded.view.timestep).all()
+    assert {thread for _, thread in read} == {"view loader"}
+
+
+def test_without_meshes_none_is_read(views: list[View]) -> None:
+    """Catches a loader that yields a mesh where the trainer has a refined one of its own."""
+    with ViewLoader(views[:1]) as loader:
+        assert next(loader).mesh is None

@@ -11,9 +11,8 @@ from training.heads import write_head
 from stga_addon.capture.images import read_view
 from stga_addon.effects.plan import plan_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
-from stga_addon.training.optimize import cpu_backend, frames, trainer
+from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
-from stga_addon.training.optimize.trainer import initial_splats
 from stga_addon.training.run import loop
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
@@ -24,8 +23,8 @@ from .test_rules import unlike_cameras
 # What each effect calls, by where the call is made from.
 CALLS = {
     "background": (cpu_backend, "change_background"),
-    "hull-points": (trainer, "hull_points"),
-    "density": (trainer, "control_density"),
+    "hull-points": (initial_splats, "hull_points"),
+    "density": (strategies, "control_density"),
     "selection": (loop, "select_capture"),
     "strain-color": (frames, "strain_basis"),
 }
@@ -78,7 +77,7 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
     capture, _ = write_head(tmp_path / "head")
     settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
     calls: Counter[str] = Counter()
-    for module, name in ((trainer, "track"), (cpu_backend, "frame_backward"), (loop, "write_tracking")):
+    for module, name in ((trainer, "refinable_tracking"), (cpu_backend, "frame_backward"), (loop, "write_tracking")):
         monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
     loop.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
     if choice == "off":
@@ -86,7 +85,7 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
         assert read_checkpoint(tmp_path / "run").tracking is None
         assert not (tmp_path / "run/tracking.npz").exists()
     else:
-        assert calls["track"] == 1
+        assert calls["refinable_tracking"] == 1
         assert calls["frame_backward"] == ITERATIONS - 2  # none in the first 15 %
         assert calls["write_tracking"] > 0
 
@@ -123,7 +122,7 @@ def test_no_splats_on_teeth(painted):
     flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
     toothed = replace(capture, faces=faces, neutral=np.concatenate([capture.neutral, rows]), flame=flame)
     for kept in (True, False):
-        splats = initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
+        splats = initial_splats.initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
         on_teeth = (splats.face >= len(capture.faces)).sum()
         assert on_teeth == (6 * TEETH_FACES if kept else 0)
         assert len(splats) - on_teeth == 6 * len(capture.faces)

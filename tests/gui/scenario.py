@@ -1,4 +1,4 @@
-"""Runs inside a Blender with a window, started by test_scenario.py: trains as a person would, and mistreats the worker.
+"""Runs inside a Blender with a window, started by test_scenario.py: trains as a user would, and kills the worker.
 
 `blender [FILE] --python scenario.py -- PART RESULT CAPTURE BLEND PYTHON`: PART is the name of a function below, RESULT
 the JSON file that says what was seen.
@@ -22,9 +22,10 @@ STEP_S, PATIENCE_S = 0.1, 180.0
 seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-watch = sys.modules[f"{extension}.operators.monitor"]
-runtime_folder = sys.modules[f"{extension}.operators.environment"].runtime_folder
-task_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].task_folder
+monitor = sys.modules[f"{extension}.operators.monitor"]
+environment_folder = sys.modules[f"{extension}.operators.environment"].environment_folder
+status_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].status_folder
+lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
 
 
 def timed(name: str, action: Callable[..., Any]) -> Callable[..., Any]:
@@ -46,11 +47,11 @@ def chosen() -> Any:
 
 
 def state() -> str:
-    return str(watch.snapshot_of(bpy.context.scene).state)
+    return str(monitor.training_of(bpy.context.scene).snapshot.state)
 
 
 def figures() -> dict[str, float]:
-    return dict(watch.snapshot_of(bpy.context.scene).status.figures)
+    return dict(monitor.training_of(bpy.context.scene).snapshot.status.figures)
 
 
 def is_training() -> bool:
@@ -62,17 +63,17 @@ def splats() -> int:
 
 
 def job_folder() -> Path:
-    return watch.job_folder(watch.run_of(bpy.context.scene))
+    return monitor.job_folder(monitor.training_of(bpy.context.scene).folder)
 
 
 def first() -> Iterator[Callable[[], bool]]:
     """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the worker at work."""
-    bpy.context.preferences.addons[extension].preferences.runtime_python = PYTHON
+    bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_environment()
-    runtime = task_folder(runtime_folder())
-    yield lambda: not watch.snapshot(runtime).state.is_alive
-    seen["runtime"] = watch.snapshot(runtime).status.message or watch.snapshot(runtime).status.error
+    environment = status_folder(environment_folder())
+    yield lambda: not monitor.snapshot(environment).state.is_alive
+    seen["environment"] = monitor.snapshot(environment).status.message or monitor.snapshot(environment).status.error
     with in_window():
         bpy.ops.stga.import_capture(directory=CAPTURE)
     yield looks_at_head
@@ -92,9 +93,9 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.ops.stga.train(directory="//run", resume=True)
     yield is_training
     seen["resumed at"] = figures()["iteration"]
-    os.kill(int((job_folder() / "worker.lock").read_text()), signal.SIGKILL)
+    os.kill(lock_owner(job_folder() / "worker.lock"), signal.SIGKILL)
     yield lambda: state() == "lost"
-    seen["lost"] = watch.snapshot_of(bpy.context.scene).status.error
+    seen["lost"] = monitor.training_of(bpy.context.scene).snapshot.status.error
     bpy.ops.stga.copy_report()
     seen["clipboard"] = bpy.context.window_manager.clipboard
 
@@ -116,13 +117,13 @@ def first() -> Iterator[Callable[[], bool]]:
     before = figures()["iteration"]
     yield lambda: figures()["iteration"] > before
     seen["reopened"] = True
-    seen["left"] = int((job_folder() / "worker.lock").read_text())
+    seen["left"] = lock_owner(job_folder() / "worker.lock")
     bpy.ops.wm.save_mainfile()
 
 
 def second() -> Iterator[Callable[[], bool]]:
     """Find the worker that went on while Blender was closed; then a short run that ends by itself."""
-    seen["found"] = int((job_folder() / "worker.lock").read_text())
+    seen["found"] = lock_owner(job_folder() / "worker.lock")
     yield is_training
     bpy.ops.stga.cancel_training()
     yield lambda: state() == "cancelled" and chosen().result_shown
@@ -183,7 +184,7 @@ class Player:
         return None
 
 
-bpy.app.timers.unregister(watch.tick) if bpy.app.timers.is_registered(watch.tick) else None
-watch.tick, watch._push_undo = timed("tick", watch.tick), timed("undo step", watch._push_undo)
-watch.follow()
+bpy.app.timers.unregister(monitor.tick) if bpy.app.timers.is_registered(monitor.tick) else None
+monitor.tick, monitor._push_undo = timed("tick", monitor.tick), timed("undo step", monitor._push_undo)
+monitor._start_timer()
 bpy.app.timers.register(Player({"first": first, "second": second}[PART]()), first_interval=1.0, persistent=True)

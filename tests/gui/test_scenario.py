@@ -13,7 +13,7 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.development.package import build_zip
-from stga_addon.worker.process import ask_to_stop
+from stga_addon.worker.status import request_cancel
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
@@ -28,7 +28,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     blender(folder, "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
     yield folder
     for job in folder.glob("*/job"):  # whatever failed: no worker stays behind
-        ask_to_stop(job)
+        request_cancel(job)
 
 
 def blender(home: Path, *arguments: object) -> None:
@@ -56,7 +56,7 @@ def test_training_in_a_window(home: Path) -> None:
     """Catches what only a window has: the timer, its end, undo, reopening, and workers that outlive Blender."""
     capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
     seen = play(home, "first", capture)
-    assert seen["runtime"].startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert seen["environment"].startswith(f"Python {sys.version.split()[0]}, torch ")
     assert {"iteration", "per_second", "left_s", "splats", "memory_mb"} <= set(seen["figures"])
     assert seen["refreshed"]
     assert seen["cancelled"]["avatar"]

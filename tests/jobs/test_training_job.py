@@ -18,8 +18,17 @@ from stga_addon.jobs.training_job import TrainingJob, job_folder, read_job, run_
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.run.progress import describe_figures
 from stga_addon.training.settings import make_settings
-from stga_addon.worker import process as task
-from stga_addon.worker.process import State
+from stga_addon.worker.launch import start_worker
+from stga_addon.worker.status import (
+    CANCEL_FILE,
+    LOG_FILE,
+    STATUS_FILE,
+    WorkerState,
+    inspect_worker,
+    log_lines,
+    request_cancel,
+    status_writer,
+)
 
 
 @pytest.fixture
@@ -37,7 +46,7 @@ def painted() -> dict[int, np.ndarray]:
 
 
 def start(run: Path) -> "subprocess.Popen[bytes]":
-    return task.start(job_folder(run), sys.executable, training_job.worker_arguments(run))
+    return start_worker(job_folder(run), sys.executable, training_job.worker_arguments(run))
 
 
 def test_round_trip(tmp_path, capture):
@@ -53,10 +62,10 @@ def test_the_next_job_forgets_the_last(tmp_path, capture):
     """Catches yesterday's selection, preview or wish to cancel in today's training."""
     run, folder = tmp_path / "run", job_folder(tmp_path / "run")
     write_job(run, new_job(capture), painted())
-    for name in (training_job.PREVIEW, task.CANCEL, task.STATUS):
+    for name in (training_job.PREVIEW, CANCEL_FILE, STATUS_FILE):
         (folder / name).write_text("{}")
     write_job(run, new_job(capture))
-    assert sorted(path.name for path in folder.iterdir()) == [training_job.JOB, task.LOG]
+    assert sorted(path.name for path in folder.iterdir()) == [training_job.JOB, LOG_FILE]
 
 
 def test_refusals(tmp_path, capture):
@@ -72,7 +81,7 @@ def test_refusals(tmp_path, capture):
     assert read_job(run).settings is None
     with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
         write_job(run, TrainingJob(capture, None, "opencv", None))
-    with task.telling(job_folder(run)), pytest.raises(StgaError, match="another worker is at work"):
+    with status_writer(job_folder(run)), pytest.raises(StgaError, match="another worker is running"):
         write_job(run, TrainingJob(capture, None, "vhap", None))
 
 
@@ -110,9 +119,9 @@ def test_a_worker_trains_what_this_process_would(tmp_path, capture):
         write_job(run, new_job(capture), painted())
     assert run_training_job(here) == here / "avatar.npz"
     process = start(there)
-    assert process.wait(300) == 0, task.log_lines(job_folder(there), 50)
-    seen = task.look(job_folder(there), process)
-    assert seen.state == State.FINISHED
+    assert process.wait(300) == 0, log_lines(job_folder(there), 50)
+    seen = inspect_worker(job_folder(there), process)
+    assert seen.state == WorkerState.FINISHED
     assert seen.status.figures["splats"] > 0
     assert {"psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
     one, two = (read_npz(run / "avatar.npz") for run in (here, there))
@@ -135,19 +144,19 @@ def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path, capture):
 
     def cancel(progress):
         if progress.iteration == 5:
-            task.ask_to_stop(folder)
+            request_cancel(folder)
         assert progress.iteration <= 6
         return False
 
     run_training_job(run, also=cancel)
-    assert task.look(folder).state == State.CANCELLED
+    assert inspect_worker(folder).state == WorkerState.CANCELLED
     assert (run / "avatar.npz").exists()
     write_job(run, TrainingJob(capture, None, "opencv", None))
     first = []
     run_training_job(run, also=lambda progress: first.append(progress.iteration))
     assert min(n for n in first if n) > 5
     assert max(first) == 40
-    assert task.look(folder).state == State.FINISHED
+    assert inspect_worker(folder).state == WorkerState.FINISHED
 
 
 @pytest.mark.slow
@@ -200,8 +209,8 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     write_job(run, new_job(capture))
     (capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
     assert main(["job", str(run)]) == 2
-    seen = task.look(job_folder(run))
-    assert seen.state == State.FAILED
+    seen = inspect_worker(job_folder(run))
+    assert seen.state == WorkerState.FAILED
     assert "00003.obj" in seen.status.error
     assert seen.status.traceback == ""
 
@@ -211,10 +220,10 @@ def test_an_interpreter_without_anything_is_named(tmp_path, capture):
     write_job(tmp_path / "run", new_job(capture))
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv/bin/python"
-    process = task.start(job_folder(tmp_path / "run"), str(python), training_job.worker_arguments(tmp_path / "run"))
+    process = start_worker(job_folder(tmp_path / "run"), str(python), training_job.worker_arguments(tmp_path / "run"))
     assert process.wait(60) == 2
-    seen = task.look(job_folder(tmp_path / "run"), process)
-    assert seen.status.error == f"the worker ended with exit status 2: stga: {python} lacks the package 'numpy'"
+    seen = inspect_worker(job_folder(tmp_path / "run"), process)
+    assert seen.status.error == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
 
 
 def test_a_head_that_is_not_there_is_a_sentence(tmp_path):
@@ -230,3 +239,20 @@ def test_a_head_that_is_not_there_is_a_sentence(tmp_path):
 def _made(folder: Path) -> Path:
     folder.mkdir(parents=True)
     return folder
+
+
+def test_removed_job_leaves_other_files(tmp_path, capture):
+    """Catches *Dismiss* removing a person's files along a path that a .blend file names."""
+    folder = job_folder(tmp_path / "run")
+    folder.mkdir(parents=True)
+    for name in (STATUS_FILE, LOG_FILE, "notes.txt"):
+        (folder / name).write_text("mine")
+    training_job.remove_job(tmp_path / "run")
+    assert len(list(folder.iterdir())) == 3  # no job
+    write_job(tmp_path / "run", new_job(capture), painted())
+    training_job.remove_job(tmp_path / "run")
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    write_job(tmp_path / "run", new_job(capture), painted())
+    training_job.remove_job(tmp_path / "run")
+    assert not folder.exists()

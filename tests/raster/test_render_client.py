@@ -131,13 +131,13 @@ def test_a_worker_draws_the_same(monkeypatch):
 
 
 def test_nobody_who_can_draw_is_one_sentence(monkeypatch):
-    """Catches a traceback where Blender's Python has no numba and no runtime is set."""
+    """Catches a traceback where Blender's Python has no numba and there is no training environment."""
 
     def nobody() -> str:
-        raise StgaError("no runtime")
+        raise StgaError("no training environment")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
-    with pytest.raises(StgaError, match=r"drawing splats needs numba and platformdirs in Blender's own .*runtime"):
+    with pytest.raises(StgaError, match=r"drawing splats needs numba and platformdirs .*training environment"):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)

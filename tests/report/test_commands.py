@@ -19,7 +19,7 @@ def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches presets that are not told, or without their time, or without what was timed."""
     assert main(["presets", str(toy_root), "--device", "cpu"]) == 0
     device, *lines = capsys.readouterr().out.splitlines()
-    assert device == "training on the CPU, as asked for"
+    assert device == "Training on the CPU (--device cpu)"
     assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
     assert lines[1].split()[1:6] == ["3000", "iterations", "about", "3", "s"]
 

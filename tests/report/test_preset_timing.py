@@ -1,4 +1,4 @@
-"""Plans: how long a preset takes."""
+"""Preset timing."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,7 +8,7 @@ import pytest
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.report import preset_timing
-from stga_addon.report.preset_timing import SETTLING, seconds_per_iteration, time_presets
+from stga_addon.report.preset_timing import WARM_UP_ITERATIONS, seconds_per_iteration, time_presets
 from stga_addon.training.settings import PRESETS, Preset, make_settings
 
 
@@ -30,7 +30,7 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         def __init__(self, *_: Any, **__: Any) -> None:
             pass
 
-        def step(self, view: Any, image: Any, share: float, mask: Any) -> None:
+        def step(self, view: Any, image: Any, share: float, mask: Any, mesh: Any) -> None:
             assert not image.flags.writeable
             assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
             watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000
@@ -48,17 +48,17 @@ def test_the_mean_over_the_whole_course(toy: Capture, shares: list[float]) -> No
     fine, coarse = 0.024, 0.006
     steps = [0.8 / coarse, 1.6 / fine]  # seconds at each size over the time of a step
     assert pace == pytest.approx(2.4 / sum(steps), rel=0.05)
-    assert shares[: SETTLING + 1] == [0.0] * (SETTLING + 1)
+    assert shares[: WARM_UP_ITERATIONS + 1] == [0.0] * (WARM_UP_ITERATIONS + 1)
     assert shares == sorted(shares)
     assert 0.97 < shares[-1] < 1
 
 
-def test_plans(toy: Capture, shares: list[float]) -> None:
+def test_timings_of_all_presets(toy: Capture, shares: list[float]) -> None:
     """Catches presets out of order, and a long capture that gets no more time than a short one."""
-    plans = time_presets(toy, seconds=0.1)
-    assert [plan.preset for plan in plans] == list(PRESETS)
-    assert [plan.seconds for plan in plans] == sorted(plan.seconds for plan in plans)
-    assert plans[1].seconds == pytest.approx(PRESETS["standard"].iterations * 0.024, rel=0.01)
+    timings = time_presets(toy, seconds=0.1)
+    assert [timing.preset for timing in timings] == list(PRESETS)
+    assert [timing.seconds for timing in timings] == sorted(timing.seconds for timing in timings)
+    assert timings[1].seconds == pytest.approx(PRESETS["standard"].iterations * 0.024, rel=0.01)
     assert time_presets(toy, ["final"], 0.1)[0].as_json()["preset"] == "final"
 
 

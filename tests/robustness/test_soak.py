@@ -70,7 +70,7 @@ def soak(capture: Capture, until: int, on: int, seed: int = 0) -> Soak:
     for iteration in range(until):
         view, image, _ = views[rng.integers(len(views))]
         share = rng.choice([0.0, 0.01, 0.2, 0.7, 1.0])
-        trainer.selection = {view.timestep: rng.random(len(capture.faces)) < share}
+        trainer.strategy.selection = {view.timestep: rng.random(len(capture.faces)) < share}
         _step(trainer, view, image, iteration, found)
         if (iteration + 1) % MARK == 0:
             _mark(trainer, found)
@@ -86,7 +86,7 @@ def _step(trainer: Trainer, view, image: np.ndarray, iteration: int, found: Soak
         return
     found.local += 1
     if trainer.iteration % STRAYS and trainer.iteration % DENSITY:  # those two may touch every row
-        frozen = ~trainer.selection[view.timestep][face]
+        frozen = ~trainer.strategy.selection[view.timestep][face]
         after = bits(trainer.state)
         if any(not np.array_equal(before[name][frozen], after[name][frozen]) for name in before):
             found.thawed.append(iteration)

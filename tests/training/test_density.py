@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.rasterize import Parameters
-from stga_addon.training.optimize.density import FAINT, control_density
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.training.optimize.density import MIN_OPACITY, control_density
 from stga_addon.training.optimize.state import TrainState, keep_rows, new_state, tensors_of
 
 from .toys import bits, random_state
 
 FACES, COUNT = 6, 40
-FAINT_LOGIT = float(np.log(FAINT / (1 - FAINT)))
+FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
 def busy_state(pulled: list[int]) -> TrainState:
@@ -30,7 +30,7 @@ def busy_state(pulled: list[int]) -> TrainState:
 
 
 def control(state: TrainState, room: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
-    return control_density(state, room, share, np.random.default_rng(seed))
+    return control_density(state, room, np.random.default_rng(seed), share)
 
 
 def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
@@ -103,7 +103,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     state = new_state(splats)
     parent = cover(state)
     state.screen_gradient[0], state.gradient_count[0] = 1.0, 1.0
-    split = control_density(state, 10, 1.0, np.random.default_rng(0))
+    split = control_density(state, 10, np.random.default_rng(0), 1.0)
     assert len(split) == 2
     children = cover(split)
     assert 0.6 < children.sum() / parent.sum() < 1.15

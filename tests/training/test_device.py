@@ -1,4 +1,4 @@
-"""Which device trains, and what is said where it cannot be the one that was asked for."""
+"""Choice of the training device, and the message if the wanted one cannot be used."""
 
 import ctypes
 import subprocess
@@ -37,7 +37,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Gpu:
 def test_a_working_gpu_is_taken(gpu: Gpu) -> None:
     """Catches "auto" that never takes the GPU, and "cpu" that does."""
     for wanted in ("auto", "cuda"):
-        assert choose_device(wanted) == ("cuda:0", "training on Card (8192 MiB of memory free)")
+        assert choose_device(wanted) == ("cuda:0", "Training on Card (8192 MiB of free memory)")
     assert choose_device("cpu")[0] == "cpu"
     assert choose_device("warp-cpu")[0] == "warp-cpu"
 
@@ -51,15 +51,15 @@ def no_driver(name: str) -> None:
 
 
 WRONG = {
-    "no package": ((device_module, "find_spec", lambda name: None), "warp-lang, .* is not installed"),
+    "no package": ((device_module, "find_spec", lambda name: None), "warp-lang .* is not installed"),
     "no driver": ((ctypes, "CDLL", no_driver), "no NVIDIA driver"),
-    "no card": ((warp, "is_cuda_available", lambda: False), "finds no GPU"),
+    "no card": ((warp, "is_cuda_available", lambda: False), "finds no usable GPU"),
     "no memory": (
         (warp, "get_cuda_device", lambda: Gpu(free_memory=MIN_FREE_BYTES // 2)),
-        "512 MiB .* 1024 are needed",
+        "512 MiB .* at least 1024 MiB",
     ),
     "no compiler": ((self_test, "compile_kernels", broken), r"failed \(nvrtc: too old\)$"),
-    "wrong numbers": ((self_test, "passes", lambda name: False), "wrong numbers"),
+    "wrong numbers": ((self_test, "passes", lambda name: False), "fails the self-test: its results are wrong"),
 }
 
 
@@ -72,7 +72,7 @@ def test_what_is_wrong_is_said_and_only_auto_falls_back(gpu: Gpu, monkeypatch: p
         choose_device("cuda")
     chosen, why = choose_device("auto")
     assert chosen == "cpu"
-    assert why.startswith("training on the CPU: ")
+    assert why.startswith("Training on the CPU: ")
 
 
 def test_warp_is_imported_only_where_it_works() -> None:

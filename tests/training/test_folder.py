@@ -18,6 +18,7 @@ from stga_addon.training.run import folder, metrics_log
 from stga_addon.training.run.checkpoint import Checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import STRATEGIES, make_settings
+from stga_addon.worker.lock import lock_owner
 
 from .toys import random_state
 
@@ -258,9 +259,9 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         with pytest.raises(StgaError, match=f"process {other.pid}"), folder.locked(target):
             pass
         other.kill()
-    assert (target / "run.lock").read_text() == str(other.pid)
+    assert lock_owner(target / "run.lock") == other.pid
     with folder.locked(target):  # its process is gone
-        assert (target / "run.lock").read_text() == str(os.getpid())
+        assert lock_owner(target / "run.lock") == os.getpid()
 
 
 @pytest.mark.parametrize("content", ["", "hello", "0", "1", str(os.getpid())])

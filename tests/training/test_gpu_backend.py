@@ -17,8 +17,9 @@ from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
+from stga_addon.training.optimize.initial_splats import initial_splats
+from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
-from stga_addon.training.optimize.trainer import face_lengths, initial_splats
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
@@ -50,7 +51,7 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
 
 def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
     """Both implementations with the same splats."""
-    lengths, frames = face_lengths(capture, settings.convention), FrameStore(capture, settings.convention, True)
+    lengths, frames = limit_units(capture, settings.convention), FrameStore(capture, settings.convention, True)
     cpu = CpuBackend(settings, lengths, frames, disturbed(capture, settings))
     return cpu, GpuBackend("cpu", settings, lengths, frames, disturbed(capture, settings))
 
@@ -58,7 +59,7 @@ def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuB
 def batch_of(capture: Capture, settings: TrainingSettings, timestep: int = 1, **changes: Any) -> Batch:
     view = view_of(capture, timestep)
     values = {
-        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3, np.float32), "degree": 3,
+        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3, np.float32), "sh_degree": 3,
         "selected": None, "rates": learning_rates(settings.rates, 0.0),
     }  # fmt: skip
     return Batch(**{**values, **changes})
@@ -83,8 +84,8 @@ def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
     batch = batch_of(toy, settings, **changes)
     cpu, warp = pair(toy, settings)
     before = tensors_of(warp.state)["parameters/xyz"].numpy().copy()
-    cpu.train(batch)
-    warp.train(batch)
+    cpu.step(batch)
+    warp.step(batch)
     expected, state = tensors_of(cpu.state), tensors_of(warp.state)
     assert not np.array_equal(before, expected["parameters/xyz"].numpy())
     for name in state:
@@ -102,7 +103,7 @@ def test_losses_are_the_cpus_and_told_two_iterations_late(toy: Capture) -> None:
     cpu, warp = pair(toy, settings)
     parts = [(1, None), (3, None), (1, toy.regions["mouth"]), (3, None), (1, None), (3, None)]
     batches = [batch_of(toy, settings, timestep, selected=part) for timestep, part in parts]
-    expected, told = ([step.train(batch) for batch in batches] for step in (cpu, warp))
+    expected, told = ([step.step(batch) for batch in batches] for step in (cpu, warp))
     assert [loss is None for loss in told] == [True, True, False, False, True, False]
     assert [told[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
 
@@ -111,10 +112,10 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
     """Catches momentum, limits or statistics that reach rows which the frame does not select."""
     settings = settings_of()
     _, warp = pair(toy, settings)
-    warp.train(batch_of(toy, settings))
+    warp.step(batch_of(toy, settings))
     before = bits(warp.state)
     for _ in range(2):
-        warp.train(batch_of(toy, settings, selected=toy.regions["mouth"]))
+        warp.step(batch_of(toy, settings, selected=toy.regions["mouth"]))
     state = warp.state
     after, selected = bits(state), toy.regions["mouth"][state.face.numpy()]
     for name in before:
@@ -130,12 +131,12 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     whole = batch_of(toy, settings, view=view, target=target)
     part = batch_of(toy, settings, view=view, target=target, selected=toy.regions["mouth"])
     (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
-    first.train(whole)
+    first.step(whole)
     second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
     for buffer in second._rasterizer.buffers._buffers.values():
         if buffer.dtype in warp_render.PARAMETER_TYPES:
             buffer.fill_(np.nan)
-    second.train(part)
+    second.step(part)
     assert 0 < second._rasterizer.buffers.get("rendered", 8 * 12, warp_render.wp.uint8).numpy().mean() < 0.8
     rows = np.flatnonzero(second.state.steps.numpy() != disturbed(toy, settings).steps.numpy())
     assert 20 < len(rows) < 0.5 * len(second)
@@ -153,7 +154,7 @@ def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest
         monkeypatch.setattr(warp_render, "INITIAL_PAIR_CAPACITY", capacity)
         _, step = pair(toy, settings)
         for batch in (*batches, *batches):
-            step.train(batch)
+            step.step(batch)
         results.append(bits(step.state))
     for name, want in results[0].items():
         np.testing.assert_array_equal(results[1][name], want, err_msg=name)
@@ -169,10 +170,10 @@ def test_full_memory_is_one_sentence(toy: Capture, monkeypatch: pytest.MonkeyPat
     _, step = pair(toy, settings)
     monkeypatch.setattr(warp_render.wp, "empty", full)
     with pytest.raises(StgaError, match=r"memory of .* is full; .* or give --device cpu"):
-        step.train(batch_of(toy, settings))
+        step.step(batch_of(toy, settings))
     monkeypatch.setattr(warp_render.wp, "empty", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        step.train(batch_of(toy, settings))
+        step.step(batch_of(toy, settings))
 
 
 def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:

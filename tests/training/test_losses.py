@@ -5,8 +5,9 @@ import pytest
 import torch
 from torch.nn.functional import conv2d
 
+from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
 from stga_addon.raster.cpu.layout import TILE
-from stga_addon.training.optimize.losses import LOSS_REACH_PX, image_gradient, similarity, tile_rectangles, whole_image
+from stga_addon.training.optimize.losses import image_gradient, similarity, tile_rectangles, whole_image
 
 # float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.
 TOLERANCE = 5e-4

@@ -9,7 +9,7 @@ import pytest
 
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import View
-from stga_addon.training.schedule import learning_rates, sh_degree, trains_globally, view_order
+from stga_addon.training.schedule import learning_rates, sh_degree, view_order
 from stga_addon.training.settings import Rates, TrainingSettings
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
@@ -56,31 +56,6 @@ def test_views_of_a_visit_stay_together() -> None:
         positions = [order.index(view) for view in frame]
         alone = [p for p in positions if p - 1 not in positions and p + 1 not in positions]
         assert len(alone) <= len(positions) % 2
-
-
-@pytest.mark.parametrize("every", [1, 2, 20])
-def test_global_every_so_many_local_iterations(every: int) -> None:
-    """Catches an off-by-one: `every` local iterations, then a global one, from the first iteration on."""
-    settings = TrainingSettings(strategy="selective", global_interval=every, global_unit="iteration", warm_up_share=0.0)
-    kinds = [trains_globally(settings, n, 0, 0.5) for n in range(3 * (every + 1))]
-    assert kinds == ([False] * every + [True]) * 3
-
-
-def test_global_every_so_many_frames() -> None:
-    """Catches the unit being ignored: with frames, the count of iterations must not matter."""
-    settings = TrainingSettings(strategy="selective", global_interval=3, global_unit="frame", warm_up_share=0.0)
-    for visit in range(12):
-        kinds = {trains_globally(settings, n, visit, 0.5) for n in range(10)}
-        assert kinds == {visit % 4 == 3}
-
-
-def test_warm_up_and_other_strategies_are_global() -> None:
-    """Catches local iterations before the head has taken shape, or in a run that should have none."""
-    settings = TrainingSettings(strategy="selective", warm_up_share=0.3)
-    assert all(trains_globally(settings, n, n, 0.29) for n in range(6))
-    assert not all(trains_globally(settings, n, n, 0.3) for n in range(6))
-    for strategy in ("global", "gaussian-avatars"):
-        assert all(trains_globally(TrainingSettings(strategy=strategy, warm_up_share=0.0), n, n, 0.9) for n in range(6))
 
 
 def test_sh_degree_rises_step_by_step() -> None:

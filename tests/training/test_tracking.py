@@ -17,7 +17,7 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.sequence import read_motion, sequence_mesh
-from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.tracking import Tracking, frame_gradient, refinable_tracking, with_refined_tracking
@@ -130,7 +130,7 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     No closer than this: splats that change places in depth, and their rims, are steps that no gradient tells of.
     """
     trainer, capture = finished, finished.capture
-    step, tracking = trainer._step, trainer.tracking
+    step, tracking = trainer._backend, trainer.tracking
     assert isinstance(step, CpuBackend)
     assert tracking is not None
     view = next(view for view in capture.views["train"] if view.timestep == 3)
@@ -142,8 +142,8 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     def differentiate(share: float) -> tuple[np.ndarray, float]:
         tracking.tracked = before.copy()
         tracking.tracked[row] += share * away
-        trainer.frames.forget()
-        rows, _, loss = step._differentiate(view, target, WHITE, 0, None)
+        trainer.frames.clear()
+        rows, _, loss = step._backward(view, target, WHITE, 0, None)
         assert loss is not None
         return rows, loss
 

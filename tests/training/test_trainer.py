@@ -17,7 +17,9 @@ from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
-from stga_addon.training.optimize.trainer import Trainer, face_lengths, initial_splats
+from stga_addon.training.optimize.initial_splats import initial_splats
+from stga_addon.training.optimize.losses import limit_units
+from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import STRATEGIES
 
@@ -43,9 +45,9 @@ def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) 
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
 
 
-def cpu_step(trainer: Trainer) -> CpuBackend:
-    assert isinstance(trainer._step, CpuBackend)
-    return trainer._step
+def cpu_backend(trainer: Trainer) -> CpuBackend:
+    assert isinstance(trainer._backend, CpuBackend)
+    return trainer._backend
 
 
 def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
@@ -98,8 +100,8 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    step = cpu_step(trainer)
-    rows, screen, loss = step._differentiate(view, target, WHITE, degree, None)
+    step = cpu_backend(trainer)
+    rows, screen, loss = step._backward(view, target, WHITE, degree, None)
     full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
     screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
@@ -107,7 +109,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for tensor in trainer.state.gradients:
         tensor.fill_(7.0)
-    rows, screen, loss = step._differentiate(view, target, WHITE, degree, focus)
+    rows, screen, loss = step._backward(view, target, WHITE, degree, focus)
     assert loss is None
     np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)
@@ -124,8 +126,10 @@ def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
     trainer = make_trainer(toy)
     view, _ = large(view_of(toy, 1))
     focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    everything = len(cpu_step(trainer)._render(trainer.state.arrays(), view, WHITE, 0).tiles)
-    assert 0 < len(cpu_step(trainer)._render(trainer.state.arrays(), view, WHITE, 0, focus).tiles) < 0.8 * everything
+    everything = len(cpu_backend(trainer)._forward(trainer.state.arrays(), view, WHITE, 0).tiles)
+    assert (
+        0 < len(cpu_backend(trainer)._forward(trainer.state.arrays(), view, WHITE, 0, focus).tiles) < 0.8 * everything
+    )
 
 
 @pytest.mark.parametrize("timestep", [0, 4])
@@ -252,5 +256,5 @@ def test_draw_is_a_copy(toy: Capture) -> None:
 def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
     """Catches limits in metres applied to GaussianAvatars' triangle units, and an area without its factor two."""
     areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
-    np.testing.assert_allclose(face_lengths(toy, "stga"), np.sqrt(2 * areas), rtol=1e-5)
-    np.testing.assert_array_equal(face_lengths(toy, "gaussian_avatars"), 1)
+    np.testing.assert_allclose(limit_units(toy, "stga"), np.sqrt(2 * areas), rtol=1e-5)
+    np.testing.assert_array_equal(limit_units(toy, "gaussian_avatars"), 1)

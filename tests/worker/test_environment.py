@@ -1,4 +1,4 @@
-"""The training runtime: which commands make it, what its test says, and how it fails."""
+"""The training environment: how it is chosen, made, checked, kept while in use, and removed; how making it fails."""
 
 import json
 import subprocess
@@ -8,14 +8,37 @@ from pathlib import Path
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.worker import environment as runtime
-from stga_addon.worker import process as task
-from stga_addon.worker.environment import InstallStep
-from stga_addon.worker.environment_check import NEEDED
-from stga_addon.worker.process import State
+from stga_addon.worker import environment
+from stga_addon.worker.environment import (
+    CHOICE_FILE,
+    PYTHON_VARIABLE,
+    InstallStep,
+    check_arguments,
+    check_python,
+    choose_device,
+    describe_check,
+    find_training_python,
+    install_steps,
+    made_python,
+    make_environment,
+    remove_environment,
+    status_folder,
+    store_choice,
+    stored_choice,
+    venv_python,
+)
+from stga_addon.worker.environment_use import environment_users
+from stga_addon.worker.launch import prepare_status_folder, start_worker
+from stga_addon.worker.requirements import GPU_REQUIREMENT, REQUIREMENTS
+from stga_addon.worker.status import LOG_FILE, WorkerState, inspect_worker, log_lines, read_status
 
 SMI = "| NVIDIA-SMI 575.57.08   Driver Version: 575.57.08   CUDA Version: {} |"
-FOUND = {"python": "3.11.7", "found": dict.fromkeys(NEEDED, "1.0"), "broken": {}, "device": "CPU with 4 threads"}
+FOUND = {
+    "python": "3.11.7",
+    "versions": dict.fromkeys(REQUIREMENTS, "1.0"),
+    "failures": {},
+    "device": "CPU with 4 threads",
+}
 
 
 @pytest.mark.parametrize(
@@ -31,127 +54,129 @@ FOUND = {"python": "3.11.7", "found": dict.fromkeys(NEEDED, "1.0"), "broken": {}
 )
 def test_the_device_fits_the_driver(device, driver, chosen):
     """Catches GPU packages where the driver is too old for them, and none where there is a GPU."""
-    assert runtime.device_for(device, SMI.format(driver) if driver else None) == chosen
+    assert choose_device(device, SMI.format(driver) if driver else None) == chosen
 
 
 def test_cuda_that_cannot_be_is_refused():
     """Catches gigabytes that are downloaded in vain."""
-    with pytest.raises(StgaError, match=r"goes up to CUDA 11\.4, training needs CUDA 12 or newer"):
-        runtime.device_for("cuda", SMI.format("11.4"))
+    with pytest.raises(StgaError, match=r"supports CUDA 11\.4, training needs CUDA 12 or newer"):
+        choose_device("cuda", SMI.format("11.4"))
     with pytest.raises(StgaError, match="finds no NVIDIA GPU"):
-        runtime.device_for("cuda", None)
+        choose_device("cuda", None)
 
 
 def test_steps(tmp_path):
     """Catches a site's own index passed over, a network that offline steps would need, and what is never installed."""
-    looking, making, small, rest = runtime.steps(tmp_path, "/python", "cuda", None, "linux")
+    looking, making, small, rest = install_steps(tmp_path, "/python", "cuda", None, "linux")
     assert making.command == ["/python", "-m", "venv", str(tmp_path)]
-    assert rest.command[0] == small.command[0] == str(runtime.venv_python(tmp_path))
-    assert small.command[-3:] == ["--index-url", "https://download.pytorch.org/whl/cpu", "torch"]
+    assert rest.command[0] == small.command[0] == str(venv_python(tmp_path))
+    assert small.command[-3:] == ["--index-url", "https://download.pytorch.org/whl/cpu", "torch>=2.4,<3"]
     assert small.optional  # where pytorch.org cannot be reached, there is PyPI
-    assert set(rest.command) >= {*NEEDED.values(), "warp-lang"}
+    assert set(rest.command) >= {*REQUIREMENTS.values(), GPU_REQUIREMENT}
     assert not rest.optional
     assert "--index-url" not in rest.command
-    assert runtime.steps(tmp_path, "/python", "cuda", None, "win32") == [looking, making, rest]
-    _, _, offline = runtime.steps(tmp_path, "/python", "cpu", tmp_path / "wheels", "linux")
+    assert install_steps(tmp_path, "/python", "cuda", None, "win32") == [looking, making, rest]
+    _, _, offline = install_steps(tmp_path, "/python", "cpu", tmp_path / "wheels", "linux")
     assert "--no-index" in offline.command
     assert str(tmp_path / "wheels") in offline.command
-    assert set(offline.command) >= set(NEEDED.values())
-    assert "warp-lang" not in offline.command
+    assert set(offline.command) >= set(REQUIREMENTS.values())
+    assert GPU_REQUIREMENT not in offline.command
 
 
 @pytest.mark.parametrize(("newest", "status"), [((3, 11), 0), ((99, 0), 1)])
 def test_an_old_python_is_refused_at_once(newest, status, tmp_path, monkeypatch):
     """Catches gigabytes that are downloaded for a Python that cannot use them."""
-    monkeypatch.setattr(runtime, "OLDEST", newest)
-    looking = runtime.steps(tmp_path, sys.executable, "cpu", None)[0]
+    monkeypatch.setattr(environment, "MIN_PYTHON", newest)
+    looking = install_steps(tmp_path, sys.executable, "cpu", None)[0]
     done = subprocess.run(looking.command, capture_output=True, text=True)
     assert done.returncode == status
     assert ("ERROR: Python 3." in done.stderr) == bool(status)
 
 
 def test_what_an_interpreter_says():
-    """Catches a runtime that is called good and cannot train."""
-    assert runtime.describe("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
+    """Catches a training environment that is called good and cannot train."""
+    assert describe_check("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
     old = {**FOUND, "python": "3.9.1"}
     with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
-        runtime.describe("p", old)
-    bare = {**FOUND, "broken": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}}
+        describe_check("p", old)
+    bare = {**FOUND, "failures": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}}
     with pytest.raises(StgaError, match=r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"):
-        runtime.describe("p", bare)
+        describe_check("p", bare)
 
 
 def test_a_bare_interpreter_is_tested(tmp_path):
     """Catches a test that needs what it tests for: this one has nothing at all installed."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
-    python = str(runtime.venv_python(tmp_path / "venv"))
-    with pytest.raises(StgaError, match=r"lacks torch, numba, scipy, pillow, platformdirs, trimesh, tqdm; install"):
-        runtime.probe(python)
+    python = str(venv_python(tmp_path / "venv"))
+    with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*matplotlib; install"):
+        check_python(python)
 
 
 def test_what_is_no_interpreter(tmp_path):
     """Catches tracebacks where a path leads to nothing, or to another program."""
     with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
-        runtime.probe(str(tmp_path / "python"))
-    with pytest.raises(StgaError, match=r"is no Python that can run this add-on \(exit status 1\)"):
-        runtime.probe("false")
+        check_python(str(tmp_path / "python"))
+    with pytest.raises(StgaError, match=r"is not a Python that runs this add-on \(exit status 1\)"):
+        check_python("false")
 
 
 @pytest.mark.slow
 def test_this_interpreter_can_train(tmp_path):
     """Catches a probe that misses what is there, and a worker that does not tell."""
     pytest.importorskip("torch")
-    folder = runtime.task_folder(tmp_path)
-    task.prepare(folder)
-    process = task.start(folder, sys.executable, runtime.testing_arguments(tmp_path, sys.executable))
-    assert process.wait(120) == 0, task.log_lines(folder, 50)
-    seen = task.look(folder, process)
-    assert seen.state == State.FINISHED
+    folder = status_folder(tmp_path)
+    prepare_status_folder(folder)
+    process = start_worker(folder, sys.executable, check_arguments(tmp_path, sys.executable))
+    assert process.wait(120) == 0, log_lines(folder, 50)
+    seen = inspect_worker(folder, process)
+    assert seen.state == WorkerState.FINISHED
     assert seen.status.message.startswith(f"Python {sys.version.split()[0]}, torch ")
 
 
 @pytest.fixture
 def tiny(monkeypatch):
     """Only the environment and this package's probe: what pip would do is not this test's."""
-    monkeypatch.setattr(runtime, "nvidia_smi", lambda: None)
-    monkeypatch.setattr(runtime, "SIZES_GB", {"cpu": 0.0, "cuda": 0.0})
+    monkeypatch.setattr(environment, "nvidia_smi", lambda: None)
+    monkeypatch.setattr(environment, "SIZES_GB", {"cpu": 0.0, "cuda": 0.0})
     made = [sys.executable, "-m", "venv", "--without-pip"]
-    monkeypatch.setattr(runtime, "steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])])
+    monkeypatch.setattr(
+        environment, "install_steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])]
+    )
 
 
-def test_a_runtime_is_made(tiny, tmp_path, monkeypatch):
-    """Catches a runtime that is used before it has passed the test, or not found afterwards."""
-    monkeypatch.setattr(runtime, "probe", lambda python: f"good {Path(python).exists()}")
-    python = runtime.venv_python(tmp_path / "venv-1")
+def test_environment_is_made(tiny, tmp_path, monkeypatch):
+    """Catches a training environment that is used before it has passed the test, or not found afterwards."""
+    monkeypatch.setattr(environment, "check_python", lambda python: f"good {Path(python).exists()}")
+    python = venv_python(tmp_path / "venv-1")
     python.parent.mkdir(parents=True)
     python.touch()
-    assert runtime.made_python(tmp_path) is None  # what a killed maker leaves
-    assert runtime.make(tmp_path, sys.executable) == "good True"
-    made = runtime.made_python(tmp_path)
+    assert made_python(tmp_path) is None  # what a killed maker leaves
+    assert make_environment(tmp_path, sys.executable) == "good True"
+    made = made_python(tmp_path)
     assert made is not None
-    assert [made] == [runtime.venv_python(folder) for folder in tmp_path.glob("venv-*")]
-    assert task.read_status(runtime.task_folder(tmp_path)).message == "good True"
+    assert [made] == [venv_python(folder) for folder in tmp_path.glob("venv-*")]
+    assert read_status(status_folder(tmp_path)).message == "good True"
 
 
-def test_a_runtime_that_fails_leaves_nothing(tiny, tmp_path):
-    """Catches half an environment that is taken for a runtime the next time."""
-    with pytest.raises(StgaError, match="lacks torch"):
-        runtime.make(tmp_path, sys.executable)
-    assert runtime.made_python(tmp_path) is None
+def test_failed_environment_is_removed(tiny, tmp_path):
+    """Catches half an environment that is taken for a training environment the next time."""
+    with pytest.raises(StgaError, match="lacks numpy, torch"):
+        make_environment(tmp_path, sys.executable)
+    assert made_python(tmp_path) is None
     assert not list(tmp_path.glob("venv*"))
-    assert task.look(runtime.task_folder(tmp_path)).state == State.FAILED
+    assert inspect_worker(status_folder(tmp_path)).state == WorkerState.FAILED
 
 
-def test_an_attempt_in_vain_keeps_the_runtime(tiny, tmp_path, monkeypatch):
-    """Catches an artist who can train, tries a newer runtime without a network, and can train no more."""
+def test_failed_attempt_keeps_the_environment(tiny, tmp_path, monkeypatch):
+    """Catches an artist who can train, tries a newer training environment without a network, and can train no more."""
     with monkeypatch.context() as patched:
-        patched.setattr(runtime, "probe", lambda python: "good")
-        runtime.make(tmp_path, sys.executable)
-    before = runtime.made_python(tmp_path)
-    with pytest.raises(StgaError, match="lacks torch"):
-        runtime.make(tmp_path, sys.executable)
+        patched.setattr(environment, "check_python", lambda python: "good")
+        make_environment(tmp_path, sys.executable)
+    before = made_python(tmp_path)
+    with pytest.raises(StgaError, match="lacks numpy, torch"):
+        make_environment(tmp_path, sys.executable)
     assert before is not None
-    assert runtime.made_python(tmp_path) == before
+    assert made_python(tmp_path) == before
 
 
 @pytest.mark.parametrize(
@@ -164,35 +189,37 @@ def test_an_attempt_in_vain_keeps_the_runtime(tiny, tmp_path, monkeypatch):
         ),
         (
             "WARNING: Retrying after connection broken by 'X'\nERROR: No matching distribution",
-            "indexes cannot be reached",
+            "index cannot be reached",
         ),
         ("ERROR: no matching distribution\nnotice", "ERROR: no matching distribution$"),
         ("connection broken by an optional step\n$ pip\nERROR: no space", "ERROR: no space$"),
-        ("ERROR: No matching distribution found for torch", "for torch: none that fits this Python and system$"),
+        ("ERROR: No matching distribution found for torch", "for torch: no version fits this Python and system$"),
         ("bye", "exit status 1$"),
     ],
 )
 def test_a_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypatch):
     """Catches pip's message lost in a log that nobody opens, and one that says nothing to an artist."""
-    log = runtime.task_folder(tmp_path) / task.LOG
+    log = status_folder(tmp_path) / LOG_FILE
     script = f"import sys; open({str(log)!r}, 'a').write({printed + chr(10)!r}); sys.exit(1)"
-    monkeypatch.setattr(runtime, "steps", lambda *_: [InstallStep("installing torch", [sys.executable, "-c", script])])
-    with pytest.raises(StgaError, match=f"installing torch: failed, .*{reason}"):
-        runtime.make(tmp_path, sys.executable)
+    monkeypatch.setattr(
+        environment, "install_steps", lambda *_: [InstallStep("installing torch", [sys.executable, "-c", script])]
+    )
+    with pytest.raises(StgaError, match=f"installing torch failed: .*{reason}"):
+        make_environment(tmp_path, sys.executable)
 
 
 def test_an_optional_step_may_fail(tiny, tmp_path, monkeypatch):
-    """Catches no runtime at all where pytorch.org cannot be reached, and PyPI can."""
-    monkeypatch.setattr(runtime, "probe", lambda python: "good")
+    """Catches no training environment at all where pytorch.org cannot be reached, and PyPI can."""
+    monkeypatch.setattr(environment, "check_python", lambda python: "good")
     failing = InstallStep("failing", [sys.executable, "-c", "raise SystemExit(1)"], optional=True)
-    making = runtime.steps
-    monkeypatch.setattr(runtime, "steps", lambda *given: [*making(*given), failing])
-    assert runtime.make(tmp_path, sys.executable) == "good"
+    making = environment.install_steps
+    monkeypatch.setattr(environment, "install_steps", lambda *given: [*making(*given), failing])
+    assert make_environment(tmp_path, sys.executable) == "good"
 
 
 def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
     """Catches a cancel that waits for a download to end, or leaves half an environment."""
-    folder = runtime.task_folder(tmp_path)
+    folder = status_folder(tmp_path)
     script = f"import pathlib, time; pathlib.Path({str(folder / 'cancel')!r}).touch(); time.sleep(600)"
     steps = [
         InstallStep(
@@ -200,17 +227,17 @@ def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
         ),
         InstallStep("waiting", [sys.executable, "-c", script]),
     ]
-    monkeypatch.setattr(runtime, "steps", lambda *_: steps)
-    assert runtime.make(tmp_path, sys.executable) == ""
-    assert task.look(folder).state == State.CANCELLED
+    monkeypatch.setattr(environment, "install_steps", lambda *_: steps)
+    assert make_environment(tmp_path, sys.executable) == ""
+    assert inspect_worker(folder).state == WorkerState.CANCELLED
     assert not list(tmp_path.glob("venv*"))
 
 
 def test_a_disk_too_small_is_refused(tmp_path, monkeypatch):
     """Catches a full disk after half an hour of downloading."""
-    monkeypatch.setattr(runtime.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
-    with pytest.raises(StgaError, match=r"has 0\.1 GB free, the runtime needs 1\.5 GB"):
-        runtime.make(tmp_path, sys.executable, "cpu")
+    monkeypatch.setattr(environment.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
+    with pytest.raises(StgaError, match=r"has 0\.1 GB free, the environment needs 1\.5 GB"):
+        make_environment(tmp_path, sys.executable, "cpu")
 
 
 def test_the_probe_runs_by_itself():
@@ -219,3 +246,97 @@ def test_the_probe_runs_by_itself():
         [sys.executable, "-m", "stga_addon.worker.environment_check"], capture_output=True, text=True, check=True
     )
     assert set(json.loads(done.stdout.splitlines()[-1])) == set(FOUND)
+
+
+@pytest.fixture
+def chosen(tmp_path, monkeypatch):
+    """An environment folder and a check that every interpreter passes."""
+    monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
+    monkeypatch.setattr(environment, "check_python", lambda python: "good")
+    return tmp_path / "environment"
+
+
+def test_order_of_choices(chosen, tiny, monkeypatch):
+    """Catches a farm's variable, the preferences or a stored choice that is overruled by a lower one."""
+    monkeypatch.setattr(environment, "missing_packages", lambda: ["torch"])
+    with pytest.raises(StgaError, match=rf"lacks torch.*stga environment make`.* use PATH`, or set {PYTHON_VARIABLE}"):
+        find_training_python(chosen)
+    monkeypatch.setattr(environment, "missing_packages", list)
+    assert find_training_python(chosen) == sys.executable
+    make_environment(chosen, sys.executable)
+    assert find_training_python(chosen) == str(venv_python(chosen / "venv-1"))
+    assert store_choice(chosen, "/stored/python") == "good"
+    assert find_training_python(chosen) == "/stored/python"
+    assert find_training_python(chosen, "/preferred/python") == "/preferred/python"
+    monkeypatch.setenv(PYTHON_VARIABLE, "/farm/python")
+    assert find_training_python(chosen, "/preferred/python") == "/farm/python"
+    monkeypatch.delenv(PYTHON_VARIABLE)
+    make_environment(chosen, sys.executable)  # the later choice
+    assert find_training_python(chosen) == str(venv_python(chosen / "venv-2"))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"python": 3}', "null"])
+def test_damaged_choice_is_a_sentence(tmp_path, text):
+    """Catches a traceback for a damaged choice.json."""
+    (tmp_path / CHOICE_FILE).write_text(text)
+    with pytest.raises(StgaError, match=CHOICE_FILE):
+        stored_choice(tmp_path)
+
+
+def test_choice_that_cannot_train_is_refused(tmp_path):
+    """Catches a choice stored although nothing can be trained with it."""
+    with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
+        store_choice(tmp_path, str(tmp_path / "python"))
+    assert not list(tmp_path.iterdir())
+
+
+def run_in(venv: Path) -> "subprocess.Popen[bytes]":
+    """A process of the environment that has marked it as used and waits for its input to end."""
+    code = (
+        f"import sys; sys.path[:0] = {[path for path in sys.path if path]!r}; "
+        "from stga_addon.worker.environment_use import mark_environment_used; mark_environment_used(); "
+        "print('ready', flush=True); sys.stdin.read()"
+    )
+    process = subprocess.Popen([str(venv_python(venv)), "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
+def test_environment_in_use_is_kept(chosen, tiny):
+    """Catches an environment removed or replaced while a worker trains with it."""
+    make_environment(chosen, sys.executable)
+    with run_in(chosen / "venv-1") as worker:
+        assert environment_users(chosen / "venv-1") == [worker.pid]
+        with pytest.raises(StgaError, match=rf"venv-1: is in use by process {worker.pid}"):
+            remove_environment(chosen)
+        make_environment(chosen, sys.executable)
+        assert venv_python(chosen / "venv-1").exists()
+        assert made_python(chosen) == venv_python(chosen / "venv-2")
+        worker.kill()
+    assert environment_users(chosen / "venv-1") == []
+    make_environment(chosen, sys.executable)
+    assert sorted(path.name for path in chosen.glob("venv-*")) == ["venv-3"]
+
+
+def test_environment_is_removed(chosen, tiny):
+    """Catches a removal that leaves the environment or the stored choice, or takes other files with it."""
+    make_environment(chosen, sys.executable)
+    store_choice(chosen, "/stored/python")
+    (chosen / "venv-notes").mkdir()
+    assert remove_environment(chosen) == 1
+    assert made_python(chosen) is None
+    assert stored_choice(chosen) == ""
+    assert (chosen / "venv-notes").exists()
+    assert remove_environment(chosen) == 0
+
+
+def test_installation_does_not_see_other_packages(tiny, tmp_path, monkeypatch):
+    """Catches pip that takes packages on the worker's path for installed ones."""
+    monkeypatch.setenv("PYTHONPATH", "/bundled")
+    monkeypatch.setattr(environment, "check_python", lambda python: "good")
+    code = "import os, sys; sys.exit('PYTHONPATH' in os.environ)"
+    making = environment.install_steps
+    step = InstallStep("looking", [sys.executable, "-c", code])
+    monkeypatch.setattr(environment, "install_steps", lambda *given: [*making(*given), step])
+    assert make_environment(tmp_path, sys.executable) == "good"

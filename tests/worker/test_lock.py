@@ -1,42 +1,93 @@
-"""Locks: held while a process lives, and only then."""
+"""Lock files: held while a process lives, and only then."""
 
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from stga_addon.worker import lock as locks
+from stga_addon.worker.lock import hold_lock, is_locked, lock_owner
 
 HOLD = (
-    "import sys; from pathlib import Path; from stga_addon.worker.lock import held\n"
-    "with held(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    "import sys; from pathlib import Path; from stga_addon.worker.lock import hold_lock\n"
+    "with hold_lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
 )
 
 
-def test_looking_neither_takes_nor_makes_a_lock(tmp_path: Path) -> None:
-    """Catches a look that leaves a lock file behind, or keeps out the worker that it looks for."""
+def test_probing_leaves_no_trace(tmp_path: Path) -> None:
+    """Catches a probe that leaves a lock file behind, or a held lock that it misses."""
     path = tmp_path / "worker.lock"
-    assert not locks.is_held(path)
+    assert not is_locked(path)
     assert not path.exists()
-    with locks.held(path):
-        assert locks.is_held(path)
-        assert locks.owner(path) == os.getpid()
-    assert not locks.is_held(path)
+    with hold_lock(path):
+        assert is_locked(path)
+        assert lock_owner(path) == os.getpid()
+    assert not is_locked(path)
 
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
-    """Catches a worker that counts as alive for ever after kill -9."""
+    """Catches a worker that is reported alive forever after kill -9."""
     path = tmp_path / "worker.lock"
     command = [sys.executable, "-c", HOLD, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
-        assert locks.is_held(path)
-        assert locks.owner(path) == other.pid
-        with pytest.raises(BlockingIOError), locks.held(path):
+        assert is_locked(path)
+        assert lock_owner(path) == other.pid
+        with pytest.raises(BlockingIOError), hold_lock(path):
             pass
         other.kill()
     assert path.exists()
-    assert not locks.is_held(path)
+    assert not is_locked(path)
+    with hold_lock(path):
+        assert lock_owner(path) == os.getpid()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
+def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
+    """Catches a file overwritten through a link at the lock's path."""
+    path, target = tmp_path / "run.lock", tmp_path / "target"
+    target.write_text("mine")
+    path.symlink_to(target)
+    with pytest.raises(OSError, match="symbolic link"), hold_lock(path):
+        pass
+    assert not is_locked(path)
+    assert target.read_text() == "mine"
+
+
+def test_probes_do_not_disturb_each_other(tmp_path: Path) -> None:
+    """Catches a free lock that one probe reports as held because another probe has it for a moment."""
+    path = tmp_path / "worker.lock"
+    path.touch()
+    with ThreadPoolExecutor(2) as threads:
+        assert not any(threads.map(lambda _: is_locked(path), range(100)))
+
+
+def test_probes_do_not_keep_a_holder_out(tmp_path: Path) -> None:
+    """Catches a worker that fails to start while its folder is watched."""
+    path, stop = tmp_path / "worker.lock", threading.Event()
+    path.touch()
+
+    def probe() -> None:
+        while not stop.is_set():
+            is_locked(path)
+
+    with ThreadPoolExecutor(2) as threads:
+        threads.submit(probe)
+        try:
+            for _ in range(20):
+                with hold_lock(path):
+                    pass
+        finally:
+            stop.set()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="named pipes are files on POSIX systems only")
+def test_owner_of_a_pipe_is_unknown(tmp_path: Path) -> None:
+    """Catches a read that never returns."""
+    os.mkfifo(tmp_path / "worker.lock")
+    assert lock_owner(tmp_path / "worker.lock") == 0
+    assert not is_locked(tmp_path / "worker.lock")

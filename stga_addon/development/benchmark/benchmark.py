@@ -1,4 +1,4 @@
-"""What accuracy costs in time: variants trained for the same wall time, in turns, and what came of them."""
+"""Benchmark of variants trained for the same wall time, and its report, table and chart."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,17 +16,17 @@ from ...report.run_summary import evaluation_share
 from ...training.run.folder import Run
 from ...training.settings import TrainingSettings
 from .chart import benchmark_chart
-from .scheduler import BenchmarkRun, Tell, race
+from .scheduler import BenchmarkRun, PrintProgress, train_in_turns
 from .statistics import (
     MeanCurve,
     Outcome,
     Spread,
-    alike,
-    forecasts_checked,
-    leaders,
+    count_forecasts,
     mean_curves,
     outcome_of,
-    summarise,
+    pareto_front,
+    summarize,
+    within_spread,
 )
 from .variants import STANDARD, Changes, settings_of
 
@@ -53,38 +53,38 @@ def run_benchmark(
     seconds: float,
     seeds: int,
     out: Path,
-    tell: Tell = print,
+    print_progress: PrintProgress = print,
 ) -> str:
     """Train every variant for `seconds` with each seed; returns the report, which is also written to `out`.
 
-    run: how `capture` is opened again; its settings do not matter. Leaves report.txt, benchmark.json, benchmark.csv and
-    benchmark.png beside the runs. What is done is kept and reported when this is interrupted, and taken up again when
-    it is called again. Raises StgaError where `out` holds a benchmark of other settings.
+    run: how `capture` is opened again; its settings are ignored. Writes report.txt, benchmark.json, benchmark.csv and
+    benchmark.png beside the runs, also when interrupted; the same call then continues.
+    Raises StgaError where `out` holds a benchmark of other settings.
     """
-    tell("deciding about effects")
+    print_progress("Deciding effects")
     runs = _runs(capture, run, variants, seconds)
-    jobs = {seed: {name: _job(run, name, seed, out) for name, run in runs.items()} for seed in range(seeds)}
-    for of_seed in jobs.values():
-        for job in of_seed.values():
-            job.check()
-    left = sum(not job.finished for of_seed in jobs.values() for job in of_seed.values())
+    by_seed = {seed: {name: _seeded(run, name, seed, out) for name, run in runs.items()} for seed in range(seeds)}
+    for of_seed in by_seed.values():
+        for one in of_seed.values():
+            one.check()
+    left = sum(not one.finished for of_seed in by_seed.values() for one in of_seed.values())
     if left:
         each, total = format_duration(seconds), format_duration(left * seconds)
-        tell(f"{left} runs of {each}: {total} of training; what starting and measuring take is on top")
+        print_progress(f"{left} runs of {each}: {total} of training, plus the time to start and to evaluate")
     try:
-        for seed, of_seed in jobs.items():
-            if not all(job.finished for job in of_seed.values()):
-                race(list(of_seed.values()), lambda text, seed=seed: tell(f"seed {seed}: {text}"))  # type: ignore[misc]
+        for seed, of_seed in by_seed.items():
+            if not all(one.finished for one in of_seed.values()):
+                train_in_turns(list(of_seed.values()), lambda text, seed=seed: print_progress(f"seed {seed}: {text}"))  # type: ignore[misc]
     except KeyboardInterrupt:
-        tell(f"what is finished stands in {out / 'report.txt'}; the same command goes on from here")
+        print_progress(f"Finished runs are reported in {out / 'report.txt'}; run the same command to continue")
         raise
     finally:
-        report = _write(run, jobs, seconds, out)
+        report = _write_report(run, by_seed, seconds, out)
     return report
 
 
 def _runs(capture: Capture, run: Run, variants: Mapping[str, Changes], seconds: float) -> dict[str, Run]:
-    """variant -> its run; one that would train as an earlier one does is left out."""
+    """variant -> its run; a variant with the settings of an earlier one is left out."""
     runs: dict[str, Run] = {}
     for name, changes in variants.items():
         decided = with_effect_plan(replace(run, settings=settings_of(changes, seconds)), capture)
@@ -97,14 +97,14 @@ def _same(a: TrainingSettings, b: TrainingSettings) -> bool:
     return replace(a, preset=None, effects=None) == replace(b, preset=None, effects=None)
 
 
-def _job(run: Run, name: str, seed: int, out: Path) -> BenchmarkRun:
+def _seeded(run: Run, name: str, seed: int, out: Path) -> BenchmarkRun:
     return BenchmarkRun(replace(run, settings=replace(run.settings, seed=seed)), out / f"{name}-{seed}")
 
 
-def _write(run: Run, jobs: Mapping[int, Mapping[str, BenchmarkRun]], seconds: float, out: Path) -> str:
-    """Write down whatever there is, and return the report."""
-    names = list(jobs[0])
-    found = [outcome_of(name, of_seed[name]) for name in names for of_seed in jobs.values()]
+def _write_report(run: Run, by_seed: Mapping[int, Mapping[str, BenchmarkRun]], seconds: float, out: Path) -> str:
+    """Write what is finished so far; returns the report."""
+    names = list(by_seed[0])
+    found = [outcome_of(name, of_seed[name]) for name in names for of_seed in by_seed.values()]
     outcomes = [outcome for outcome in found if outcome is not None]
     curves = mean_curves(outcomes)
     report = report_text(outcomes, curves, seconds, run.capture)
@@ -113,15 +113,15 @@ def _write(run: Run, jobs: Mapping[int, Mapping[str, BenchmarkRun]], seconds: fl
     write_json(out / "benchmark.json", _as_json(outcomes, seconds))
     _write_csv(out / "benchmark.csv", outcomes)
     if curves:
-        title = f"{run.capture.name}: PSNR on held-out views, {len(jobs)} seeds; bold is best for its time"
+        title = f"{run.capture.name}: PSNR on held-out views, {len(by_seed)} seeds; bold: Pareto front"
         with replacing(out / "benchmark.png") as partial:
             benchmark_chart(curves, title).savefig(partial, format="png")
     return report
 
 
 def report_text(outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], seconds: float, capture: Path) -> str:
-    """The table and what it shows, for the terminal and for a document."""
-    table = summarise(outcomes)
+    """Table and conclusions, as Markdown."""
+    table = summarize(outcomes)
     runs = [outcome for outcome in outcomes if outcome.quality]
     if not table:
         return f"{capture.name}: no run is finished yet"
@@ -134,19 +134,17 @@ def report_text(outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], se
         "",
         *_comparisons(table),
     ]
-    spans = [f"{name} {format_duration(start)}–{format_duration(end)}" for name, start, end in leaders(curves)]
-    hit, checked = forecasts_checked(runs)
-    lines += [f"Best for its time (Pareto front): {', '.join(spans)}."] if spans else []
-    lines += (
-        [f"Forecasts that came true within their error: {hit} of {checked} ({hit / checked:.0%})."] if checked else []
-    )
+    spans = [f"{name} {format_duration(start)}–{format_duration(end)}" for name, start, end in pareto_front(curves)]
+    hit, checked = count_forecasts(runs)
+    lines += [f"Pareto front of PSNR over time: {', '.join(spans)}."] if spans else []
+    lines += [f"Forecasts correct within their error: {hit} of {checked} ({hit / checked:.0%})."] if checked else []
     share = float(np.mean([evaluation_share(outcome.lines) for outcome in runs]))
-    lines.append(f"Evaluation while training took {share:.1%} of the training time, which does not count it.")
+    lines.append(f"Evaluation while training took {share:.1%} of the training time, which excludes it.")
     return "\n".join(lines)
 
 
 def table_lines(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
-    """A Markdown table, its columns aligned."""
+    """Lines of an aligned Markdown table."""
     shown = [name for name in COLUMNS if any(name in row for row in table.values())]
     reference = table.get(STANDARD, {}).get("val_psnr")
     rows = [["variant", *(COLUMNS[name][0] for name in shown)]]
@@ -167,24 +165,23 @@ def table_lines(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
 def _cell(value: Spread | None, decimals: int) -> str:
     if value is None:
         return ""
-    # How far counts scatter over seeds says little.
     spread = "" if decimals < 2 or np.isnan(value.spread) else f" ± {value.spread:.{decimals}f}"
     return f"{value.mean:,.{decimals}f}{spread}"
 
 
 def _comparisons(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
-    """Which neighbours in the ranking by held-out PSNR differ by no more than their spread."""
+    """Neighbors in the ranking by held-out PSNR that differ by no more than their spread."""
     ranked = sorted(
         ((row["val_psnr"], name) for name, row in table.items() if "val_psnr" in row), key=lambda pair: -pair[0].mean
     )
     if any(value.count < 2 for value, _ in ranked):
-        return ["One seed shows no spread: differences under about 0.3 dB mean little."]
+        return ["One seed gives no spread: differences below about 0.3 dB are not significant."]
     lines = [
-        f"{first} and {second} are {a.mean - b.mean:.2f} dB apart, within their spread: no difference is shown."
+        f"{first} and {second} are {a.mean - b.mean:.2f} dB apart, which is within their spread."
         for (a, first), (b, second) in pairwise(ranked)
-        if alike(a, b)
+        if within_spread(a, b)
     ]
-    return lines or ["All neighbours in the ranking are farther apart than their spread."]
+    return lines or ["All neighbors in the ranking differ by more than their spread."]
 
 
 def _as_json(outcomes: Iterable[Outcome], seconds: float) -> dict[str, object]:
@@ -202,7 +199,7 @@ def _as_json(outcomes: Iterable[Outcome], seconds: float) -> dict[str, object]:
 
 
 def _write_csv(path: Path, outcomes: Sequence[Outcome]) -> None:
-    """One row an evaluation: everything that its metrics line holds."""
+    """One row per evaluation, with all values of its metrics line."""
     rows = [
         {"variant": outcome.variant, "seed": outcome.seed, **{k: v for k, v in line.items() if k != "forecast"}}
         for outcome in outcomes

@@ -9,7 +9,7 @@ from ...cli.inputs import open_named_capture
 from ...errors import StgaError
 from ...jobs.delegate import OpenHead
 from ...training.settings import make_settings
-from .variants import KNOBS, MAIN, chosen
+from .variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 
 NAME, HELP = "benchmark", "compare accuracy and training time of strategies and presets on the CPU"
 
@@ -29,7 +29,7 @@ def run(options: Namespace) -> None:
     from ...training.run.folder import Run
     from .benchmark import run_benchmark
 
-    variants = chosen(KNOBS if options.knobs else MAIN, options.only)
+    variants = select_variants(SETTING_VARIANTS if options.knobs else MAIN_VARIANTS, options.only)
     settings = make_settings(seconds=options.budget)
     capture = open_named_capture(options)
     for split, purpose in (("train", "train on"), ("val", "measure with")):

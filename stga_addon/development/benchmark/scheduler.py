@@ -1,4 +1,4 @@
-"""Training runs that take turns, so that whatever else the machine does slows all of them alike."""
+"""Benchmark runs trained in turns, so that other load on the machine slows all of them alike."""
 
 import json
 import math
@@ -13,18 +13,20 @@ from pathlib import Path
 
 from ...errors import StgaError
 from ...training.run.folder import Run, read_run, write_run
-from ...worker.process import same_packages
+from ...worker.launch import same_interpreter_environment
 from .worker import QUALITY
 
-SLICE_S = 2.0
+TURN_S = 2.0
 """Seconds of training in one turn."""
-PATIENCE_S = 60.0
-"""How long an interrupted race waits for its runs to save what they have."""
+SAVE_TIMEOUT_S = 60.0
+"""Longest wait for an interrupted worker to save its run."""
+
+PrintProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class BenchmarkRun:
-    """One run: what it trains, and the folder that keeps it."""
+    """A run and its folder."""
 
     run: Run
     out: Path
@@ -39,96 +41,94 @@ class BenchmarkRun:
             raise StgaError(f"{self.out}: holds a run with other settings; choose another --out, or delete it")
 
 
-Tell = Callable[[str], None]
+def train_in_turns(runs: Sequence[BenchmarkRun], print_progress: PrintProgress) -> None:
+    """Train all runs, `TURN_S` at a time, in a random order that changes with every round.
 
-
-def race(jobs: Sequence[BenchmarkRun], tell: Tell) -> None:
-    """Train all jobs, a slice of the budget at a time, in an order that changes with every round.
-
-    Each is a process of its own; only one of them works at a time. Finished ones are left alone and interrupted ones
-    go on, so calling again with the same jobs takes up where it ended. On KeyboardInterrupt all save what they have.
-    A run that fails is told, and the others go on.
+    Each run has a process, of which one trains at a time. Finished runs are skipped and interrupted ones resumed, so
+    the same call continues where the last one ended. On KeyboardInterrupt every run is saved. A run that fails is
+    reported at the end and does not stop the others.
     """
-    runners = [_Runner(job) for job in jobs if not job.finished]
+    workers = [_Worker(run) for run in runs if not run.finished]
     try:
-        for runner in runners:  # one after the other: the start is work, too
-            tell(f"starting {runner.name}")
-            runner.start()
-        rounds = max((math.ceil((job.run.settings.seconds or 0) / SLICE_S) for job in jobs), default=1)
-        shuffled = random.Random(0)
+        for worker in workers:  # one at a time, because starting loads the processor too
+            print_progress(f"Starting {worker.name}")
+            worker.start()
+        rounds = max((math.ceil((run.run.settings.seconds or 0) / TURN_S) for run in runs), default=1)
+        rng = random.Random(0)
         for turn in range(1, rounds + 1):
-            tell(f"training, {turn} of {rounds} turns each")
-            for runner in shuffled.sample(runners, len(runners)):
-                runner.train_until(turn / rounds)
+            print_progress(f"Training, turn {turn} of {rounds}")
+            for worker in rng.sample(workers, len(workers)):
+                worker.train_until(turn / rounds)
     finally:
-        for runner in runners:
-            runner.dismiss()
-        for runner in runners:
-            runner.end()
-    for runner in runners:
-        if runner.error:
-            tell(f"{runner.name} failed: {runner.error}")
+        for worker in workers:
+            worker.stop()
+        for worker in workers:
+            worker.wait()
+    for worker in workers:
+        if worker.error:
+            print_progress(f"{worker.name} failed: {worker.error}")
 
 
-class _Runner:
-    """The process of one job, seen from outside."""
+class _Worker:
+    """The process that trains one run (`worker`)."""
 
-    def __init__(self, job: BenchmarkRun) -> None:
-        self.job, self.name, self.error = job, job.out.name, ""
+    def __init__(self, run: BenchmarkRun) -> None:
+        self.name, self.error = run.out.name, ""
+        self._run = run
         self._process: subprocess.Popen[str] | None = None
-        self._waiting = False
+        self._ready = False
 
     def start(self) -> None:
-        """Start the process and wait until it could train."""
-        if not (self.job.out / "run.json").exists():
-            write_run(self.job.out, self.job.run)
-        package = __package__
-        # A process of its own group: an interruption reaches only us, and we let it save.
-        with (self.job.out / "log.txt").open("a", encoding="utf-8") as log:
+        """Start the process and wait until it is ready to train."""
+        if not (self._run.out / "run.json").exists():
+            write_run(self._run.out, self._run.run)
+        # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
+        with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", f"{package}.worker", str(self.job.out)],
+                [sys.executable, "-m", f"{__package__}.worker", str(self._run.out)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
                 text=True,
                 encoding="utf-8",
-                env=same_packages(os.environ),
+                env=same_interpreter_environment(os.environ),
                 start_new_session=True,
             )
-        self._listen()
+        self._read_reply()
 
     def train_until(self, share: float) -> None:
-        """Let it train up to a share of its budget; returns when it has."""
-        if self._waiting:
+        """Train up to a share of the budget; returns when that is done."""
+        if self._ready:
             assert self._process is not None
             assert self._process.stdin is not None
-            with suppress(OSError):  # it has died, as listening will find out
+            with suppress(OSError):  # the process has ended, which reading its reply reports
                 self._process.stdin.write(f"{share!r}\n")
                 self._process.stdin.flush()
-            self._listen()
+            self._read_reply()
 
-    def dismiss(self) -> None:
-        """Tell it that no more turns come."""
+    def stop(self) -> None:
+        """Close the worker's input, after which it saves the run and ends."""
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):
                 self._process.stdin.close()
 
-    def end(self) -> None:
-        """Wait for its end."""
+    def wait(self) -> None:
+        """Wait for the end of the process; kill it after `SAVE_TIMEOUT_S`."""
         if self._process is None:
             return
         try:
-            self._process.wait(PATIENCE_S)
+            self._process.wait(SAVE_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
         if self._process.stdout is not None:
             self._process.stdout.close()
 
-    def _listen(self) -> None:
+    def _read_reply(self) -> None:
         assert self._process is not None
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
-        message = json.loads(line) if line else {"error": f"its process ended; see {self.job.out / 'log.txt'}"}
-        self._waiting = "share" in message
-        self.error = message.get("error", "")
+        log = self._run.out / "log.txt"
+        reply = json.loads(line) if line else {"error": f"Worker exited unexpectedly. Log: {log}"}
+        self._ready = "share" in reply
+        self.error = reply.get("error", "")

@@ -1,4 +1,4 @@
-"""Figures of a benchmark's runs: means and spreads over seeds, curves on a common clock, and what they do not show."""
+"""Statistics of benchmark runs: means and spreads over seeds, mean curves and the Pareto front."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ...training.run.metrics_log import read_metrics
 from .scheduler import BenchmarkRun
 from .worker import QUALITY
 
-MOMENTS = 200
+CURVE_POINTS = 200
 """Points of a mean curve."""
 
 
@@ -30,7 +30,7 @@ class Outcome:
     quality: Mapping[str, Mapping[str, float]]
 
     def figures(self) -> dict[str, float]:
-        """What a table shows, by the name of its column; what was not measured is left out."""
+        """Column of the table -> value, for what was measured."""
         last = self.lines[-1]
         figures = {
             "iterations": last["iteration"],
@@ -63,14 +63,14 @@ class MeanCurve:
     high: np.ndarray
 
 
-def outcome_of(variant: str, job: BenchmarkRun) -> Outcome | None:
-    """What a run left so far; None before its first evaluation."""
-    lines = read_metrics(job.out)
-    quality = read_json(job.out / QUALITY) if job.finished else {}
-    return Outcome(variant, job.run.settings.seed, lines, quality) if lines else None
+def outcome_of(variant: str, run: BenchmarkRun) -> Outcome | None:
+    """The run's outcome so far; None before its first evaluation."""
+    lines = read_metrics(run.out)
+    quality = read_json(run.out / QUALITY) if run.finished else {}
+    return Outcome(variant, run.run.settings.seed, lines, quality) if lines else None
 
 
-def summarise(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Spread]]:
+def summarize(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Spread]]:
     """variant -> column -> mean and spread, over its finished runs."""
     table: dict[str, dict[str, Spread]] = {}
     for variant in dict.fromkeys(outcome.variant for outcome in outcomes):
@@ -86,8 +86,8 @@ def spread_of(values: Sequence[float]) -> Spread:
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if several else float("nan"), len(values))
 
 
-def alike(a: Spread, b: Spread) -> bool:
-    """Whether two means are within the spread of each other: no farther apart than one spread of each, together."""
+def within_spread(a: Spread, b: Spread) -> bool:
+    """Whether two means differ by no more than the sum of their spreads."""
     return abs(a.mean - b.mean) <= a.spread + b.spread
 
 
@@ -99,39 +99,38 @@ def mean_curves(outcomes: Sequence[Outcome]) -> dict[str, MeanCurve]:
         runs = [run for run in runs if len(run) > 1]
         if not runs:
             continue
-        seconds = np.linspace(max(run[0][0] for run in runs), min(run[-1][0] for run in runs), MOMENTS)
+        seconds = np.linspace(max(run[0][0] for run in runs), min(run[-1][0] for run in runs), CURVE_POINTS)
         values = np.array([np.interp(seconds, *np.array(run).T) for run in runs])
         curves[variant] = MeanCurve(seconds, values.mean(0), values.min(0), values.max(0))
     return curves
 
 
-def leaders(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, float]]:
-    """The Pareto front of accuracy against time: (variant, from, to) in seconds, whose curve is highest there.
-
-    A moment counts only where no curve has been as high before: waiting for less is not on the front.
-    """
+def pareto_front(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, float]]:
+    """(variant, from, to) in seconds: the variant with the highest PSNR, while that exceeds every earlier PSNR."""
     if not curves:
         return []
     seconds = np.linspace(min(c.seconds[0] for c in curves.values()), max(c.seconds[-1] for c in curves.values()), 400)
     heights = np.array([np.interp(seconds, c.seconds, c.mean, left=-np.inf, right=-np.inf) for c in curves.values()])
     best, names = heights.argmax(0), list(curves)
     spans: list[tuple[str, float, float]] = []
-    for moment, winner, reached in zip(seconds.tolist(), best.tolist(), _rises(heights.max(0)), strict=True):
-        if not reached:
+    for second, winner, is_higher in zip(
+        seconds.tolist(), best.tolist(), _exceeds_earlier(heights.max(0)), strict=True
+    ):
+        if not is_higher:
             continue
         if spans and spans[-1][0] == names[winner]:
-            spans[-1] = (names[winner], spans[-1][1], moment)
+            spans[-1] = (names[winner], spans[-1][1], second)
         else:
-            spans.append((names[winner], moment, moment))
+            spans.append((names[winner], second, second))
     return spans
 
 
-def forecasts_checked(outcomes: Sequence[Outcome]) -> tuple[int, int]:
-    """Forecasts of all runs that came true within their error, and those that could be checked."""
+def count_forecasts(outcomes: Sequence[Outcome]) -> tuple[int, int]:
+    """Forecasts of all runs that were correct within their error, and those that could be checked."""
     pairs = [checked_forecasts(outcome.lines) for outcome in outcomes]
     return sum(hit for hit, _ in pairs), sum(count for _, count in pairs)
 
 
-def _rises(values: np.ndarray) -> list[bool]:
+def _exceeds_earlier(values: np.ndarray) -> list[bool]:
     before = np.concatenate([[-np.inf], np.maximum.accumulate(values)[:-1]])
     return [bool(higher) for higher in values > before]

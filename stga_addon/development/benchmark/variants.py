@@ -1,4 +1,4 @@
-"""What a benchmark compares: strategies and presets, or one knob at a time."""
+"""Variants that a benchmark compares: presets and strategies, or single settings."""
 
 from typing import Any
 
@@ -12,14 +12,14 @@ Changes = dict[str, Any]
 STANDARD = "standard"
 """The variant that the others are compared with."""
 
-MAIN: dict[str, Changes] = {
+MAIN_VARIANTS: dict[str, Changes] = {
     **{preset: {"preset": preset} for preset in PRESETS},
     **{strategy: {"strategy": strategy} for strategy in STRATEGIES if strategy != "global"},
     "paper": {"schedule": "paper"},
 }
-"""Presets (all of them train globally) and the other strategies."""
+"""Presets, which all train globally, the other strategies, and the paper settings."""
 
-KNOBS: dict[str, Changes] = {
+SETTING_VARIANTS: dict[str, Changes] = {
     STANDARD: {},
     "scale-0.5": {"scale": 0.5},
     "coarse-30%": {"coarse_share": 0.3},
@@ -40,18 +40,17 @@ KNOBS: dict[str, Changes] = {
     "selective-1mm": {"strategy": "selective", "selection": SelectionOptions(threshold=0.001)},
     "selective-5mm": {"strategy": "selective", "selection": SelectionOptions(threshold=0.005)},
 }
-"""One setting changed at a time: resolution, splats a triangle, degree of colour, loss, density control, stray
-resets, order of views, and for selective training the period of global iterations, its beginning and the threshold."""
+"""One setting changed at a time."""
 
 
 def settings_of(changes: Changes, seconds: float) -> TrainingSettings:
-    """Settings as `stga train` makes them: effects are left to be decided, but for a method that is fixed by its
-    letter."""
+    """Settings as `stga train` makes them: effects are decided from the capture, except for the paper settings and
+    GaussianAvatars, which fix them."""
     fixed = changes.get("schedule") == "paper" or changes.get("strategy") == "gaussian-avatars"
     return make_settings(**{"seconds": seconds, "effects": None if fixed else {}, **changes})
 
 
-def chosen(variants: dict[str, Changes], only: list[str] | None) -> dict[str, Changes]:
+def select_variants(variants: dict[str, Changes], only: list[str] | None) -> dict[str, Changes]:
     """The variants named in `only`, in the order of the table; all without it. Raises StgaError for unknown names."""
     unknown = sorted(set(only or ()) - set(variants))
     if unknown:

@@ -1,10 +1,10 @@
-"""One run of a benchmark, in a process of its own that trains when it is told to.
+"""Benchmark worker: a process that trains one run in turns.
 
     python -m stga_addon.development.benchmark.worker FOLDER
 
-Trains, or goes on with, the run that FOLDER/run.json describes. Reads shares of the budget, one a line, each of which
-it trains up to; the end of its input means stop and keep what there is. Answers every line, and the start, with a line
-of JSON: {"share": …, "iteration": …} while it waits, {"done": …} at the end, {"error": …} instead of either.
+Trains or resumes the run of FOLDER/run.json. Each line on stdin is a share of the budget to train up to; the end of
+stdin means save and end. Each line, and the start, is answered by a line of JSON on stdout: {"share": …,
+"iteration": …} when ready for the next, {"done": …} at the end, or {"error": …}.
 """
 
 import json
@@ -23,54 +23,54 @@ from ...training.run.folder import read_run
 from ...training.run.loop import train
 from ...training.run.progress import Progress
 
-WARM_UP = 1.0
-"""Seconds of training before the run that are not counted: caches fill and the clock of the processor rises."""
+WARM_UP_S = 1.0
+"""Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
 QUALITY = "quality.json"
-"""The finished avatar on all views of "val" and "test"; its presence says that the run is finished."""
+"""Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the file exists."""
 
 
 class Turns:
-    """Lets a run train up to a share of its budget, then makes it wait for the next one.
+    """Makes a run wait at the shares of its budget that it reads.
 
-    dismissed  no more turns come
+    stopped  the end of the requests was read
     """
 
-    def __init__(self, orders: IO[str], answers: IO[str]) -> None:
-        self._orders, self._answers = orders, answers
+    def __init__(self, requests: IO[str], replies: IO[str]) -> None:
+        self._requests, self._replies = requests, replies
         self._until = 0.0
-        self.dismissed = False
+        self.stopped = False
 
     def report(self, progress: Progress) -> bool:
-        """To be called after every iteration: answers True where the run is to stop."""
+        """Call after every iteration; True where the run is to stop."""
         if progress.iteration == 0 or self._until > progress.share or progress.share >= 1:
             return False
-        self.answer({"share": progress.share, "iteration": progress.iteration})
-        order = self._orders.readline()
-        self.dismissed = not order
-        self._until = float(order or 1)
-        return self.dismissed
+        self.reply({"share": progress.share, "iteration": progress.iteration})
+        request = self._requests.readline()
+        self.stopped = not request
+        self._until = float(request or 1)
+        return self.stopped
 
-    def answer(self, message: dict[str, Any]) -> None:
-        self._answers.write(json.dumps(message) + "\n")
-        self._answers.flush()
+    def reply(self, message: dict[str, Any]) -> None:
+        self._replies.write(json.dumps(message) + "\n")
+        self._replies.flush()
 
 
-def work(folder: Path, orders: IO[str], answers: IO[str]) -> None:
-    """Train the folder's run in turns, and measure what came of it."""
-    turns = Turns(orders, answers)
+def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
+    """Train the folder's run in turns and measure its avatar."""
+    turns = Turns(requests, replies)
     try:
         run = read_run(folder)
         capture = open_capture(run.capture, run.flame, run.principal_point)
-        seconds_per_iteration(capture, run.settings, WARM_UP)
+        seconds_per_iteration(capture, run.settings, WARM_UP_S)
         avatar = read_avatar(train(capture, folder, run, resume=True, report=turns.report))
-        if not turns.dismissed:
+        if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
             trained = with_refined_tracking(capture, folder)
             quality = {split: evaluate_avatar(avatar, trained, split, perceptual=True).as_json() for split in splits}
             write_json(folder / QUALITY, quality)
-        turns.answer({"done": not turns.dismissed})
+        turns.reply({"done": not turns.stopped})
     except StgaError as error:
-        turns.answer({"error": str(error)})
+        turns.reply({"error": str(error)})
 
 
 if __name__ == "__main__":

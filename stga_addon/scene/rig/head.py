@@ -8,7 +8,7 @@ import numpy as np
 from ...capture.model import Capture
 from .. import tags
 from ..animation import write_triangle_curves
-from ..arrays import mesh_triangles, triangle_mesh
+from ..arrays import has_triangles, triangle_mesh
 from ..objects import Warn, capture_root, log_warning, place, reset
 from .flame_rig import add_rig, remove_rig
 
@@ -42,7 +42,7 @@ def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warn
 def _place_head(capture: Capture, name: str | None) -> Any:
     root = capture_root(capture.root, name)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
-    if head is not None and _has_triangles(head.data, capture.faces):
+    if head is not None and has_triangles(head.data, capture.faces):
         _renew_mesh(head, capture)
     else:
         title = f"{root.name} head"
@@ -53,10 +53,6 @@ def _place_head(capture: Capture, name: str | None) -> Any:
     head[tags.TIMESTEPS] = [int(timestep) for timestep in capture.timesteps]
     head.shape_key_add(name="Basis", from_mix=False)
     return head
-
-
-def _has_triangles(mesh: Any, faces: np.ndarray) -> bool:
-    return len(mesh.loops) == faces.size and np.array_equal(mesh_triangles(mesh), faces)
 
 
 def _renew_mesh(head: Any, capture: Capture) -> None:

@@ -1,4 +1,4 @@
-"""One iteration: render a view, compare, and step the splats. Who computes it, the CPU or a GPU, is one object."""
+"""Interface between the trainer and the device that computes an iteration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,31 +12,31 @@ from .state import TrainState
 
 @dataclass(frozen=True)
 class Batch:
-    """What one iteration trains, and how.
+    """Input of one iteration: one view.
 
     target      (H, W, 3) uint8 over the settings' background
-    mask        (H, W) uint8 coverage where the background behind the target is to be exchanged for `background`
+    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`, else None
     background  (3,) float32 behind the splats
-    degree      of spherical harmonics in use
-    selected    (F,) bool triangles whose splats alone are trained; None trains all
+    sh_degree   degree of spherical harmonics in use
+    selected    (F,) bool triangles whose splats are trained; None trains all
     rates       learning rate by parameter name, and "sh_rest"
-    refine      share of the full rates by which FLAME's parameters of the timestep are stepped, 0 for not at all
+    refinement_rate  share of the full learning rates for the timestep's FLAME parameters; 0 leaves them unchanged
     """
 
     view: View
     target: np.ndarray
     mask: np.ndarray | None
     background: np.ndarray
-    degree: int
+    sh_degree: int
     selected: np.ndarray | None
     rates: Mapping[str, float]
-    refine: float = 0.0
+    refinement_rate: float = 0.0
 
 
 class Backend(Protocol):
-    """Holds the splats in training and computes with them.
+    """Holds the splats in training and computes iterations.
 
-    state  as a `TrainState` in the host's memory; what is changed there counts once it is assigned
+    state  as a `TrainState` in host memory; changes take effect when it is assigned
     """
 
     state: TrainState
@@ -44,8 +44,8 @@ class Backend(Protocol):
     def __len__(self) -> int:
         """How many splats there are."""
 
-    def train(self, batch: Batch) -> float | None:
-        """Make one step. Returns the image loss of the latest global iteration that is known and not yet told."""
+    def step(self, batch: Batch) -> float | None:
+        """Forward, backward and optimizer step. Returns the latest image loss that has become available, if any."""
 
-    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
-        """The view as the splats show it now: a new (3, H, W) float32 image."""
+    def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
+        """The view with the splats' running average: a new (3, H, W) float32 image over background (3,)."""

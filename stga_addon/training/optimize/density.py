@@ -1,4 +1,4 @@
-"""Density control: splats where the error asks for them, none where they do nothing (STGA, training)."""
+"""Density control and stray resets: splitting, pruning and moving splats between steps (STGA, training)."""
 
 from dataclasses import replace
 
@@ -8,77 +8,98 @@ import torch
 from ...avatar.splats import Splats
 from .state import TrainState, join, keep_rows, new_state
 
-FAINT = 0.005
-"""Opacity under which a splat is pruned."""
-SHRINK = np.log(1.6)
-"""How much smaller, as a logarithm, both halves of a split splat are along the axis it is split on."""
+MIN_OPACITY = 0.005
+"""Splats with a lower opacity are pruned."""
+MAX_SPLIT_SHARE = 0.02
+"""Largest share of the splats that one round of density control splits."""
+SPLIT_LOG_SCALE = np.log(1.6)
+"""Reduction of the log scale of both halves of a split splat along the axis it is split on."""
 
 
-def control_density(state: TrainState, room: int, share: float, rng: np.random.Generator) -> TrainState:
-    """Split the splats that the image pulls at hardest and prune the faint ones.
+def control_density(
+    state: TrainState, budget: int, rng: np.random.Generator, max_share: float = MAX_SPLIT_SHARE
+) -> TrainState:
+    """Split the splats with the largest mean screen gradient and prune those of low opacity.
 
-    room: how many splats may still be added; share: at most this share of the splats is split at once. Every triangle
-    that has splats keeps one. Children inherit triangle and looseness, lie within the parent's Gaussian in local
-    units, and keep Adam's second moment, without which their first steps would all be as long as the rate.
+    budget: how many splats may be added; max_share: largest share of the splats that is split. Every triangle with
+    bound splats keeps one. Children inherit triangle and binding, lie within the parent's Gaussian in local units, and
+    keep Adam's second moment and step count, without which their first steps would all be as long as the rate.
     """
-    screen_gradient = (state.screen_gradient / state.gradient_count.clamp_min(1)).numpy()
-    count = max(0, min(room, int(share * len(state))))
-    hardest = np.argsort(-screen_gradient, kind="stable")[:count]
-    hardest = hardest[screen_gradient[hardest] > 0]
-    parents = keep_rows(state, torch.from_numpy(hardest))
+    gradient = (state.screen_gradient / state.gradient_count.clamp_min(1)).numpy()
+    count = max(0, min(budget, int(max_share * len(state))))
+    split = np.argsort(-gradient, kind="stable")[:count]
+    split = split[gradient[split] > 0]
+    parents = keep_rows(state, torch.from_numpy(split))
     pairs = join(parents, parents)
     children = replace(new_state(_halves(parents.splats(), rng)), second=pairs.second, steps=pairs.steps)
-    keep = ~_dispensable(state)
-    keep[hardest] = False
+    keep = ~_prunable(state)
+    keep[split] = False
     state = join(keep_rows(state, torch.from_numpy(keep)), children)
     return replace(state, screen_gradient=torch.zeros(len(state)), gradient_count=torch.zeros(len(state)))
 
 
+def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
+    """Move bound splats farther than `limit` from their triangle's origin back to `share` of it; returns how many.
+
+    limit (F,) in local units. Works in place. (STGA, training, which moves them onto the origin: share = 0.)
+    Adam's first moment of the position is reset. The second moment is kept: with it at zero and the step count of the
+    row, which all its parameters share, in the thousands, the bias correction would make the next step 3.2 times as
+    long as the learning rate (0.1 / √0.001).
+    """
+    distance = state.parameters.xyz.norm(dim=1)
+    allowed = torch.from_numpy(limit)[state.face.long()]
+    strays = ~state.unbound & (distance > allowed)
+    # Rounding must not leave them just beyond the limit, or they would be strays again.
+    factor = (share * (1 - 1e-6) * allowed / distance)[strays, None]
+    state.parameters.xyz[strays] = torch.where(factor > 0, factor * state.parameters.xyz[strays], 0)
+    state.first.xyz[strays] = 0
+    state.average.xyz[strays] = state.parameters.xyz[strays]
+    return int(strays.sum())
+
+
 def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
-    """Two smaller splats per parent, on either side of its centre along its longest axis."""
+    """Two smaller splats per parent, on either side of its center along its longest axis."""
     axes = _rotation_matrices(parents.rotation)
     longest = np.argmax(parents.log_scale, axis=1)
     n = np.arange(len(parents))
     offset = axes[n, :, longest] * np.exp(parents.log_scale[n, longest])[:, None] * 0.5
     jitter = 1 + 0.1 * rng.standard_normal((len(parents), 1))
     log_scale = parents.log_scale.copy()
-    log_scale[n, longest] -= SHRINK
+    log_scale[n, longest] -= SPLIT_LOG_SCALE
     # Two splats of opacity a cover as one of opacity o where 1 − (1 − a)² = o.
     opacity = 1 - np.sqrt(1 - np.clip(_sigmoid(parents.opacity), 0, 0.999))
-    opacity = np.maximum(opacity, 2 * FAINT)
-    both = []
+    opacity = np.maximum(opacity, 2 * MIN_OPACITY)
+    halves = []
     for side in (-1, 1):
-        moved = replace(
+        half = replace(
             parents,
             xyz=(parents.xyz + side * offset * jitter).astype(np.float32),
             log_scale=log_scale,
             opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
         )
-        both.append(moved)
-    return Splats(*(np.concatenate(pair) for pair in zip(*(_values(s) for s in both), strict=True)))
+        halves.append(vars(half).values())
+    return Splats(*(np.concatenate(pair) for pair in zip(*halves, strict=True)))
 
 
-def _dispensable(state: TrainState) -> np.ndarray:
-    """(N,) bool: faint splats, but never the last (most opaque) bound one of a triangle."""
+def _prunable(state: TrainState) -> np.ndarray:
+    """(N,) bool: splats of low opacity, except the most opaque bound splat of each triangle."""
     opacity, face, unbound = state.parameters.opacity.numpy(), state.face.numpy(), state.unbound.numpy()
-    faint = _sigmoid(opacity) < FAINT
+    prunable = _sigmoid(opacity) < MIN_OPACITY
     bound = np.flatnonzero(~unbound)
     order = bound[np.lexsort((-opacity[bound], face[bound]))]
     first = np.ones(len(order), bool)
     first[1:] = face[order][1:] != face[order][:-1]
-    faint[order[first]] = False
-    return np.asarray(faint)
-
-
-def _values(splats: Splats) -> tuple[np.ndarray, ...]:
-    return tuple(vars(splats).values())
+    prunable[order[first]] = False
+    return np.asarray(prunable)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
+    """In float64."""
     return np.asarray(1 / (1 + np.exp(-x.astype(np.float64))))
 
 
 def _rotation_matrices(q: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of quaternions (N, 4), w first, of any length."""
     q = q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
     w, x, y, z = q.T
     rows = [

@@ -1,4 +1,6 @@
-"""Face frames of a capture's timesteps, the latest ones kept."""
+"""Cache of meshes and face frames by timestep."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,14 +10,20 @@ from ...capture.model import Capture
 from .tracking import Tracking
 
 CACHED_TIMESTEPS = 12
-"""Timesteps whose frames stay in memory: about 1 MB each for 10,000 triangles."""
+"""Timesteps kept in memory: about 1 MB each for 10,000 triangles."""
+
+
+@dataclass
+class _Timestep:
+    mesh: np.ndarray
+    frames: FaceFrames | None = None
 
 
 class FrameStore:
-    """Meshes and face frames by timestep, float64, bounded however long the sequence is.
+    """Meshes (V, 3) and face frames by timestep, float64; the latest CACHED_TIMESTEPS are kept.
 
-    strain: what strain needs of the neutral mesh, None where colours do not follow it.
-    tracking: the timesteps whose mesh is being refined, None where all are as tracked.
+    strain    `strain_basis` of the neutral mesh, None if colors do not depend on strain
+    tracking  meshes of its timesteps come from here instead of the capture, None if no tracking is refined
     """
 
     def __init__(
@@ -23,28 +31,40 @@ class FrameStore:
     ) -> None:
         self.capture, self.convention, self.tracking = capture, convention, tracking
         self.strain = strain_basis(capture.neutral, capture.faces) if strain else None
-        self._kept: dict[int, tuple[np.ndarray, FaceFrames]] = {}
+        self._cached: dict[int, _Timestep] = {}
 
     def of(self, timestep: int) -> FaceFrames:
-        return self._latest(timestep)[1]
+        entry, capture = self._latest(timestep), self.capture
+        if entry.frames is None:
+            entry.frames = face_frames(entry.mesh, capture.faces, capture.neutral, self.convention, self.strain)
+        return entry.frames
 
     def mesh(self, timestep: int) -> np.ndarray:
-        """(V, 3) that the frames stand on."""
-        return self._latest(timestep)[0]
+        """(V, 3) that the frames of the timestep are computed from."""
+        return self._latest(timestep).mesh
 
-    def forget(self) -> None:
-        """The meshes have changed."""
-        self._kept.clear()
+    def add(self, timestep: int, mesh: np.ndarray) -> None:
+        """Use `mesh`, already read from the capture, if the timestep is not cached; refined timesteps ignore it."""
+        if not self._refines(timestep):
+            self._latest(timestep, mesh)
 
-    def _latest(self, timestep: int) -> tuple[np.ndarray, FaceFrames]:
-        known = self._kept.pop(timestep, None)
-        self._kept[timestep] = known or self._read(timestep)  # the latest asked for stands last
-        if len(self._kept) > CACHED_TIMESTEPS:
-            del self._kept[next(iter(self._kept))]
-        return self._kept[timestep]
+    def clear(self) -> None:
+        """Forget all meshes, because the refined tracking has changed."""
+        self._cached.clear()
 
-    def _read(self, timestep: int) -> tuple[np.ndarray, FaceFrames]:
-        capture, tracking = self.capture, self.tracking
-        source = capture if tracking is None or not tracking.refines(timestep) else tracking
-        mesh = np.asarray(source.mesh(timestep))
-        return mesh, face_frames(mesh, capture.faces, capture.neutral, self.convention, self.strain)
+    def _latest(self, timestep: int, mesh: np.ndarray | None = None) -> _Timestep:
+        entry = self._cached.pop(timestep, None)
+        if entry is None:
+            entry = _Timestep(self._read(timestep) if mesh is None else mesh)
+        self._cached[timestep] = entry  # dictionaries keep insertion order, so the oldest is first
+        if len(self._cached) > CACHED_TIMESTEPS:
+            del self._cached[next(iter(self._cached))]
+        return entry
+
+    def _read(self, timestep: int) -> np.ndarray:
+        if self.tracking is not None and self._refines(timestep):
+            return self.tracking.mesh(timestep)
+        return np.asarray(self.capture.mesh(timestep))
+
+    def _refines(self, timestep: int) -> bool:
+        return self.tracking is not None and self.tracking.refines(timestep)

@@ -1,4 +1,4 @@
-"""One iteration on a Warp device: an NVIDIA GPU, or for tests Warp's CPU device."""
+"""Training backend on a Warp device: an NVIDIA GPU, or Warp's CPU device for tests."""
 
 import math
 from collections import deque
@@ -13,7 +13,8 @@ import warp as wp
 
 from ...capture.model import View
 from ...errors import StgaError
-from ...raster.cpu.rasterize import Parameters
+from ...raster.cpu.image_loss import LOSS_REACH_PX
+from ...raster.cpu.layout import Parameters
 from ...raster.gpu import optimizer
 from ...raster.gpu.embed import Embedding
 from ...raster.gpu.image_loss import change_background, image_loss_gradient
@@ -23,7 +24,6 @@ from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, EPSILON
 from .backend import Batch
 from .frames import FrameStore
-from .losses import LOSS_REACH_PX
 from .state import TrainState
 
 
@@ -52,31 +52,31 @@ class _DeviceState:
 
 
 @dataclass(frozen=True)
-class _Sent:
-    """A batch whose arrays are on the device; place: where its loss goes in `GpuBackend._losses`."""
+class _DeviceBatch:
+    """A batch with its arrays on the device; slot: index of its loss in `GpuBackend._losses`."""
 
     batch: Batch
     vertices: wp.array
     target: wp.array
     mask: wp.array | None
     selected: wp.array | None
-    place: int
+    slot: int
 
 
 class GpuBackend:
-    """Trains on a device without waiting for it.
+    """Trains asynchronously: `step` queues an iteration on the device and returns without waiting for it.
 
-    An iteration is only put into the device's queue. How many pairs of a splat and a tile it has, the host learns when
-    it begins the next one: by then the device is past that point. If there was no room for so many, the device has
-    left everything as it was, and the iteration is repeated. Losses are told two iterations late.
+    The number of pairs of a splat and a tile becomes known while the iteration runs; the host reads it when it queues
+    the next one. If the pairs did not fit into their buffer, the device has left all parameters unchanged, and the
+    iteration is queued again. Losses are returned two iterations late.
     """
 
     def __init__(
-        self, device: str, settings: TrainingSettings, lengths: np.ndarray, frames: FrameStore, state: TrainState
+        self, device: str, settings: TrainingSettings, units: np.ndarray, frames: FrameStore, state: TrainState
     ) -> None:
         self._settings, self._frames = settings, frames
         capture = frames.capture
-        with _room(device):
+        with _memory_errors(device):
             self._rasterizer = Rasterizer(device)
             self._device = self._rasterizer.device
             self._uploads = Uploads(self._device)
@@ -84,13 +84,13 @@ class GpuBackend:
                 self._device, capture.neutral, capture.faces, frames.convention, frames.strain
             )  # fmt: skip
             self._scale_limit, self._distance_limit = (
-                wp.array(np.float32(limit) * lengths, dtype=wp.float32, device=self._device)
+                wp.array(np.float32(limit) * units, dtype=wp.float32, device=self._device)
                 for limit in (settings.scale_limit, settings.distance_limit)
             )
             self._losses = wp.zeros(2, wp.float32, device="cpu", pinned=self._device.is_cuda)
-        self._queued: _Sent | None = None
-        self._untold: deque[_Sent] = deque()
-        self._place = 0
+        self._queued: _DeviceBatch | None = None
+        self._pending: deque[_DeviceBatch] = deque()
+        self._slot = 0
         self.state = state
 
     def __len__(self) -> int:
@@ -98,8 +98,8 @@ class GpuBackend:
 
     @property
     def state(self) -> TrainState:
-        """A copy in the host's memory, after everything that is queued."""
-        self._settle()
+        """A copy in host memory, after all queued iterations."""
+        self._synchronize()
         state = self._state
         parameters, first, second, average = (
             Parameters(*(_tensor(table.rows) for table in tables))
@@ -120,7 +120,7 @@ class GpuBackend:
 
     @state.setter
     def state(self, state: TrainState) -> None:
-        self._settle()
+        self._synchronize()
 
         def tables(tensors: Parameters) -> list[_Table]:
             return [
@@ -131,7 +131,7 @@ class GpuBackend:
         def array(tensor: torch.Tensor, kind: Any) -> wp.array:
             return wp.array(tensor.numpy(), dtype=kind, device=self._device)
 
-        with _room(self._device):
+        with _memory_errors(self._device):
             self._state = _DeviceState(
                 parameters=tables(state.parameters),
                 gradients=tables(state.gradients),
@@ -145,86 +145,86 @@ class GpuBackend:
                 gradient_count=array(state.gradient_count, wp.float32),
             )
 
-    def train(self, batch: Batch) -> float | None:
-        """Queue one step; returns the loss of the iteration before the last, if that was a global one."""
-        with _room(self._device):
-            self._repeat_if_cut_short()
-            told = self._tell()
-            self._place = 1 - self._place
-            self._queued = self._send(batch)
-            self._untold.append(self._queued)
-            self._run(self._queued)
-        return told
+    def step(self, batch: Batch) -> float | None:
+        """Queue one step; returns the loss of the iteration before the last if it was a global one."""
+        with _memory_errors(self._device):
+            self._repeat_if_pairs_overflowed()
+            loss = self._finished_loss()
+            self._slot = 1 - self._slot
+            self._queued = self._upload(batch)
+            self._pending.append(self._queued)
+            self._enqueue(self._queued)
+        return loss
 
-    def render(self, view: View, background: np.ndarray, degree: int) -> np.ndarray:
-        """The view as the splats' running average shows it, after everything that is queued."""
-        self._settle()
-        with _room(self._device):
+    def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
+        """The view with the splats' running average after all queued iterations: a new (3, H, W) float32 image."""
+        self._synchronize()
+        with _memory_errors(self._device):
             self._uploads.begin()
-            vertices = self._send_mesh(view)
+            vertices = self._upload_mesh(view)
             self._uploads.finish()
-            parameters, frames = _rows(self._state.average), self._see(vertices, view, degree)
+            parameters, frames = _rows(self._state.average), self._device_frames(vertices, view, sh_degree)
             return np.array(self._rasterizer.forward(parameters, self._state.face, frames, background).image.numpy())
 
-    def _settle(self) -> None:
-        """Wait until everything that is queued is done."""
-        with _room(self._device):
-            self._repeat_if_cut_short()
+    def _synchronize(self) -> None:
+        """Wait until all queued iterations are done."""
+        with _memory_errors(self._device):
+            self._repeat_if_pairs_overflowed()
             wp.synchronize_device(self._device)
 
-    def _repeat_if_cut_short(self) -> None:
+    def _repeat_if_pairs_overflowed(self) -> None:
         queued, self._queued = self._queued, None
         if queued is not None and not self._rasterizer.pairs_fit():
-            self._run(queued)
+            self._enqueue(queued)
 
-    def _tell(self) -> float | None:
-        """The loss of the iteration before the last one queued, which the device has written by now."""
-        if len(self._untold) < 2:
+    def _finished_loss(self) -> float | None:
+        """The loss of the oldest pending iteration, which is done when another one has been queued after it."""
+        if len(self._pending) < 2:
             return None
-        sent = self._untold.popleft()
-        return float(self._losses.numpy()[sent.place]) / sent.target.size if sent.selected is None else None
+        done = self._pending.popleft()
+        return float(self._losses.numpy()[done.slot]) / done.target.size if done.selected is None else None
 
-    def _send(self, batch: Batch) -> _Sent:
+    def _upload(self, batch: Batch) -> _DeviceBatch:
         self._uploads.begin()
         send = self._uploads.send
-        sent = _Sent(
+        uploaded = _DeviceBatch(
             batch=batch,
-            vertices=self._send_mesh(batch.view),
+            vertices=self._upload_mesh(batch.view),
             target=send("target", batch.target, wp.uint8),
             mask=None if batch.mask is None else send("mask", batch.mask, wp.uint8),
             selected=None if batch.selected is None else send("selected", batch.selected, wp.uint8),
-            place=self._place,
+            slot=self._slot,
         )
         self._uploads.finish()
-        return sent
+        return uploaded
 
-    def _send_mesh(self, view: View) -> wp.array:
-        return self._uploads.send("vertices", np.asarray(self._frames.capture.mesh(view.timestep)), wp.vec3d)
+    def _upload_mesh(self, view: View) -> wp.array:
+        return self._uploads.send("vertices", self._frames.mesh(view.timestep), wp.vec3d)
 
-    def _see(self, vertices: wp.array, view: View, degree: int) -> DeviceFrames:
-        """The triangles' frames as the view's camera sees them."""
+    def _device_frames(self, vertices: wp.array, view: View, sh_degree: int) -> DeviceFrames:
+        """Face frames in the view's camera."""
         origin, matrix, strain = self._embedding.frames(vertices, view.camera)
         strains = min(strain.shape[1], self._state.parameters[-1].rows.shape[1])
-        lens = device_camera(view.camera, degree, strains, antialiased=self._settings.antialiased)
-        return DeviceFrames(origin, matrix, strain, lens)
+        camera = device_camera(view.camera, sh_degree, strains, antialiased=self._settings.antialiased)
+        return DeviceFrames(origin, matrix, strain, camera)
 
-    def _run(self, sent: _Sent) -> None:
-        """Put one iteration into the device's queue."""
-        rasterizer, state, batch = self._rasterizer, self._state, sent.batch
+    def _enqueue(self, uploaded: _DeviceBatch) -> None:
+        """Queue one iteration."""
+        rasterizer, state, batch = self._rasterizer, self._state, uploaded.batch
         focus = None
-        if sent.selected is not None:
+        if uploaded.selected is not None:
             focus = rasterizer.buffers.get("focus", len(self), wp.uint8)
-            rasterizer.launch(optimizer.mark_focus, len(self), state.face, sent.selected, focus)
+            rasterizer.launch(optimizer.mark_focus, len(self), state.face, uploaded.selected, focus)
         parameters, gradients = _rows(state.parameters), _rows(state.gradients)
-        frames = self._see(sent.vertices, batch.view, batch.degree)
+        frames = self._device_frames(uploaded.vertices, batch.view, batch.sh_degree)
         rendering = rasterizer.forward(
             parameters, state.face, frames, batch.background, focus, LOSS_REACH_PX, wait=False
         )  # fmt: skip
-        v_image, loss = image_loss_gradient(rasterizer, rendering, self._over(sent), self._settings.ssim_weight)
+        v_image, loss = image_loss_gradient(rasterizer, rendering, self._target(uploaded), self._settings.ssim_weight)
         screen = rasterizer.backward(rendering, parameters, state.face, v_image, gradients)
-        self._limit(rendering.wanted)
+        self._add_limit_gradients(rendering.wanted)
         self._adam(rendering.wanted, batch.rates)
-        if sent.selected is None:
+        if uploaded.selected is None:
             rasterizer.launch(
                 optimizer.accumulate_screen_gradient,
                 len(self),
@@ -235,20 +235,25 @@ class GpuBackend:
             )
             total = rasterizer.buffers.get("loss_sum", 1)
             wp.utils.array_sum(loss.flatten(), out=total)
-            wp.copy(self._losses, total, dest_offset=sent.place, count=1)
+            wp.copy(self._losses, total, dest_offset=uploaded.slot, count=1)
 
-    def _over(self, sent: _Sent) -> wp.array:
-        """The target over the background that is drawn behind the splats."""
-        if sent.mask is None:
-            return sent.target
-        out = self._rasterizer.buffers.get("over", sent.target.shape, wp.uint8)
-        change = 255 * sent.batch.background - 255 * np.array(self._settings.background, np.float32)
+    def _target(self, uploaded: _DeviceBatch) -> wp.array:
+        """The target over the batch's background."""
+        if uploaded.mask is None:
+            return uploaded.target
+        out = self._rasterizer.buffers.get("over", uploaded.target.shape, wp.uint8)
+        change = 255 * uploaded.batch.background - 255 * np.array(self._settings.background, np.float32)
         self._rasterizer.launch(
-            change_background, sent.mask.shape, sent.target, sent.mask, wp.vec3(*(float(c) for c in change)), out
+            change_background,
+            uploaded.mask.shape,
+            uploaded.target,
+            uploaded.mask,
+            wp.vec3(*(float(c) for c in change)),
+            out,
         )
         return out
 
-    def _limit(self, wanted: wp.array) -> None:
+    def _add_limit_gradients(self, wanted: wp.array) -> None:
         """Add the gradients of the limits that keep splats near what they cover."""
         settings, state, launch, n = self._settings, self._state, self._rasterizer.launch, len(self)
         squares, square = self._rasterizer.buffers.get("squares", n), self._rasterizer.buffers.get("square", 1)
@@ -293,13 +298,13 @@ def _table(values: np.ndarray, kind: Any, device: wp.Device) -> _Table:
 
 
 def _tensor(array: wp.array) -> torch.Tensor:
-    """A copy in the host's memory."""
+    """A copy in host memory."""
     return torch.from_numpy(np.array(array.numpy()))
 
 
 @contextmanager
-def _room(device: wp.Device | str) -> Iterator[None]:
-    """Explain in one sentence that the device's memory is full."""
+def _memory_errors(device: wp.Device | str) -> Iterator[None]:
+    """Turn a failed allocation on the device into a StgaError."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:

@@ -1,14 +1,14 @@
-"""The image loss and the limits that keep splats near what they cover (STGA, training)."""
+"""Image loss of the CPU backend, and the unit of the limits on size and position (STGA, training)."""
 
 from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from ...raster.cpu.image_loss import LOSS_REACH_PX, image_loss
+from ...avatar.embedding import face_areas
+from ...capture.model import Capture
+from ...raster.cpu.image_loss import image_loss
 from ...raster.cpu.layout import TILE
-
-__all__ = ["LOSS_REACH_PX", "image_gradient", "similarity", "tile_rectangles", "whole_image"]
 
 
 def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:
@@ -43,3 +43,10 @@ def similarity(image: np.ndarray, target: np.ndarray) -> float:
     """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
     unused = np.empty_like(image)
     return image_gradient(image, target, whole_image(*image.shape[1:]), 1.0, unused)[1]
+
+
+def limit_units(capture: Capture, convention: str) -> np.ndarray:
+    """Per triangle the length (F,) that limits are multiples of, in the convention's local units."""
+    if convention == "gaussian_avatars":
+        return np.ones(len(capture.faces), np.float32)
+    return np.asarray(np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32)

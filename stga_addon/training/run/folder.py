@@ -9,22 +9,20 @@ metrics.jsonl   one line per evaluation
 """
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError
-from ...files import partial_name, read_json, write_json
-from ...worker.lock import held, owner
-from ..effect_plan import TRACKING, EffectDecision, effect_plan_from_json, effect_plan_to_json
+from ...files import read_json, remove_leftovers, write_json
+from ...worker.lock import hold_lock, lock_owner
+from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
 from ..settings import DEVICES, TrainingSettings, from_json, to_json
 from .identity import Identity, identity_from_json
-from .metrics_log import METRICS
 
 FORMAT, VERSION = "stga-run", 2
 CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
-FILES = ("run.json", SELECTION, CHECKPOINT, "avatar.npz", TRACKING, METRICS)
 
 
 @dataclass(frozen=True)
@@ -105,12 +103,10 @@ def locked(folder: Path) -> Iterator[None]:
     with ExitStack() as lock:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock.enter_context(held(path))
+            lock.enter_context(hold_lock(path))
         except BlockingIOError as error:
-            raise StgaError(f"{folder}: another run is working in this folder (process {owner(path)})") from error
+            raise StgaError(f"{folder}: another run is working in this folder (process {lock_owner(path)})") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
-        for litter in (path for name in FILES for path in folder.glob(partial_name(name, "*"))):
-            with suppress(OSError):
-                litter.unlink()
+        remove_leftovers(folder)
         yield

@@ -202,12 +202,15 @@ class _Loop:
         red, green, blue = (round(255 * c) for c in settings.background)
         order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
         correct = exposure_correction(settings)
-        return ViewLoader(order, lambda position: self._size(first + position), (red, green, blue), correct=correct)
+        mesh = self.capture.mesh if self.trainer.tracking is None else None  # refined meshes change with every step
+        return ViewLoader(
+            order, lambda position: self._size(first + position), (red, green, blue), correct=correct, mesh=mesh
+        )
 
     def _step(self, loader: ViewLoader) -> None:
         begin = perf_counter()
-        view, image, mask = next(loader)
-        loss = self.trainer.step(view, image, self._share(), mask)
+        view, image, mask, mesh = next(loader)
+        loss = self.trainer.step(view, image, self._share(), mask, mesh)
         self.elapsed += perf_counter() - begin
         if loss is not None:
             self.losses.append(loss)

@@ -11,11 +11,11 @@ from stga_addon.development.benchmark.statistics import (
     MeanCurve,
     Outcome,
     Spread,
-    alike,
-    leaders,
     mean_curves,
+    pareto_front,
     spread_of,
-    summarise,
+    summarize,
+    within_spread,
 )
 from stga_addon.report.run_summary import evaluation_share
 
@@ -33,19 +33,19 @@ def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outc
 def test_summary_over_seeds() -> None:
     """Catches the population's deviation for the sample's, seeds of other variants, and unfinished runs that count."""
     runs = [outcome("a", seed, psnr) for seed, psnr in enumerate((30.0, 31.0, 32.0))]
-    table = summarise([*runs, outcome("a", 3, 99.0, finished=False), outcome("b", 0, 20.0)])
+    table = summarize([*runs, outcome("a", 3, 99.0, finished=False), outcome("b", 0, 20.0)])
     assert table["a"]["val_psnr"] == Spread(31.0, 1.0, 3)
     assert table["a"]["ms_per_iteration"].mean == pytest.approx(100.0)
     assert table["b"]["val_psnr"].mean == 20.0
     assert np.isnan(table["b"]["val_psnr"].spread)
 
 
-def test_alike() -> None:
+def test_within_spread() -> None:
     """Catches a difference claimed between runs that scatter as much."""
     a, b = spread_of([30.0, 30.4]), spread_of([30.3, 30.9])
-    assert alike(a, b)
-    assert not alike(a, Spread(31.0, 0.1, 2))
-    assert not alike(Spread(30.0, float("nan"), 1), Spread(30.0, float("nan"), 1))  # nothing is known
+    assert within_spread(a, b)
+    assert not within_spread(a, Spread(31.0, 0.1, 2))
+    assert not within_spread(Spread(30.0, float("nan"), 1), Spread(30.0, float("nan"), 1))  # nothing is known
 
 
 def test_mean_curves() -> None:
@@ -71,19 +71,19 @@ def test_the_front() -> None:
         "late": curve([1, 10], [20, 38]),
         "never": curve([1, 10], [15, 29]),
     }
-    (first, a, b), (second, c, d) = leaders(curves)
+    (first, a, b), (second, c, d) = pareto_front(curves)
     assert (first, second) == ("early", "late")
     assert a == 1
     assert b == pytest.approx(2, abs=0.05)  # after that it only waits
     assert c == pytest.approx(6, abs=0.05)  # where the late one has caught up with 30 dB
     assert d == 10
-    assert leaders({}) == []
+    assert pareto_front({}) == []
 
 
 def test_the_table() -> None:
     """Catches columns out of line, figures under the wrong heading, and a comparison with the wrong variant."""
     runs = [outcome(name, seed, psnr + seed) for name, psnr in (("standard", 30.0), ("draft", 27.0)) for seed in (0, 1)]
-    lines = table_lines(summarise(runs))
+    lines = table_lines(summarize(runs))
     assert len({len(text) for text in lines}) == 1
     cells = [[cell.strip() for cell in text.strip("|").split("|")] for text in lines]
     assert cells[0] == ["variant", "iterations", "ms/it", "splats", "val", "SSIM", "Δ val"]
@@ -97,12 +97,12 @@ def test_the_report_says_what_is_not_shown() -> None:
         outcome(name, seed, psnr + seed) for name, psnr in (("a", 30.0), ("b", 30.5), ("c", 20.0)) for seed in (0, 1)
     ]
     text = report_text(two, mean_curves(two), 10.0, Path("head"))
-    assert "b and a are 0.50 dB apart, within their spread" in text
+    assert "b and a are 0.50 dB apart, which is within their spread" in text
     assert "a and c" not in text
-    assert "Pareto front): b 1 s–10 s" in text
+    assert "Pareto front of PSNR over time: b 1 s–10 s" in text
     assert "Evaluation while training took 45.0%" in text
     one = [run for run in two if run.seed == 0]
-    assert "One seed shows no spread" in report_text(one, mean_curves(one), 10.0, Path("head"))
+    assert "One seed gives no spread" in report_text(one, mean_curves(one), 10.0, Path("head"))
     none = [outcome("a", 0, 30.0, finished=False)]
     assert report_text(none, {}, 10.0, Path("head")) == "head: no run is finished yet"
 

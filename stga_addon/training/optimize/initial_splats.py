@@ -1,0 +1,35 @@
+"""The splats that training starts with."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...avatar.lattice import lattice_splats
+from ...avatar.splats import Splats
+from ...avatar.strain import STRAINS
+from ...capture.model import Capture
+from ..settings import TrainingSettings
+from .hull_points import hull_points
+
+
+def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
+    """The lattice on the neutral mesh and, if the settings say so, hull points of the first training timestep."""
+    lattice = lattice_splats(
+        capture.neutral, capture.faces, settings.lattice, settings.sh_degree, convention=settings.convention
+    )
+    if not settings.teeth:
+        lattice = lattice.rows(~teeth_triangles(capture)[lattice.face])
+    parts = [lattice]
+    if settings.hull_points:
+        first = capture.views["train"][0].timestep
+        views = [view for view in capture.views["train"] if view.timestep == first]
+        parts.append(hull_points(capture, views, settings.convention, settings.sh_degree))
+    strains = STRAINS if settings.strain_color else 0
+    parts = [replace(part, strain_color=np.zeros((len(part), strains, 3), np.float32)) for part in parts]
+    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
+
+
+def teeth_triangles(capture: Capture) -> np.ndarray:
+    """(F,) bool: the triangles of the rows of teeth added to FLAME's mesh; none in any other mesh."""
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    return np.asarray(np.isin(capture.faces, masks.get("teeth", ())).all(axis=1))

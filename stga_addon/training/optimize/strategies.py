@@ -1,0 +1,98 @@
+"""Training strategies: which triangles an iteration trains, and what happens after a step."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..settings import TrainingSettings
+from .density import control_density, reset_strays
+from .state import TrainState
+
+
+class Strategy(Protocol):
+    """Decides which triangles each iteration trains."""
+
+    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+        """(F,) bool triangles whose splats are trained; None trains all splats.
+
+        iteration, visit  count iterations and visits of frames (consecutive views of one timestep) from 0
+        progress          share of the budget spent
+        """
+
+
+class GlobalStrategy:
+    """Every iteration trains all splats."""
+
+    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> None:
+        return None
+
+
+@dataclass
+class SelectiveStrategy:
+    """Alternates local iterations, which train a frame's selected triangles, with global ones (STGA, training).
+
+    selection  timestep -> (F,) bool triangles; a frame that selects none is trained globally
+    """
+
+    settings: TrainingSettings
+    selection: Mapping[int, np.ndarray]
+
+    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+        settings, selected = self.settings, self.selection.get(timestep)
+        count = iteration if settings.global_unit == "iteration" else visit
+        is_global = count % (settings.global_interval + 1) == settings.global_interval
+        if progress < settings.warm_up_share or is_global or selected is None or not selected.any():
+            return None
+        return selected
+
+
+def make_strategy(settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> Strategy:
+    """The strategy that the settings name; "gaussian-avatars" differs from "global" in its settings only."""
+    return SelectiveStrategy(settings, selection) if settings.strategy == "selective" else GlobalStrategy()
+
+
+class PostStep(Protocol):
+    """Changes the splats at intervals, after an optimizer step."""
+
+    def is_due(self, iteration: int, progress: float) -> bool:
+        """Whether to `apply` after so many iterations, at this share of the budget."""
+
+    def apply(self, state: TrainState, iteration: int) -> TrainState:
+        """The changed state, which may share tensors with `state` or change them in place."""
+
+
+@dataclass(frozen=True)
+class StrayReset:
+    """Moves splats back that left their triangle's neighborhood; `unit` (F,) is what the limit is a multiple of."""
+
+    settings: TrainingSettings
+    unit: np.ndarray
+
+    def is_due(self, iteration: int, progress: float) -> bool:
+        return _at_interval(iteration, self.settings.stray_reset_interval)
+
+    def apply(self, state: TrainState, iteration: int) -> TrainState:
+        reset_strays(state, self.settings.stray_limit * self.unit, self.settings.stray_reset_share)
+        return state
+
+
+@dataclass(frozen=True)
+class DensityControl:
+    """Splits and prunes splats; the count may grow to (1 + `settings.growth`) · `initial_count`."""
+
+    settings: TrainingSettings
+    initial_count: int
+
+    def is_due(self, iteration: int, progress: float) -> bool:
+        start, end = self.settings.density_span
+        return _at_interval(iteration, self.settings.density_interval) and start <= progress < end
+
+    def apply(self, state: TrainState, iteration: int) -> TrainState:
+        budget = round(self.initial_count * (1 + self.settings.growth)) - len(state)
+        return control_density(state, budget, np.random.default_rng([self.settings.seed, iteration]))
+
+
+def _at_interval(iteration: int, interval: int) -> bool:
+    return interval > 0 and iteration % interval == 0

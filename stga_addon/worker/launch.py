@@ -1,0 +1,100 @@
+"""Starts processes in another Python interpreter: workers with a status folder, and others."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ..errors import StgaError
+from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, remove_status_folder
+
+PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
+"""The folder that holds `stga_addon`, for a worker's import path."""
+NICENESS = 5
+"""Added to a worker's nice value on Linux and macOS, so that Blender has precedence."""
+# Windows: own process group, so that closing the console does not end the worker; no console window; and
+# BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
+_DETACHED: dict[str, Any] = (
+    {"creationflags": 0x00000200 | 0x08000000 | 0x00004000} if os.name == "nt" else {"start_new_session": True}
+)
+
+
+def prepare_status_folder(folder: Path) -> None:
+    """Create the status folder, or remove the previous worker's status from it.
+
+    Raises StgaError while that worker is running, or where the folder cannot be written.
+    """
+    refuse_running_worker(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (STATUS_FILE, CANCEL_FILE, LOG_FILE):
+            (folder / name).unlink(missing_ok=True)
+        (folder / LOG_FILE).open("xb").close()
+    except OSError as error:
+        raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start `python -m ARGUMENTS…` at low priority in a prepared status folder; it outlives the calling process.
+
+    Raises StgaError where the interpreter cannot be started; then only the status is removed from the folder.
+    """
+    try:
+        log = os.open(folder / LOG_FILE, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
+    except OSError as error:
+        raise StgaError(f"{folder / LOG_FILE}: cannot be written ({error.strerror or error})") from error
+    try:
+        process = start_python(
+            python, arguments, cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, **_DETACHED
+        )
+    except StgaError:
+        remove_status_folder(folder)
+        raise
+    finally:
+        os.close(log)
+    if os.name != "nt":
+        with suppress(OSError):  # the process has ended already
+            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+    return process
+
+
+def start_python(
+    python: str, arguments: Sequence[str], variables: Mapping[str, str] | None = None, **options: Any
+) -> subprocess.Popen[Any]:
+    """Start `python -m ARGUMENTS…` with `worker_environment`.
+
+    variables: environment variables to add. options: those of subprocess.Popen.
+    Raises StgaError where the interpreter cannot be started.
+    """
+    environment = {**worker_environment(os.environ, python), **(variables or {})}
+    try:
+        return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        reason = getattr(error, "strerror", None) or error
+        raise StgaError(f"{python}: cannot be started as a Python interpreter ({reason})") from error
+
+
+def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, str]:
+    """Environment variables for the interpreter `python`: the path of this package, and none of Blender's own Python.
+
+    Another process of this interpreter finds the packages that this process does: Blender's extensions have a folder
+    for theirs, which its Python does not search by itself.
+    """
+    kept = {name: value for name, value in variables.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
+    own_paths = filter(None, sys.path) if python == sys.executable else ()
+    return {
+        **kept,
+        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *own_paths]),
+        "PYTHONSAFEPATH": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",  # the extension's folder belongs to Blender
+        "PYTHONUNBUFFERED": "1",
+        "PYTHONUTF8": "1",
+    }
+
+
+def same_interpreter_environment(variables: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables for another process of this interpreter: the packages that this process finds."""
+    return {**variables, "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)])}

@@ -1,0 +1,280 @@
+"""Status of a worker process, shared through a folder.
+
+status.json   the worker's latest status, replaced atomically
+worker.log    its standard output and error
+worker.lock   locked while the worker lives
+cancel        exists once the worker was asked to stop
+"""
+
+import math
+import os
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+
+from ..errors import StgaError
+from ..files import file_size, read_json, write_json
+from .lock import hold_lock, is_locked, lock_owner
+
+STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
+STATUS_INTERVAL_S = 0.5
+"""Least time between two writes of status.json with the same message."""
+FINAL_STATUS_TIMEOUT_S = 5.0
+"""How long writing the final status is retried: on Windows, a file that is being read cannot be replaced."""
+MIN_FREE_BYTES = 1 << 20
+"""Free space below which a disk counts as full."""
+LOG_TAIL_LINES, REPORT_LOG_LINES = 6, 200
+MAX_LOG_LINE_BYTES = 400
+"""Assumed length of a log line, which bounds how much of the log is read."""
+
+
+class WorkerState(StrEnum):
+    """State of a worker, derived from its folder and whether its process lives."""
+
+    NONE = "none"
+    STARTING = "starting"
+    WORKING = "working"
+    CANCELLING = "cancelling"
+    FINISHED = "finished"
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+    LOST = "lost"
+
+    @property
+    def is_alive(self) -> bool:
+        return self in (WorkerState.STARTING, WorkerState.WORKING, WorkerState.CANCELLING)
+
+    @property
+    def failed(self) -> bool:
+        return self in (WorkerState.FAILED, WorkerState.LOST)
+
+
+@dataclass(frozen=True)
+class WorkerStatus:
+    """Content of status.json.
+
+    state     working, finished, cancelled or failed
+    progress  0 to 1
+    message   what the worker is doing; detail: a second line about it
+    error     one sentence, and the traceback where a bug caused it
+    figures   named numbers that depend on the kind of work
+    """
+
+    state: str = WorkerState.WORKING
+    progress: float = 0.0
+    message: str = ""
+    detail: str = ""
+    error: str = ""
+    traceback: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class WorkerSnapshot:
+    """State and status of a worker at one moment; `log_tail`: the last lines of its log where it failed."""
+
+    state: WorkerState = WorkerState.NONE
+    status: WorkerStatus = field(default_factory=WorkerStatus)
+    log_tail: tuple[str, ...] = ()
+
+
+def derive_state(status: WorkerStatus | None, alive: bool, cancel_requested: bool, started: bool) -> WorkerState:
+    """State of a worker.
+
+    status: the latest one, or None. alive: whether the process lives. started: whether one was ever started.
+    """
+    if status is not None and status.state != WorkerState.WORKING:
+        return WorkerState(status.state)
+    if not alive:
+        return WorkerState.LOST if started else WorkerState.NONE
+    if cancel_requested:
+        return WorkerState.CANCELLING
+    return WorkerState.STARTING if status is None else WorkerState.WORKING
+
+
+# Reading
+
+
+def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None) -> WorkerSnapshot:
+    """Snapshot of the worker of a status folder; `process`: the worker, where this process started it."""
+    code = None if process is None else process.poll()
+    # The process before the status: one that ends between the two reads has written its final status by then.
+    alive = (process is not None and code is None) or is_locked(folder / LOCK_FILE)
+    status = read_status(folder)
+    state = derive_state(status, alive, (folder / CANCEL_FILE).exists(), (folder / LOG_FILE).exists())
+    status = status or WorkerStatus()
+    if state == WorkerState.LOST:
+        error = describe_lost_worker(folder, code)
+        status = WorkerStatus(WorkerState.LOST, status.progress, error=error, figures=status.figures)
+    return WorkerSnapshot(state, status, tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ())
+
+
+def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
+    """One sentence on a worker that ended without a final status."""
+    with suppress(OSError):
+        if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
+            return f"Worker exited unexpectedly: the disk that holds {folder} is full"
+    if exit_code is not None and exit_code > 0:
+        last = log_lines(folder, 1)
+        return f"Worker exited with status {exit_code}: {last[0].strip() if last else 'its log is empty'}"
+    signal = f" (signal {-exit_code})" if exit_code else ""
+    return f"Worker exited unexpectedly{signal}; it was killed or may have run out of memory. Log: {folder / LOG_FILE}"
+
+
+def read_status(folder: Path) -> WorkerStatus | None:
+    """The latest status; None where status.json is missing or malformed."""
+    try:
+        values = read_json(folder / STATUS_FILE)
+        status = WorkerStatus(**values)
+        texts = (status.message, status.detail, status.error, status.traceback)
+        figures = {str(name): float(value) for name, value in status.figures.items()}
+        states = (WorkerState.WORKING, WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
+        if status.state not in states or not all(isinstance(text, str) for text in texts):
+            return None
+        if not 0 <= status.progress <= 1:
+            return None
+    except (StgaError, TypeError, ValueError, AttributeError):
+        return None
+    return WorkerStatus(status.state, float(status.progress), *texts, figures)
+
+
+def log_lines(folder: Path, count: int) -> list[str]:
+    """The last `count` lines of the log that are not empty; none where it cannot be read."""
+    path = folder / LOG_FILE
+    try:
+        file_size(path)
+        with path.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - MAX_LOG_LINE_BYTES * count))
+            lines = log.read().decode("utf-8", "replace").replace("\r", "\n").splitlines()
+    except (StgaError, OSError):
+        return []
+    return [line.rstrip() for line in lines if line.strip()][-count:]
+
+
+def failure_report(folder: Path, snapshot: WorkerSnapshot) -> str:
+    """Everything known about a failure, to be passed on: sentence, traceback and log."""
+    log = log_lines(folder, REPORT_LOG_LINES)
+    parts = [snapshot.status.error, snapshot.status.traceback, f"{folder / LOG_FILE}:", *log]
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+# Control
+
+
+def request_cancel(folder: Path) -> None:
+    """Ask the worker to stop and to keep what it has. Raises StgaError where the folder cannot be written."""
+    path = folder / CANCEL_FILE
+    try:
+        with suppress(FileExistsError):
+            os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def refuse_running_worker(folder: Path) -> None:
+    """Raises StgaError while a worker is running in the folder."""
+    if is_locked(folder / LOCK_FILE):
+        raise StgaError(f"{folder}: another worker is running here (process {lock_owner(folder / LOCK_FILE)})")
+
+
+def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:
+    """Remove the files of a worker's status and `other_files`, then the folder where nothing else is in it.
+
+    Raises StgaError while the worker is running, or where a file cannot be removed.
+    """
+    refuse_running_worker(folder)
+    try:
+        for name in (STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE, *other_files):
+            (folder / name).unlink(missing_ok=True)
+        with suppress(OSError):  # files of others are in it, or it is gone
+            folder.rmdir()
+    except NotADirectoryError:
+        pass
+    except OSError as error:
+        raise StgaError(f"{folder}: cannot be removed ({error.strerror or error})") from error
+
+
+# Writing, by the worker
+
+
+class StatusWriter:
+    """Writes the status of this process, a worker, into its status folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.cancel_requested = False
+        self._status, self._written_s = WorkerStatus(), -math.inf
+
+    def update(
+        self, progress: float, message: str, detail: str = "", figures: Callable[[], Mapping[str, float]] = dict
+    ) -> bool:
+        """Write the status, at most every STATUS_INTERVAL_S; returns whether to stop and keep what there is.
+
+        figures: called when the status is written; numbers that are not finite are left out.
+        """
+        self.cancel_requested = (self.folder / CANCEL_FILE).exists()
+        now = time.monotonic()
+        if message != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
+            finite = {name: value for name, value in figures().items() if math.isfinite(value)}
+            progress = min(max(progress, 0.0), 1.0)
+            self._status = WorkerStatus(WorkerState.WORKING, progress, message, detail, figures=finite)
+            self._written_s = now
+            with suppress(StgaError):  # a missing status stops no work; the work itself reports a full disk
+                write_json(self.folder / STATUS_FILE, asdict(self._status))
+        return self.cancel_requested
+
+    def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
+        """Write the final status."""
+        final = replace(self._status, state=state, error=error, traceback=trace)
+        deadline = time.monotonic() + FINAL_STATUS_TIMEOUT_S
+        while True:
+            try:
+                return write_json(self.folder / STATUS_FILE, asdict(final))
+            except StgaError:
+                if time.monotonic() > deadline:
+                    return None  # `inspect_worker` reports a worker that is gone
+                time.sleep(0.1)
+
+
+@contextmanager
+def status_writer(folder: Path) -> Iterator[StatusWriter]:
+    """Lock the status folder while the block runs, and write the final status when it ends, however it ends.
+
+    Raises what the block raises, and StgaError where another worker is in the folder or it cannot be written.
+    """
+    with ExitStack() as lock:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock.enter_context(hold_lock(folder / LOCK_FILE))
+        except BlockingIOError:
+            refuse_running_worker(folder)
+            raise StgaError(f"{folder}: another worker was running here; try again") from None
+        except OSError as error:
+            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        writer = StatusWriter(folder)
+        try:
+            yield writer
+        except StgaError as error:
+            writer.finish(WorkerState.FAILED, str(error))
+            raise
+        except KeyboardInterrupt:
+            writer.finish(WorkerState.CANCELLED)
+            raise
+        except BaseException as error:
+            writer.finish(WorkerState.FAILED, _summarize(error), traceback.format_exc())
+            raise
+        writer.finish(WorkerState.CANCELLED if writer.cancel_requested else WorkerState.FINISHED)
+
+
+def _summarize(error: BaseException) -> str:
+    if isinstance(error, ModuleNotFoundError):
+        return f"{sys.executable} lacks the package '{error.name}'"
+    lines = str(error).strip().splitlines()
+    return ": ".join([type(error).__name__, *lines[:1]])

@@ -1,0 +1,45 @@
+"""A run whose meshes are read by the loader's thread."""
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture import factory
+
+from stga_addon.capture.loader import ViewLoader
+from stga_addon.capture.open import open_capture
+from stga_addon.training.optimize.frames import CACHED_TIMESTEPS
+from stga_addon.training.run import loop
+from stga_addon.training.run.loop import train
+
+from .test_run import assert_same_state, make_run
+
+
+def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches training that waits for mesh files on captures longer than the cache, and numbers that depend on it."""
+    timesteps = range(2 * CACHED_TIMESTEPS)
+    opened = open_capture(factory.write_mesh_capture(tmp_path / "capture", timesteps, range(2)))
+    read: list[tuple[int, bool]] = []
+
+    def mesh(timestep: int) -> np.ndarray:
+        read.append((timestep, threading.current_thread() is threading.main_thread()))
+        return opened.mesh(timestep)
+
+    capture = replace(opened, mesh=mesh, views={"train": opened.views["train"]})
+    run = make_run(capture, "global", iterations=len(timesteps) - 1)
+    train(capture, tmp_path / "loaded", run)
+    assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view
+    assert not any(on_training_thread for _, on_training_thread in read)
+
+    def without_meshes(*arguments: Any, **options: Any) -> ViewLoader:
+        return ViewLoader(*arguments, **{**options, "mesh": None})
+
+    read.clear()
+    monkeypatch.setattr(loop, "ViewLoader", without_meshes)
+    train(capture, tmp_path / "unloaded", run)
+    assert len(read) == len(timesteps) - 1
+    assert all(on_training_thread for _, on_training_thread in read)
+    assert_same_state(tmp_path / "loaded", tmp_path / "unloaded")

@@ -1,0 +1,380 @@
+"""Workers and their status folder, without Blender: start, progress, cancel, failure, and workers that are killed."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.worker import launch, status
+from stga_addon.worker.launch import (
+    prepare_status_folder,
+    same_interpreter_environment,
+    start_worker,
+    worker_environment,
+)
+from stga_addon.worker.status import (
+    CANCEL_FILE,
+    LOG_FILE,
+    STATUS_FILE,
+    StatusWriter,
+    WorkerSnapshot,
+    WorkerState,
+    WorkerStatus,
+    derive_state,
+    failure_report,
+    inspect_worker,
+    log_lines,
+    read_status,
+    remove_status_folder,
+    request_cancel,
+    status_writer,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+# A worker that reports progress until it is cancelled, or does what its argument says.
+WORKER = """
+import os, sys, time
+from pathlib import Path
+from stga_addon.worker.status import status_writer
+from stga_addon.errors import StgaError
+
+def main():
+    with status_writer(Path(sys.argv[1])) as writer:
+        print("a line of the log", flush=True)
+        for n in range(2000):
+            if writer.update(n / 2000, "counting", "on time", lambda: {"n": n, "nothing": float("nan")}):
+                return
+            if sys.argv[2] == "sentence": raise StgaError("capture: is not a folder")
+            if sys.argv[2] == "bug": raise ValueError("a bug\\nof two lines")
+            if sys.argv[2] == "exit": os._exit(7)
+            if sys.argv[2] == "done": return
+            time.sleep(0.01)
+main()
+"""
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch):
+    """Start the worker above as a module, in a status folder that is returned with the process."""
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    (packages / "counting.py").write_text(WORKER)
+    path = os.pathsep.join([str(ROOT), str(packages)])
+    monkeypatch.setattr(launch, "worker_environment", lambda variables, python: {**variables, "PYTHONPATH": path})
+    running: list[subprocess.Popen[bytes]] = []
+
+    def run(action: str = "work") -> tuple[Path, "subprocess.Popen[bytes]"]:
+        folder = tmp_path / "status"
+        prepare_status_folder(folder)
+        running.append(start_worker(folder, sys.executable, ["counting", str(folder), action]))
+        return folder, running[-1]
+
+    yield run
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def wait(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("state", "alive", "cancel_requested", "started", "expected"),
+    [
+        (None, False, False, False, WorkerState.NONE),
+        (None, False, True, False, WorkerState.NONE),
+        (None, True, False, True, WorkerState.STARTING),
+        (None, True, True, True, WorkerState.CANCELLING),
+        (None, False, False, True, WorkerState.LOST),
+        (WorkerState.WORKING, True, False, True, WorkerState.WORKING),
+        (WorkerState.WORKING, True, True, True, WorkerState.CANCELLING),
+        (WorkerState.WORKING, False, False, True, WorkerState.LOST),
+        (WorkerState.WORKING, False, True, True, WorkerState.LOST),
+        *[
+            (end, alive, cancel_requested, True, end)
+            for end in (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
+            for alive in (False, True)
+            for cancel_requested in (False, True)
+        ],
+    ],
+)
+def test_state_is_derived(state, alive, cancel_requested, started, expected):
+    """Catches a living worker reported as dead, or one that wrote its final status reported as alive."""
+    status = None if state is None else WorkerStatus(state)
+    assert derive_state(status, alive, cancel_requested, started) == expected
+
+
+def test_worker_is_cancelled(start):
+    """Catches figures that do not arrive, a cancel request that is ignored, and a second worker in the folder."""
+    folder, process = start()
+    assert inspect_worker(folder, process).state.is_alive
+    wait(lambda: inspect_worker(folder, process).state == WorkerState.WORKING)
+    wait(lambda: inspect_worker(folder).status.progress > 0)  # as a Blender sees it that did not start the worker
+    snapshot = inspect_worker(folder)
+    assert snapshot.state == WorkerState.WORKING
+    assert (snapshot.status.message, snapshot.status.detail) == ("counting", "on time")
+    assert list(snapshot.status.figures) == ["n"]
+    if os.name != "nt":
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
+    with pytest.raises(StgaError, match=f"another worker is running here \\(process {process.pid}\\)"):
+        prepare_status_folder(folder)
+    with pytest.raises(StgaError, match="another worker"):
+        remove_status_folder(folder)
+    request_cancel(folder)
+    request_cancel(folder)
+    assert inspect_worker(folder, process).state in (WorkerState.CANCELLING, WorkerState.CANCELLED)
+    assert process.wait(20) == 0
+    final = inspect_worker(folder, process)
+    assert final.state == WorkerState.CANCELLED
+    assert 0 < final.status.progress < 1
+    remove_status_folder(folder)
+    assert not folder.exists()
+    assert inspect_worker(folder) == WorkerSnapshot()
+
+
+def test_worker_finishes(start):
+    """Catches a finished worker reported as lost."""
+    folder, process = start("done")
+    assert process.wait(20) == 0
+    assert inspect_worker(folder, process).state == WorkerState.FINISHED
+
+
+def test_user_error_is_a_sentence(start):
+    """Catches a user's mistake reported with a traceback."""
+    folder, process = start("sentence")
+    process.wait(20)
+    snapshot = inspect_worker(folder)
+    assert snapshot.state == WorkerState.FAILED
+    assert (snapshot.status.error, snapshot.status.traceback) == ("capture: is not a folder", "")
+    assert snapshot.log_tail
+    assert "a line of the log" in failure_report(folder, snapshot)
+
+
+def test_bug_has_a_traceback(start):
+    """Catches a crash whose report lacks traceback or log."""
+    folder, process = start("bug")
+    assert process.wait(20) == 1
+    snapshot = inspect_worker(folder)
+    assert snapshot.state == WorkerState.FAILED
+    assert snapshot.status.error == "ValueError: a bug"
+    report = failure_report(folder, snapshot)
+    assert report.startswith("ValueError: a bug\nTraceback")
+    assert "a line of the log" in report
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_killed_worker_is_lost(start):
+    """Catches a progress bar that stays forever after kill -9, and an unreported signal."""
+    folder, process = start()
+    wait(lambda: inspect_worker(folder, process).state == WorkerState.WORKING)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert inspect_worker(folder).state == WorkerState.LOST
+    assert "Worker exited unexpectedly; it was killed or" in inspect_worker(folder).status.error
+    assert "(signal 9)" in inspect_worker(folder, process).status.error
+    prepare_status_folder(folder)
+    assert inspect_worker(folder).state == WorkerState.LOST  # prepared, and no worker yet
+
+
+def test_exit_status_is_reported(start):
+    """Catches a worker that ends before its first status and leaves an exit status alone."""
+    folder, process = start("exit")
+    process.wait(20)
+    assert inspect_worker(folder, process).status.error == "Worker exited with status 7: a line of the log"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell closes the descriptors")
+@pytest.mark.parametrize("action", ["done", "sentence"])
+@pytest.mark.parametrize("streams", [">&- 2>&-", "<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"])
+def test_final_status_without_output_streams(tmp_path, streams, action):
+    """Catches a worker without a final status where its output is closed, full or a broken pipe."""
+    script = WORKER.replace('print("a line of the log", flush=True)', "time.sleep(0.2)")
+    (tmp_path / "counting.py").write_text(script)
+    folder = tmp_path / "status"
+    subprocess.run(
+        f"{sys.executable} {tmp_path}/counting.py {folder} {action} {streams}",
+        shell=True, check=False, env=same_interpreter_environment(os.environ), timeout=60,
+    )  # fmt: skip
+    expected = WorkerState.FINISHED if action == "done" else WorkerState.FAILED
+    wait(lambda: (read_status(folder) or WorkerStatus()).state == expected)
+
+
+def test_interpreter_that_does_not_exist(tmp_path):
+    """Catches a traceback for a mistyped path, and files of a person removed with the status folder."""
+    folder = tmp_path / "job"
+    for own in (True, False):
+        prepare_status_folder(folder)
+        if own:
+            (folder / "notes.txt").write_text("mine")
+        for python in (str(tmp_path / "nowhere/python"), "null\0character"):
+            prepare_status_folder(folder)
+            with pytest.raises(StgaError, match=r"cannot be started as a Python interpreter"):
+                start_worker(folder, python, [])
+        assert inspect_worker(folder).state == WorkerState.NONE
+        if own:
+            assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+            (folder / "notes.txt").unlink()
+    assert not folder.exists()
+
+
+def test_only_own_files_are_removed(tmp_path):
+    """Catches a folder removed with a person's files, and one that is not a folder taken for an error."""
+    with status_writer(tmp_path / "job") as writer:
+        writer.update(0.5, "working")
+    (tmp_path / "job" / "notes.txt").write_text("mine")
+    (tmp_path / "job" / "job.json").write_text("")
+    remove_status_folder(tmp_path / "job", ["job.json"])
+    assert [path.name for path in (tmp_path / "job").iterdir()] == ["notes.txt"]
+    (tmp_path / "file").write_text("")
+    remove_status_folder(tmp_path / "file")
+    assert (tmp_path / "file").exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
+def test_symbolic_links_are_not_followed(tmp_path):
+    """Catches a file overwritten through a link that somebody placed in the status folder."""
+    target, folder = tmp_path / "target", tmp_path / "job"
+    target.write_text("mine")
+    folder.mkdir()
+    for name in (STATUS_FILE, LOG_FILE, CANCEL_FILE):
+        (folder / name).symlink_to(target)
+    prepare_status_folder(folder)
+    (folder / CANCEL_FILE).symlink_to(tmp_path / "created")
+    request_cancel(folder)
+    assert not (tmp_path / "created").exists()
+    (folder / CANCEL_FILE).unlink()
+    (folder / LOG_FILE).unlink()
+    (folder / LOG_FILE).symlink_to(target)
+    with pytest.raises(StgaError, match=rf"{LOG_FILE}: cannot be written"):
+        start_worker(folder, sys.executable, ["this"])
+    with status_writer(folder) as writer:
+        writer.update(0.5, "working")
+    assert target.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        '{"state": "dancing"}',
+        '{"state": 3}',
+        '{"progress": "half"}',
+        '{"progress": NaN}',
+        '{"progress": 2}',
+        '{"error": ["a"]}',
+        '{"figures": []}',
+        '{"figures": {"n": "many"}}',
+        '{"surprise": 1}',
+    ],
+)
+def test_damaged_status_is_ignored(tmp_path, text):
+    """Catches an exception in Blender's timer for a truncated or foreign status.json."""
+    (tmp_path / STATUS_FILE).write_text(text)
+    assert read_status(tmp_path) is None
+    assert inspect_worker(tmp_path).state == WorkerState.NONE
+
+
+def test_status_round_trip(tmp_path):
+    """Catches a field that is lost between worker and panel."""
+    expected = WorkerStatus(WorkerState.WORKING, 0.25, "training", "enough", "", "", {"psnr": 30.5})
+    with status_writer(tmp_path) as writer:
+        writer.update(0.25, "training", "enough", lambda: {"psnr": 30.5})
+        assert read_status(tmp_path) == expected
+    assert read_status(tmp_path) == WorkerStatus(**{**vars(expected), "state": WorkerState.FINISHED})
+
+
+def test_status_is_written_rarely(tmp_path, monkeypatch):
+    """Catches a status written in every iteration, and a new message that is delayed."""
+    written = []
+    monkeypatch.setattr(status, "write_json", lambda path, value: written.append(value["message"]))
+    writer = StatusWriter(tmp_path)
+    for message in ("a", "a", "b", "b"):
+        writer.update(0, message)
+    assert written == ["a", "b"]
+
+
+def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
+    """Catches a worker that fails because its status cannot be written, and a cause that is not reported."""
+
+    def full(path: Path, value: object) -> None:
+        raise StgaError(f"{path}: cannot be written ({os.strerror(errno.ENOSPC)})")
+
+    monkeypatch.setattr(status, "FINAL_STATUS_TIMEOUT_S", 0.0)
+    with status_writer(tmp_path) as writer:
+        monkeypatch.setattr(status, "write_json", full)
+        assert not writer.update(0.5, "training")
+    monkeypatch.undo()
+    (tmp_path / LOG_FILE).touch()
+    assert inspect_worker(tmp_path).state == WorkerState.LOST
+    monkeypatch.setattr(status.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 100}))
+    assert f"the disk that holds {tmp_path} is full" in inspect_worker(tmp_path).status.error
+
+
+def test_folder_that_cannot_be_written(tmp_path):
+    """Catches a traceback where the folder's place is taken by a file."""
+    (tmp_path / "file").write_text("")
+    for use in (prepare_status_folder, request_cancel):
+        with pytest.raises(StgaError, match=r"file.*cannot be written"):
+            use(tmp_path / "file" / "status")
+    with pytest.raises(StgaError, match=r"cannot be written"), status_writer(tmp_path / "file" / "status"):
+        pass
+
+
+def test_one_worker_per_folder(tmp_path):
+    """Catches two workers that overwrite each other's status."""
+    with status_writer(tmp_path) as writer:
+        writer.update(0.5, "first")
+        with pytest.raises(StgaError, match="another worker"), status_writer(tmp_path):
+            pass
+        assert read_status(tmp_path).message == "first"
+
+
+def test_worker_environment():
+    """Catches a worker with Blender's own standard library, or one that writes into the extension's folder."""
+    variables = {"PATH": "/bin", "PYTHONHOME": "/blender/python", "PYTHONPATH": "/other"}
+    made = worker_environment(variables, "/usr/bin/python3")
+    assert made["PATH"] == "/bin"
+    assert "PYTHONHOME" not in made
+    assert made["PYTHONPATH"] == str(ROOT)
+    assert made["PYTHONDONTWRITEBYTECODE"] == "1"
+
+
+def test_own_interpreter_finds_the_bundled_packages(monkeypatch):
+    """Catches a worker of Blender's Python without the packages of Blender's extensions."""
+    monkeypatch.setattr(sys, "path", ["", "/extensions/site-packages"])
+    expected = os.pathsep.join([str(ROOT), "/extensions/site-packages"])
+    assert worker_environment({}, sys.executable)["PYTHONPATH"] == expected
+
+
+def test_log_lines(tmp_path):
+    """Catches progress bars, which use carriage returns, and a character that is cut in half."""
+    (tmp_path / LOG_FILE).write_bytes("ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n")
+    assert log_lines(tmp_path, 2) == ["second", "third"]
+    assert log_lines(tmp_path / "none", 2) == []
+
+
+def test_status_is_standard_json(tmp_path):
+    """Catches a NaN in status.json, which other programs cannot read."""
+    with status_writer(tmp_path) as writer:
+        writer.update(0.5, "x", "", lambda: {"psnr": float("nan"), "loss": float("inf"), "n": 1.0})
+
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    text = (tmp_path / STATUS_FILE).read_text()
+    assert json.loads(text, parse_constant=refuse)["figures"] == {"n": 1.0}
