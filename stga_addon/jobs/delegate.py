@@ -59,7 +59,7 @@ def read_head(folder: Path) -> OpenHead:
         value = values.get(name)
         if not isinstance(value, str) and (needed or value is not None):
             raise StgaError(f"{path}: {name} is {value!r:.40}, expected a path")
-    capture, flame, avatar = (values.get(name) and Path(values[name]) for name in ("capture", "flame", "avatar"))
+    flame, avatar = (Path(values[name]) if values.get(name) else None for name in ("flame", "avatar"))
 
     def selection() -> dict[int, np.ndarray] | None:
         return _by_timestep(folder / SELECTION) if (folder / SELECTION).exists() else None
@@ -68,7 +68,7 @@ def read_head(folder: Path) -> OpenHead:
         meshes = _by_timestep(folder / PLAYED)
         return replace(capture, timesteps=tuple(sorted(meshes)), mesh=meshes.__getitem__, flame=None)
 
-    return OpenHead(capture, flame, values["principal_point"], avatar, selection, played)
+    return OpenHead(Path(values["capture"]), flame, values["principal_point"], avatar, selection, played)
 
 
 def _by_timestep(path: Path) -> dict[int, np.ndarray]:
