@@ -214,3 +214,14 @@ def test_mode_follows_the_umask(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o640
+
+
+@pytest.mark.parametrize("name", [".", "/", "folder", "pipe"])
+def test_only_regular_files_are_replaced(tmp_path, name):
+    """Catches a device, such as /dev/null, that is replaced by a file, and a traceback for a path without a name."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    path = Path(name) if name in "./" else tmp_path / name
+    with pytest.raises(StgaError, match="is not a regular file"), files.replacing(path):
+        pytest.fail("the block must not run")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["folder", "pipe"]

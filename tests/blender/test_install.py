@@ -1,4 +1,4 @@
-"""The built zip, installed the way a person installs it: into a fresh Blender profile, in a process of its own."""
+"""The built zip, installed as a user installs it: into a new Blender profile, in its own process."""
 
 import json
 import os

@@ -437,11 +437,35 @@ def test_splits_that_are_not_there(
 # The entry point
 
 
-def test_every_command_is_there() -> None:
-    """Catches a command that the parser lost."""
-    choices = next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
-    expected = {"train", "presets", "benchmark", "render", "eval", "select", "export", "info", "demo", "job"}
-    assert set(choices) == expected
+def commands_of(parser: argparse.ArgumentParser) -> set[str]:
+    return set(next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices)
+
+
+def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a command that the parser lost, and an extension without `development` whose parser needs it."""
+    shipped = {"train", "presets", "render", "eval", "select", "export", "info", "job", "environment"}
+    assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
+    monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
+    assert commands_of(make_parser()) == shipped
+
+
+WITH_NUMPY_ALONE = """
+import sys
+missing = ("torch", "numba", "warp", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
+sys.modules.update(dict.fromkeys(missing))  # importing one of them fails
+from stga_addon.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_bare_blender_python_selects_and_exports(trained: Path, tmp_path: Path) -> None:
+    """Catches an import by which `select` and `export` need more than the numpy of Blender's own Python."""
+    root, model = factory.write_flame_capture(tmp_path / "flame")
+    exported = ["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply")]
+    for arguments in (["--help"], ["select", str(root), "--flame", str(model)], exported):
+        command = [sys.executable, "-c", WITH_NUMPY_ALONE, *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_interruption_and_mistakes_have_their_codes(

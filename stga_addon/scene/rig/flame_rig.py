@@ -22,7 +22,7 @@ from ...flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ...flame.model import JOINTS, FlameModel
 from ...flame.motion import PARTS
 from ...flame.quaternions import continuous, from_axis_angle
-from ...flame.sequence import TURN, FlameSequence, turns
+from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import compat, tags
 from ..animation import add_driver, write_curve, write_triangle_curves
 from ..objects import Warn, leave_edit_mode, log_warning, place, remove
@@ -73,7 +73,11 @@ def add_rig(
     for name, component in sliders.items():
         _new_key(head, name, basis + model.shapedirs[:, :, component], SLIDER)
     _add_pose_keys(
-        head, rig, model, basis, np.ones(len(JOINTS), bool) if correctives == "all" else turns(frames) > TURN
+        head,
+        rig,
+        model,
+        basis,
+        np.ones(len(JOINTS), bool) if correctives == "all" else joint_angles(frames) > MIN_JOINT_ANGLE_DEG,
     )
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
