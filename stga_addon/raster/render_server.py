@@ -4,6 +4,7 @@ import sys
 from typing import Any
 
 from ..capture.camera import Camera
+from ..worker.environment_use import mark_environment_used
 from .cpu.compose import compose
 from .posed_splats import PosedSplats
 from .render_protocol import receive, send, unpack_layers
@@ -32,5 +33,6 @@ def serve(requests: Any, answers: Any) -> None:
 
 
 if __name__ == "__main__":
+    mark_environment_used()
     pipe, sys.stdout = sys.stdout.buffer, sys.stderr  # nothing else may get between the messages
     serve(sys.stdin.buffer, pipe)

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stga_addon.capture.meshes import CACHE_BYTES, read_mesh, read_regions, remembered, tracked_meshes
+from stga_addon.capture.meshes import CACHE_BYTES, cached_meshes, read_mesh, read_regions, tracked_meshes
 from stga_addon.capture.rigid import weighted_procrustes, without_head_motion
 from stga_addon.errors import StgaError
 
@@ -147,7 +147,7 @@ def test_meshes_are_kept_within_bounds() -> None:
         return np.full((4, 3), float(timestep))
 
     vertices = CACHE_BYTES // 24 // 3  # three fit
-    mesh = remembered(read, vertices)
+    mesh = cached_meshes(read, vertices)
     assert [mesh(t)[0, 0] for t in (0, 1, 2, 0, 1, 2)] == [0, 1, 2, 0, 1, 2]
     assert calls == [0, 1, 2]
     mesh(3)

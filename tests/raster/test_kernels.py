@@ -12,7 +12,8 @@ from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, frames_in_camera, render_backward, render_forward
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 from stga_addon.raster.cpu.threads import set_threads, threads
 
 NAMES = Parameters._fields[:5]

@@ -20,7 +20,7 @@ from mathutils import Matrix
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions, shaped_vertices
 from ...flame.model import JOINTS, FlameModel
-from ...flame.sequence import TURN, FlameSequence, turns
+from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import tags
 from ..animation import add_driver
 from ..arrays import flat_floats
@@ -78,7 +78,7 @@ def add_rig(
     _skin(head, rig, model.weights, displaced)
     for name, component in sliders.items():
         _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
-    corrected = np.ones(len(JOINTS), bool) if correctives == "all" else turns(frames) > TURN
+    corrected = np.ones(len(JOINTS), bool) if correctives == "all" else joint_angles(frames) > MIN_JOINT_ANGLE_DEG
     _add_pose_correctives(head, rig, model, basis, corrected)
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
