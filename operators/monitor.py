@@ -229,9 +229,12 @@ def _show_loaded(scene: Any) -> MonitorState:
             return _states[scene.session_uid]
         if not is_head(chosen.head):
             raise StgaError("No head in the scene to show the avatar on; import the capture")
-        return _handle(scene, _present(scene, shown, *loaded))
+        event = _present(scene, shown, *loaded)
     except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
-        return _handle(scene, states.AvatarFailed(str(error)))
+        event = states.AvatarFailed(str(error))
+    if not isinstance(event, states.SliceBuilt):
+        _loader.discard(scene)
+    return _handle(scene, event)
 
 
 def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes) -> states.Event:
@@ -272,9 +275,12 @@ class _Loader:
         future = self._loading[scene.session_uid]
         return future.result() if future.done() else None
 
+    def discard(self, scene: Any) -> None:
+        self._loading.pop(scene.session_uid, None)
+
     def close(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown()
+            self._pool.shutdown(wait=False, cancel_futures=True)
         self._pool, self._loading = None, {}
 
 
@@ -302,7 +308,8 @@ def redraw() -> None:
 
 @persistent
 def _after_load(_: Any) -> None:
-    _states.clear()  # session ids of the file before
+    _loader.close()
+    _states.clear()  # of scenes of the file before
     for scene in bpy.data.scenes:
         if scene.library is None:
             _adopt(scene)

@@ -3,6 +3,7 @@
 import sys
 from typing import BinaryIO
 
+from ..worker.environment_use import mark_environment_used
 from ..worker.stdout import claim_stdout
 
 
@@ -33,4 +34,6 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
 
 
 if __name__ == "__main__":
-    serve(sys.stdin.buffer, claim_stdout())
+    replies = claim_stdout()
+    mark_environment_used()
+    serve(sys.stdin.buffer, replies)
