@@ -27,8 +27,9 @@ from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.development.demo.head import synthetic_head
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
+from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.project import project_backward, project_forward
-from stga_addon.raster.cpu.rasterize import BufferPool, Parameters, frames_in_camera, render_forward
+from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_forward, tile_grid, with_strain_color
 from stga_addon.raster.cpu.threads import threads
 from stga_addon.raster.cpu.tiles import PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.training.optimize import adam
@@ -104,45 +105,40 @@ def copy_bandwidth() -> float:
 
 def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, tuple[float, int]]:
     """stage -> (median ms, bytes that it must move at least)."""
-    n, camera = len(splats), frames.camera
-    pixels, background = camera.width * camera.height, np.ones(3, np.float32)
-    tiles_x, tiles_y = -(-camera.width // 16), -(-camera.height // 16)
+    n, (width, height) = len(splats), frames.size.tolist()
+    pixels, background = width * height, np.ones(3, np.float32)
+    tiles_x, tiles_y = tile_grid(width, height)
     state, buffers = new_state(splats), BufferPool()
-    arrays, face = state.arrays(), state.face.numpy()
-    gradients = Parameters(*(g.numpy() for g in state.gradients))
-    r = render_forward(arrays, face, frames, 3, background, buffers=buffers)
-    projected, depth = np.empty_like(r.projected), np.empty(n, np.float32)
-    extent_y, rect = np.empty(n, np.float32), np.empty((n, 4), np.int32)
-    project = (
-        np.arange(n), np.ones((tiles_y, tiles_x), bool), *arrays, 3, face, frames.origin, frames.matrix, frames.strain,
-        frames.to_world, frames.intrinsics, frames.size, False, False, projected, depth, extent_y, rect,
-    )  # fmt: skip
-    project_forward(*project)
-    order = depth_order(depth, r.visible)
-    pairs, rows = len(r.pair_splat), r.visible
+    parameters, face = with_strain_color(state.arrays()), state.face.numpy()
+    gradients = with_strain_color(Parameters(*(g.numpy() for g in state.gradients)))
+    r = render_forward(parameters, face, frames, 3, background, buffers=buffers)
+    lists, columns, (_, depth, _, rect) = r.lists, r.projection.columns, r.projection
+    first_pair, pairs, rows = lists.first_pair, lists.pairs, lists.visible
+    everything, everywhere = np.arange(n), np.ones((tiles_y, tiles_x), bool)
+    order, count = depth_order(depth, rows), len(lists.pair_splat)
     counts = np.empty((PARTS, tiles_x * tiles_y), np.int32)
-    count_pairs(rect, order, tiles_x, counts, r.pairs)
+    count_pairs(rect, order, tiles_x, counts, pairs)
     places = counts.copy()
-    compute_offsets(rows, r.pairs, places, r.first_pair)
-    v_image, screen = np.empty_like(r.image), np.empty(n, np.float32)
-    bands = whole_image(camera.height, camera.width)
+    compute_offsets(rows, pairs, places, first_pair)
+    v_image, screen_gradient = np.empty_like(r.image), np.empty(n, np.float32)
+    bands = whole_image(height, width)
     zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
-    pair_gradients = np.empty((pairs, 9), np.float32)
+    pair_gradients = np.empty((count, PROJECTED), np.float32)
     work = {
-        "project": (lambda: project_forward(*project), n * (59 + 16) * 4),
-        "sort by depth": (lambda: depth_order(depth, r.visible), len(rows) * 6 * 8),
-        "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts, r.pairs), n * 24),
-        "lay out pairs": (lambda: compute_offsets(rows, r.pairs, counts.copy(), r.first_pair), counts.nbytes + n * 8),
+        "project": (
+            lambda: project_forward(everything, everywhere, parameters, face, frames, 3, False, False, r.projection),
+            n * (59 + 16) * 4,
+        ),
+        "sort by depth": (lambda: depth_order(depth, rows), len(rows) * 6 * 8),
+        "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts, pairs), n * 24),
+        "compute offsets": (lambda: compute_offsets(rows, pairs, counts.copy(), first_pair), counts.nbytes + n * 8),
         "fill pairs": (
-            lambda: fill_pairs(rect, order, tiles_x, places.copy(), r.first_pair, r.splat_pairs, r.pair_splat),
-            pairs * 8 + n * 24,
+            lambda: fill_pairs(rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat),
+            count * 8 + n * 24,
         ),
         "blend": (
-            lambda: blend_forward(
-                r.tiles, tiles_x, r.start, r.pair_splat, r.projected, extent_y, background, r.pair_rows, r.image,
-                r.transmittance, r.last,
-            ),
-            pairs * 44 + pixels * 20,
+            lambda: blend_forward(r.tiles, tiles_x, lists, r.projection, background, r.blended),
+            count * 44 + pixels * 20,
         ),
         "L1 + SSIM, both ways": (
             lambda: image_gradient(r.image, target, bands, 0.2, v_image),
@@ -150,18 +146,16 @@ def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str
         ),
         "blend backward": (
             lambda: blend_backward(
-                r.tiles, tiles_x, r.start, r.pair_splat, r.pair_rows, wanted, r.projected, background,
-                r.transmittance, r.last, v_image, zero, pair_gradients,
+                r.tiles, tiles_x, lists, r.blended, wanted, columns, background, v_image, zero, pair_gradients
             ),
-            pairs * (48 + 36) + pixels * 24,
+            count * (48 + 36) + pixels * 24,
         ),
         "project backward": (
             lambda: project_backward(
-                rows, *arrays, 3, face, frames.origin, frames.matrix, frames.strain, frames.to_world,
-                frames.intrinsics, frames.size,
-                False, False, r.projected, r.first_pair, r.pairs, r.splat_pairs, pair_gradients, *gradients, screen,
+                rows, parameters, face, frames, 3, False, False, columns, lists, pair_gradients, gradients,
+                screen_gradient,
             ),
-            pairs * 36 + len(rows) * (59 * 2 + 16) * 4,
+            count * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),
         "Adam": (lambda: adam.step(state, rows, RATES), len(rows) * 59 * 4 * 9),
     }  # fmt: skip

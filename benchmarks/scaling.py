@@ -17,7 +17,8 @@ import numpy as np
 from iteration import demo_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
-from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera, render_forward
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 from stga_addon.raster.cpu.threads import set_threads, threads
 
 matplotlib.use("Agg")
@@ -46,7 +47,7 @@ def measure(x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, sha
         batch = replace(batch, selected=two_regions(head, mesh, faces, share))
     arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
     frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
-    pairs = len(render_forward(arrays, head.face, frames, 3).pair_splat)
+    pairs = len(render_forward(arrays, head.face, frames, 3).lists.pair_splat)
     return Point(x, median_ms(lambda: step.step(batch), repeats), pairs)
 
 

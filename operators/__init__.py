@@ -1,13 +1,14 @@
-"""What a person can do: one file an action."""
+"""Operators, one module for each step of the panel."""
 
 from typing import Any
 
 import bpy
 
 from . import analyze, ids, monitor
-from .analyze import AnalyzeCapture
+from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
+from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
 from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .failure_report import CopyReport
@@ -28,6 +29,7 @@ CLASSES = (
     CountSelected,
     HeatMap,
     AnalyzeCapture,
+    CancelAnalysis,
     Train,
     CancelTraining,
     DismissTraining,
@@ -41,6 +43,10 @@ CLASSES = (
     ApplyMotion,
     ImportPly,
     ExportAvatar,
+    OpenNpz,
+    CaptureDrop,
+    AvatarDrop,
+    PlyDrop,
 )
 
 

@@ -1,4 +1,4 @@
-"""Another person's FLAME motion → this head's keyframes."""
+"""Applies a FLAME motion to the head as keyframes."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,13 +13,28 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
 from . import ids
-from .common import capture_of, file_path, flame_model_path, flame_of, head_of, is_head, needs_rig, reporting
+from .common import (
+    FileImport,
+    capture_of,
+    file_path,
+    flame_model_path,
+    flame_of,
+    head_of,
+    is_head,
+    needs_rig,
+    reporting,
+)
 
-LAST_FRAME = 1_048_574  # that Blender counts to
+LAST_FRAME = 1_048_574
+"""Blender's maximum frame number."""
 
 
-class ApplyMotion(bpy.types.Operator):
-    """Animate this head by another person's expressions and pose; what animated it before is kept"""
+def _part_property(name: str, description: str) -> Any:
+    return bpy.props.BoolProperty(name=name, description=description, default=True, options={"SKIP_SAVE"})
+
+
+class ApplyMotion(bpy.types.Operator, FileImport):
+    """Animate this head with the expressions and pose of another person; its earlier animation is kept"""
 
     bl_idname = ids.APPLY_MOTION
     bl_label = "Apply Motion"
@@ -29,82 +44,93 @@ class ApplyMotion(bpy.types.Operator):
         name="File",
         description="FLAME parameters (.npz), or the folder of a capture tracked with FLAME",
         subtype="FILE_PATH",
-        options=PATH_OPTIONS,
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
     source: bpy.props.StringProperty(
         name="Source",
-        description="Another imported head instead of a file: its motion as it plays in the scene's frame range",
+        description="Another imported head instead of a file: its motion in the scene's frame range",
+        options={"SKIP_SAVE"},
     )
-    expression: bpy.props.BoolProperty(name="Expression", description="Take the expression", default=True)
-    jaw: bpy.props.BoolProperty(name="Jaw", description="Take the rotation of the jaw", default=True)
-    eyes: bpy.props.BoolProperty(name="Eyes", description="Take the rotation of the eyes", default=True)
-    neck: bpy.props.BoolProperty(name="Neck", description="Take the rotation of the neck", default=True)
-    head: bpy.props.BoolProperty(
-        name="Head", description="Take the rotation and translation of the whole head", default=True
-    )
+    expression: _part_property("Expression", "Apply the expression")
+    jaw: _part_property("Jaw", "Apply the rotation of the jaw")
+    eyes: _part_property("Eyes", "Apply the rotation of the eyes")
+    neck: _part_property("Neck", "Apply the rotation of the neck")
+    head: _part_property("Head", "Apply the rotation and translation of the whole head")
     strength: bpy.props.FloatProperty(
         name="Strength",
-        description="1 as recorded, more to exaggerate; the whole head moves more or less about where it begins",
+        description="1: as recorded; above 1: exaggerated. Head motion is scaled about its first pose",
         default=1.0,
         min=0.0,
         soft_max=2.0,
         max=10.0,
+        options={"SKIP_SAVE"},
     )
     own_offsets: bpy.props.BoolProperty(
         name="Own Offsets",
-        description="The motion is this head's own, refined: its tracked per-frame offsets, if it has any, play along",
+        description="The motion is this head's own, refined by training: keep its tracked per-frame offsets, if any",
+        options={"SKIP_SAVE"},
     )
-    start: bpy.props.IntProperty(name="Start Frame", description="Frame of the first keyframe", default=1, min=0)
+    start: bpy.props.IntProperty(
+        name="Start Frame", description="Frame of the first keyframe", default=1, min=0, options={"SKIP_SAVE"}
+    )
     fps: bpy.props.FloatProperty(
         name="Recorded At",
-        description="Frames per second of the recording; 0: one timestep a frame of the scene",
+        description="Frames per second of the recording; 0: one timestep for each frame of the scene",
         min=0.0,
         max=1000.0,
+        options={"SKIP_SAVE"},
     )
     speed: bpy.props.FloatProperty(
-        name="Speed", description="2 plays twice as fast, 0.5 half as fast", default=1.0, min=0.01, max=100.0
+        name="Speed",
+        description="2: twice as fast; 0.5: half as fast",
+        default=1.0,
+        min=0.01,
+        max=100.0,
+        options={"SKIP_SAVE"},
     )
     place: bpy.props.EnumProperty(
         name="As",
-        description="Where the keyframes go; the animation that was there is kept in the file",
+        description="Where the keyframes go; the earlier animation is kept in the file",
         items=(
-            ("action", "New Action", "A copy of the head's action with the chosen parts exchanged"),
-            ("strip", "NLA Strip", "A strip over the head's own animation, which plays on before and after it"),
+            ("action", "New Action", "A copy of the head's action with the chosen parts replaced"),
+            ("strip", "NLA Strip", "A strip over the head's own animation, which plays before and after it"),
         ),
+        options={"SKIP_SAVE"},
     )
     fit_range: bpy.props.BoolProperty(
-        name="Extend Frame Range", description="Let the scene play as long as the motion lasts", default=True
+        name="Extend Frame Range",
+        description="Extend the scene's frame range to the end of the motion",
+        default=True,
+        options={"SKIP_SAVE"},
     )
+    filename_ext = ".npz"
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:
         if properties.own_offsets:
-            return "Put this head on its tracking as training refined it; what animated it before is kept"
-        return ""  # the class' own
+            return "Animate this head with its tracking as refined by training; its earlier animation is kept"
+        return ""  # that of the class
 
     @classmethod
     def poll(cls, context: Any) -> bool:
         return needs_rig(cls, context)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
-        if self.source:
-            return self.execute(context)
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return self.execute(context) if self.source else super().invoke(context, event)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
         parts = [part for part in PARTS if getattr(self, part)]
         if not parts:
-            raise StgaError("apply motion: no part is chosen; take the expression, jaw, eyes, neck or head")
+            raise StgaError("apply motion: no part is chosen; choose expression, jaw, eyes, neck or head")
         name, motion = self._motion(context, head)
         step = self._step(context.scene)
         frames = retimed(motion, step)
         end = self.start + len(frames) - 1
         if end > LAST_FRAME:
-            raise StgaError(f"apply motion: would end in frame {end}, Blender counts to {LAST_FRAME}")
+            raise StgaError(f"apply motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}")
         if self.strength != 1.0:
             frames = strengthened(frames, self.strength)
         tracked = self._tracked(head, step) if self.own_offsets else None

@@ -1,4 +1,4 @@
-"""`blender --command stga …`: the same parser as `python -m stga_addon`, about the head of the file that is open."""
+"""`blender --command stga …`: the commands of `python -m stga_addon`, by default about the open file's head."""
 
 import os
 import sys
@@ -17,14 +17,14 @@ from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.worker.environment import missing_packages
+from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids
 from .common import file_path, is_head, scene_settings
-from .environment import environment_folder, training_python
+from .environment import environment_folder, preferred_python, training_python
 
 IN_BLENDER = ("select", "export", "demo", "environment")
-"""Commands that need none of the packages which Blender's Python may lack, or need Blender itself."""
+"""Commands that need none of the packages that Blender's Python may lack, or need Blender itself."""
 
 if TYPE_CHECKING:
     from ..stga_addon.jobs.delegate import OpenHead
@@ -33,7 +33,6 @@ _commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from ..stga_addon.cli.environment import FOLDER_VARIABLE
     from ..stga_addon.cli.main import main, make_parser  # loaded when a command is given, not when Blender starts
 
     try:
@@ -41,15 +40,24 @@ def _run(arguments: list[str]) -> int:
         options = make_parser(head).parse_args(arguments)
         command = options.command
         if command == "environment":
-            os.environ[FOLDER_VARIABLE] = str(environment_folder(create=True))
-            if options.action == "make" and options.wheels is None and not bpy.app.online_access:
-                raise StgaError("Blender is offline: give it --online-mode, or `make` a folder of --wheels")
+            _prepare_environment_command(options)
         if command in IN_BLENDER or not missing_packages():
             return main(arguments, head)
-        return _hand_over(arguments, head, played=command == "render")
+        return _delegate(arguments, head, played=command == "render")
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2
+
+
+def _prepare_environment_command(options: Any) -> None:
+    """Pass Blender's folder and preferences on. Raises StgaError for a download while Blender is offline."""
+    from ..stga_addon.cli.environment import FOLDER_VARIABLE
+
+    os.environ[FOLDER_VARIABLE] = str(environment_folder(create=True))
+    if preferred_python(bpy.context):
+        os.environ.setdefault(PYTHON_VARIABLE, preferred_python(bpy.context))
+    if options.action == "make" and options.wheels is None and not bpy.app.online_access:
+        raise StgaError("Blender is offline: start it with --online-mode, or give a folder of --wheels")
 
 
 def _open_head() -> "OpenHead | None":
@@ -69,7 +77,7 @@ def _open_head() -> "OpenHead | None":
     )
 
 
-def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
+def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
     """Run the command in the training environment; returns its exit code. Raises StgaError where there is none."""
     from ..stga_addon.jobs.delegate import FOLDER, write_head
 
@@ -84,7 +92,7 @@ def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> i
 
 
 def _played(head: Any, capture: Capture) -> Capture:
-    """The capture with the meshes of the scene's frames, whatever animates the head there."""
+    """The capture with the meshes that the head has in the scene's frames, however it is animated."""
     scene = bpy.context.scene
     frames = range(scene.frame_start, scene.frame_end + 1)
 

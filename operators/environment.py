@@ -29,13 +29,13 @@ def training_python(context: Any, given: str = "") -> str:
 
     Raises StgaError where none of them can.
     """
-    return bpy.path.abspath(given) if given else find_training_python(environment_folder(), _preferred_python(context))
+    return bpy.path.abspath(given) if given else find_training_python(environment_folder(), preferred_python(context))
 
 
 def has_training_python(context: Any) -> bool:
     """Whether `training_python` finds one, for panels: looked up when the environment's worker changes its state."""
     folder = environment_folder()
-    return bool(_lookup(folder, _preferred_python(context), monitor.snapshot(status_folder(folder)).state))
+    return bool(_lookup(folder, preferred_python(context), monitor.snapshot(status_folder(folder)).state))
 
 
 @lru_cache(maxsize=1)
@@ -46,7 +46,8 @@ def _lookup(folder: Path, preferred: str, state: WorkerState) -> str:
         return ""
 
 
-def _preferred_python(context: Any) -> str:
+def preferred_python(context: Any) -> str:
+    """The Python in the preferences; "" where none is."""
     stored = preferences(context)
     return bpy.path.abspath(stored.training_python) if stored and stored.training_python else ""
 
@@ -166,7 +167,7 @@ class CancelEnvironment(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         folder = status_folder(environment_folder())
         request_cancel(folder)
-        monitor.follow(folder)
+        monitor.monitor_worker(folder)
         return {"FINISHED"}
 
 
@@ -186,7 +187,7 @@ def _run(operator: Any, folder: Path, arguments: list[str]) -> set[str]:
     status = status_folder(folder)
     prepare_status_folder(status)
     process = start_worker(status, sys.executable, arguments)
-    monitor.started(status, process)
+    monitor.monitor_worker(status, process)
     if bpy.app.background:
         process.wait()
         final = inspect_worker(status, process)

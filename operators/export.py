@@ -1,8 +1,9 @@
-"""Avatar → files for other viewers."""
+"""Exports an avatar to the files of other viewers."""
 
 from typing import Any, ClassVar
 
 import bpy
+from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.avatar.export import export_avatar
 from ..stga_addon.avatar.file import read_avatar
@@ -15,8 +16,8 @@ from . import ids
 from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
 
 
-class ExportAvatar(bpy.types.Operator):
-    """Export a trained avatar, posed as the head in the scene, for viewers of Gaussian splats"""
+class ExportAvatar(bpy.types.Operator, ExportHelper):
+    """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian splats"""
 
     bl_idname = ids.EXPORT_AVATAR
     bl_label = "Export Avatar"
@@ -24,19 +25,22 @@ class ExportAvatar(bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(
         name="File or Folder",
-        description="A file for one PLY, a folder for the other formats",
+        description="A file for the format PLY, a folder for the others",
         subtype="FILE_PATH",
-        options=PATH_OPTIONS,
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
     avatar: bpy.props.StringProperty(
-        name="Avatar", description="Avatar file (.npz); empty: the one shown", subtype="FILE_PATH", options=PATH_OPTIONS
+        name="Avatar",
+        description="Avatar file (.npz); empty: the one shown",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
     format: bpy.props.EnumProperty(
         name="Format",
-        description="What the files are for",
+        description="File format",
         items=(
-            ("ply", "PLY", "The current frame in world space, for every 3D Gaussian Splatting viewer"),
-            ("ply-sequence", "PLY Sequence", "One world-space PLY for every frame of the scene"),
+            ("ply", "PLY", "The current frame in world space, for any 3D Gaussian Splatting viewer"),
+            ("ply-sequence", "PLY Sequence", "One PLY in world space for each frame of the scene"),
             (
                 "gaussian-avatars",
                 "GaussianAvatars",
@@ -45,13 +49,24 @@ class ExportAvatar(bpy.types.Operator):
         ),
     )
 
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+
     @classmethod
     def poll(cls, context: Any) -> bool:
         return needs_head(cls, context)
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+    @property
+    def filename_ext(self) -> str:
+        """What ExportHelper appends to the path."""
+        return ".ply" if self.format == "ply" else ""
+
+    def check(self, context: Any) -> bool:
+        """Keep the path's extension in step with the format; whether it changed."""
+        path = self.filepath.removesuffix(".ply")
+        if self.format == "ply":
+            path = bpy.path.ensure_ext(path, ".ply")
+        changed, self.filepath = path != self.filepath, path
+        return changed
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -1,4 +1,4 @@
-"""What went wrong, for somebody who is to find out why."""
+"""Copies the report of a failed worker to the clipboard."""
 
 import platform
 from typing import Any, ClassVar
@@ -7,27 +7,30 @@ import bpy
 
 from ..stga_addon import __version__
 from ..stga_addon.jobs.training_job import job_folder
-from ..stga_addon.worker.status import failure_report
+from ..stga_addon.worker.status import failure_report, inspect_worker
 from . import ids, monitor
 from .common import file_path, reporting
 
 
 class CopyReport(bpy.types.Operator):
-    """Copy the message, the traceback and the log of a worker to the clipboard"""
+    """Copy the error message, traceback and log of a worker to the clipboard"""
 
     bl_idname = ids.COPY_REPORT
     bl_label = "Copy Report"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     directory: bpy.props.StringProperty(
-        name="Folder", description="The worker's folder; empty: that of the scene's training", subtype="DIR_PATH"
+        name="Folder",
+        description="Status folder of the worker; empty: that of the scene's training",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
     )
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        run = monitor.run_of(context.scene)
+        run = monitor.training_of(context.scene).folder
         folder = file_path(self.directory, "folder") if self.directory or run is None else job_folder(run)
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
-        context.window_manager.clipboard = f"{versions}\n{failure_report(folder, monitor.snapshot(folder))}"
+        context.window_manager.clipboard = f"{versions}\n{failure_report(folder, inspect_worker(folder))}"
         self.report({"INFO"}, "Copied to the clipboard")
         return {"FINISHED"}

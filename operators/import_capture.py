@@ -1,4 +1,4 @@
-"""Capture folder → head and cameras."""
+"""Imports a capture: the tracked head and the cameras."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -7,63 +7,76 @@ import bpy
 
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
+from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import configure_scene, import_cameras
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.objects import capture_root, leave_edit_mode
 from ..stga_addon.scene.rig.head import import_head
 from . import ids
-from .common import file_path, flame_model_path, flame_property, reporting, scene_settings
+from .common import FileImport, file_path, flame_model_path, flame_property, reporting, scene_settings
 
 
-class ImportCapture(bpy.types.Operator):
-    """Import a multi-view capture: the tracked head, animated over its frames, and the cameras with their images"""
+class ImportCapture(bpy.types.Operator, FileImport):
+    """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with images"""
 
     bl_idname = ids.IMPORT_CAPTURE
     bl_label = "Import Capture"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
+    filepath: bpy.props.StringProperty(
+        name="File",
+        description="Transforms file of the capture, such as transforms_train.json; or its folder",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    )
     directory: bpy.props.StringProperty(
         name="Capture",
-        description="Folder that holds the capture's transforms files or meshes",
+        description="Folder of the capture, with its transforms files or meshes; not needed where a file is given",
         subtype="DIR_PATH",
-        options=PATH_OPTIONS,
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
     flame: flame_property()
     principal_point: bpy.props.EnumProperty(
         name="Principal Point",
-        description="What cx and cy in the transforms files mean",
+        description="Meaning of cx and cy in the transforms files",
         items=(
             ("vhap", "VHAP", "cy is counted from the bottom of the image, as VHAP's exporter writes it"),
             ("opencv", "OpenCV", "cx and cy are counted from the top left corner of the image"),
             ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
         ),
+        options={"SKIP_SAVE"},
     )
     correctives: bpy.props.EnumProperty(
         name="Correctives",
-        description="Which of FLAME's joints get pose correctives: shape keys and drivers that correct the mesh",
+        description="FLAME joints that get pose correctives: shape keys, with drivers, that correct the mesh",
         items=(
-            ("all", "Every Joint", "Any bone posed by hand gives FLAME's own mesh"),
-            ("moving", "Joints That Move", "Only what this capture turns: fewer shape keys and drivers"),
+            ("all", "All Joints", "Every bone can be posed by hand and gives FLAME's exact mesh"),
+            ("moving", "Moving Joints", "Joints that move in this capture only: fewer shape keys and drivers"),
         ),
     )
     set_up_scene: bpy.props.BoolProperty(
         name="Set Up Scene",
-        description="Give the scene the capture's resolution, its first camera and the Standard view "
-        "transform, in which the splats' colours are trained",
+        description="Set the scene's resolution and camera to those of the capture, and its view transform to "
+        "Standard, which the splats' colors are trained for",
         default=True,
     )
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
-
-    def invoke(self, context: Any, event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+    filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = file_path(self.directory, "capture")
+        folder = _capture_folder(file_path(self.filepath or self.directory, "capture"))
         bring_in(self, context, folder, self.flame, self.principal_point, self.set_up_scene, self.correctives)
         return {"FINISHED"}
+
+
+def _capture_folder(path: Path) -> Path:
+    """The folder of a capture that is given by its folder or a transforms file. Raises StgaError for another file."""
+    if not path.is_file():
+        return path
+    if path.suffix.lower() == ".json" and path.name.startswith("transforms"):
+        return path.parent
+    raise StgaError(f"{path}: is not a transforms file; choose a capture's transforms_train.json, or its folder")
 
 
 def bring_in(
@@ -75,7 +88,7 @@ def bring_in(
     set_up_scene: bool = False,
     correctives: str = "all",
 ) -> None:
-    """Import what `open_capture` makes of `source` and work on it from here on. Raises StgaError."""
+    """Import what `open_capture` reads from `source`, and make it the scene's head. Raises StgaError."""
 
     def warn(sentence: str) -> None:
         operator.report({"WARNING"}, sentence)
@@ -104,7 +117,7 @@ def _show_first_frame(scene: Any, capture: Capture) -> None:
 
 
 def _select_only(context: Any, head: Any) -> None:
-    """As Blender's importers leave what they bring in."""
+    """Select the head and nothing else, as Blender's importers do."""
     leave_edit_mode()
     for thing in context.view_layer.objects.selected:
         thing.select_set(False)
@@ -114,7 +127,7 @@ def _select_only(context: Any, head: Any) -> None:
 
 
 def _frame_in_viewports(context: Any, head: Any) -> None:
-    """Look at the head, which is small beside Blender's usual scenes; a view through a camera stays."""
+    """Center the viewports on the head, which is small on Blender's scale; a view through a camera stays."""
     if bpy.app.background or context.window is None or not head.visible_get(view_layer=context.view_layer):
         return
     for area in context.window.screen.areas:

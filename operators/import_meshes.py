@@ -1,4 +1,4 @@
-"""Tracked meshes → animated head without a capture."""
+"""Imports a folder of tracked meshes as an animated head without a capture."""
 
 from typing import Any, ClassVar
 
@@ -7,12 +7,12 @@ import bpy
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
-from .common import file_path, reporting
+from .common import FileImport, file_path, reporting
 from .import_capture import bring_in
 
 
-class ImportMeshes(bpy.types.Operator):
-    """Import all meshes of a folder, one a frame and all of the same triangles, as one animated head"""
+class ImportMeshes(bpy.types.Operator, FileImport):
+    """Import a folder of meshes with the same triangles, one for each frame, as an animated head"""
 
     bl_idname = ids.IMPORT_MESHES
     bl_label = "Import Mesh Sequence"
@@ -22,15 +22,11 @@ class ImportMeshes(bpy.types.Operator):
         name="File",
         description="Any mesh of the sequence; the whole folder is imported",
         subtype="FILE_PATH",
-        options=PATH_OPTIONS,
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
     filter_glob: bpy.props.StringProperty(
         default=";".join(f"*{suffix}" for suffix in MESH_SUFFIXES), options={"HIDDEN"}
     )
-
-    def invoke(self, context: Any, event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -1,173 +1,257 @@
-"""Looks after workers: while one lives, a timer reads what it says and brings its splats into the scene."""
+"""Training monitor: a timer that reads the status of workers and shows their splats in the scene.
 
+What is to be done is decided by `jobs.monitor_state`; this module reads files, carries out effects and owns the timer.
+"""
+
+import traceback
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
 from typing import Any
 
 import bpy
+import numpy as np
 from bpy.app.handlers import persistent
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs import monitor_state as states
+from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
 from ..stga_addon.jobs.training_job import PREVIEW, job_folder
+from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.splat_object import (
-    SplatAttributes,
-    avatar_attributes,
-    build_next_node_group,
-    can_update,
-    check_head,
-    update_splats,
-)
-from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, inspect_worker
+from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
+from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
+from ..stga_addon.training.effect_plan import TRACKING
+from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
+from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker
 from . import ids
 from .common import is_head
 from .show import show
 
-INTERVAL_S = 0.5
-SLICE_S = 0.02
-"""Until what was begun goes on: Blender never stands still for long, and not at all while nothing is to be shown."""
+Curve = tuple[np.ndarray, str]
+"""Pixels of a run's curve and the ranges of its axes."""
 
+_states: dict[int, MonitorState] = {}
+"""Session id of a scene -> its training."""
+_curves: dict[Path, Curve | None] = {}
+"""Run folder -> its curve as last read."""
 _snapshots: dict[Path, WorkerSnapshot] = {}
+"""Status folders of workers that belong to no scene: those of the training environment."""
 _processes: dict[Path, "Popen[bytes]"] = {}
-"""The workers that this Blender started; others are known by their folder alone."""
-_jobs: dict[int, str] = {}
-"""A scene's session id -> its job: an undo step takes the scene back to before it was started."""
+"""Status folder -> worker that this Blender started, whose exit code is known."""
 
 
-def started(folder: Path, process: "Popen[bytes]") -> None:
-    """Look after the worker in this task folder."""
-    _processes[folder] = process
-    follow(folder)
+def training_of(scene: Any) -> MonitorState:
+    """The scene's training as the timer last saw it; without a window, where no timer runs, as it is."""
+    state = _states.get(scene.session_uid)
+    if has_timer():
+        if state is None:
+            _start_timer()
+        return state or MonitorState()
+    if state is None:
+        run, result_shown = _stored(scene)
+        state = MonitorState(run, run, result_shown=result_shown)
+    if state.run is None:
+        return state
+    folder = _locate(scene, state.run)
+    return replace(state, folder=folder, snapshot=_inspect(job_folder(folder)))
 
 
-def follow(folder: Path | None = None) -> None:
-    """Start the timer, which ends by itself; `folder` is looked after besides the scenes' jobs."""
-    if folder is not None:
-        _snapshots[folder] = inspect_worker(folder, _processes.get(folder))
-    if not bpy.app.background and not bpy.app.timers.is_registered(tick):
-        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
+def curve(folder: Path) -> Curve | None:
+    """The curve of the run in this folder as the timer last read it; None before two evaluations."""
+    return _curves.get(folder)
+
+
+def start_training(scene: Any, run: Path, process: "Popen[bytes] | None") -> None:
+    """Monitor a run that was started for the scene; process: its worker, None where this process trains."""
+    if process is not None:
+        _processes[job_folder(run)] = process
+    _handle(scene, states.Started(run))
+    check_now(scene)
+
+
+def finish_training(scene: Any) -> None:
+    """Store the result of a training that was waited for, without showing it."""
+    _handle(scene, _read_status(scene, show_result=False))
+
+
+def dismiss_training(scene: Any) -> None:
+    """Forget the scene's training."""
+    state = training_of(scene)
+    if state.folder is not None:
+        _processes.pop(job_folder(state.folder), None)
+        _curves.pop(state.folder, None)
+    _handle(scene, states.Dismissed())
+
+
+def check_now(scene: Any) -> None:
+    """Read the status of the scene's training at once, and again as long as something is expected."""
+    if _states[scene.session_uid].run is not None:
+        _handle(scene, _read_status(scene))
+    _start_timer()
+
+
+def monitor_worker(folder: Path, process: "Popen[bytes] | None" = None) -> None:
+    """Monitor a worker that belongs to no scene until it ends."""
+    if process is not None:
+        _processes[folder] = process
+    _snapshots[folder] = _inspect(folder)
+    _start_timer()
 
 
 def snapshot(folder: Path) -> WorkerSnapshot:
-    """The task as the timer last saw it; without a timer, as it is."""
-    if bpy.app.background or folder not in _snapshots:
-        _snapshots[folder] = inspect_worker(folder, _processes.get(folder))
+    """Status of a worker that belongs to no scene, as the timer last saw it; without a window, as it is."""
+    if folder not in _snapshots or not has_timer():
+        _snapshots[folder] = _inspect(folder)
     return _snapshots[folder]
 
 
-def forget(folder: Path) -> None:
-    """Look after this task no more."""
-    _processes.pop(folder, None)
-    _snapshots.pop(folder, None)
-
-
-def run_of(scene: Any) -> Path | None:
-    """The run folder of the scene's job; where it is gone, the one that moved along with the .blend file.
-
-    None where the scene has no job.
-    """
-    chosen = getattr(scene, ids.SETTINGS)
-    if not chosen.training_run:
-        return None
-    began, beside = Path(chosen.training_run), Path(bpy.path.abspath(chosen.run_folder))
-    return next((run for run in (began, beside) if job_folder(run).is_dir()), began)
-
-
-def snapshot_of(scene: Any) -> WorkerSnapshot:
-    """The scene's job as it is; `WorkerState.NONE` where there is none, or its folder is gone."""
-    run = run_of(scene)
-    return WorkerSnapshot() if run is None else snapshot(job_folder(run))
-
-
-def set_job(scene: Any, run: Path | None) -> None:
-    """Say which run the scene's job trains; None: the job is over and done with."""
-    chosen = getattr(scene, ids.SETTINGS)
-    chosen.training_run, chosen.result_shown = "" if run is None else str(run), False
-    _jobs[scene.session_uid] = chosen.training_run
+def has_timer() -> bool:
+    """Whether Blender has a window, and so runs timers."""
+    return not bpy.app.background
 
 
 def tick() -> float | None:
-    """Read what is new; what a bpy.app.timers function answers."""
-    waits = [_follow_job(scene) for scene in bpy.data.scenes if scene.library is None]
+    """Check every scene and worker; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
+    intervals = [_check_safely(scene) for scene in bpy.data.scenes if scene.library is None]
     for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive]:
-        waits.append(INTERVAL_S if _look(folder).state.is_alive else None)
-    return min((wait for wait in waits if wait is not None), default=None)
+        before, _snapshots[folder] = _snapshots[folder], _inspect(folder)
+        if _snapshots[folder] != before:
+            redraw()
+        intervals.append(CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None)
+    return min((interval for interval in intervals if interval is not None), default=None)
 
 
-def _look(folder: Path) -> WorkerSnapshot:
-    before, now = _snapshots.get(folder), inspect_worker(folder, _processes.get(folder))
-    _snapshots[folder] = now
-    if now != before:
-        _redraw()
-    return now
-
-
-def _follow_job(scene: Any) -> float | None:
-    """Bring the scene up to its job; seconds until there may be more to do, None where nothing is to come."""
-    chosen = getattr(scene, ids.SETTINGS)
-    job = chosen.training_run or _jobs.get(scene.session_uid, "")
-    if not job:
-        return None
-    if chosen.training_run != job:
-        chosen.training_run = job
-    _jobs[scene.session_uid] = job
-    run = run_of(scene)
-    assert run is not None
-    state = _look(job_folder(run)).state
-    if state.is_alive:
-        wait = _show(scene, job_folder(run) / PREVIEW) if chosen.live_preview else None
-        return INTERVAL_S if wait is None else wait
-    if state not in (WorkerState.FINISHED, WorkerState.CANCELLED) or chosen.result_shown:
-        return None
-    chosen.avatar = str(run / "avatar.npz")
-    wait = _show(scene, run / "avatar.npz") if chosen.show_result else None
-    chosen.result_shown = wait is None
-    return wait
-
-
-def _show(scene: Any, path: Path) -> float | None:
-    """Show the avatar file on the scene's head once a thread has read it; a slice at a time.
-
-    Returns seconds until it should be called again; None where the file is shown, or cannot be.
-    """
-    chosen = getattr(scene, ids.SETTINGS)
-    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == chosen.training_run), None)
-    if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
-        return INTERVAL_S  # neither bears a mesh that changes meanwhile
+def _check_safely(scene: Any) -> float | None:
+    """Check one scene; an unexpected error is reported once, and ends the monitoring of this scene only."""
     try:
-        read = _reader.poll(path)
-        if read is None:
-            return INTERVAL_S
-        if is_head(chosen.head) and _present(scene, shown, *read):
-            return SLICE_S
-    except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, say where the head is linked
-        print(f"stga: {error}")
-    _reader.take(path)
-    return None
+        return _check(scene)
+    except Exception as error:
+        traceback.print_exc()
+        sentence = f"Monitoring stopped after an unexpected error ({type(error).__name__}: {error}); see the console"
+        _handle(scene, states.MonitorFailed(sentence))
+        return None
 
 
-def _present(scene: Any, shown: Any, avatar: Avatar, prepared: SplatAttributes) -> bool:
-    """Show the avatar in the object that already shows this job's splats, or in a new one; whether there is more to do.
+def _check(scene: Any) -> float | None:
+    run, result_shown = _stored(scene)
+    is_new = scene.session_uid not in _states
+    _handle(scene, states.FileLoaded(run, result_shown) if is_new else states.SceneRead(run, result_shown))
+    state = _states[scene.session_uid]
+    if state.run is None or state.stopped:
+        return None
+    if not state.building:
+        state = _handle(scene, _read_status(scene))
+    if state.loading is not None:
+        state = _show_loaded(scene)
+    return state.interval_s
 
-    A new one comes in slices, each call does one.
-    """
+
+def _stored(scene: Any) -> tuple[Path | None, bool]:
+    """What the scene stores of its training: the run, and whether its result was shown."""
     chosen = getattr(scene, ids.SETTINGS)
+    return Path(chosen.training_run) if chosen.training_run else None, chosen.result_shown
+
+
+def _locate(scene: Any, run: Path) -> Path:
+    """The run's folder; where it is gone, the scene's run folder, which may have moved along with the .blend file."""
+    beside = Path(bpy.path.abspath(getattr(scene, ids.SETTINGS).run_folder))
+    return next((folder for folder in (run, beside) if job_folder(folder).is_dir()), run)
+
+
+def _inspect(folder: Path) -> WorkerSnapshot:
+    return inspect_worker(folder, _processes.get(folder))
+
+
+def _read_status(scene: Any, show_result: bool | None = None) -> states.StatusRead:
+    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    assert run is not None
+    folder = _locate(scene, run)
+    files = RunFiles(_stamp(job_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
+    shown = chosen.show_result if show_result is None else show_result
+    return states.StatusRead(folder, _inspect(job_folder(folder)), files, chosen.live_preview, shown)
+
+
+def _stamp(path: Path) -> states.Stamp | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+def _handle(scene: Any, event: states.Event) -> MonitorState:
+    """Feed the event to the scene's state and carry out the effects."""
+    state, effects = transition(_states.get(scene.session_uid, MonitorState()), event)
+    _states[scene.session_uid] = state
+    _carry_out(scene, effects)
+    return state
+
+
+def _carry_out(scene: Any, effects: Iterable[states.Effect]) -> None:
+    chosen = getattr(scene, ids.SETTINGS)
+    for effect in effects:
+        match effect:
+            case states.StoreTraining(run, result_shown):
+                chosen.training_run, chosen.result_shown = "" if run is None else str(run), result_shown
+            case states.StoreAvatar(path):
+                chosen.avatar = str(path)
+            case states.LoadAvatar(path):
+                _loader.load(scene, path)
+            case states.ReadCurve(folder):
+                _curves[folder] = _read_curve(folder)
+            case states.PushUndo():
+                if has_timer():  # later: saving the scene's state takes as long as a slice
+                    bpy.app.timers.register(_push_undo, first_interval=SLICE_INTERVAL_S)
+            case states.Redraw():
+                redraw()
+
+
+def _read_curve(folder: Path) -> Curve | None:
+    try:
+        return curve_image(read_metrics(folder))
+    except (StgaError, KeyError, TypeError, ValueError):
+        return None  # training reports a damaged file
+
+
+def _show_loaded(scene: Any) -> MonitorState:
+    """Show the avatar that was loaded for the scene, in the object that shows this run or in a new one."""
+    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == str(run)), None)
+    if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
+        return _states[scene.session_uid]  # Blender crashes where a mesh changes during these
+    try:
+        loaded = _loader.result(scene)
+        if loaded is None:
+            return _states[scene.session_uid]
+        if not is_head(chosen.head):
+            raise StgaError("No head in the scene to show the avatar on; import the capture")
+        event = _present(scene, shown, *loaded)
+    except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
+        event = states.AvatarFailed(str(error))
+    if not isinstance(event, states.SliceBuilt):
+        _loader.discard(scene)
+    return _handle(scene, event)
+
+
+def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes) -> states.Event:
+    """Show the avatar, or build the next slice of what its object needs."""
+    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     check_head(avatar, chosen.head)
     if shown is not None and can_update(shown, avatar):
-        update_splats(shown, prepared)
-        return False
+        update_splats(shown, attributes)
+        return states.AvatarShown(created=False)
     if build_next_node_group(avatar):
-        return True
+        return states.SliceBuilt()
     if shown is not None:
         bpy.data.objects.remove(shown)
-    name = f"{chosen.head.name} {Path(chosen.training_run).name}"
-    shown = show(scene, avatar, chosen.head, name, prepared=prepared)
-    shown[tags.RUN] = chosen.training_run
-    if not bpy.app.background:
-        bpy.app.timers.register(_push_undo, first_interval=SLICE_S)  # saving the scene's state takes a slice as well
-    return False
+    assert run is not None
+    shown = show(scene, avatar, chosen.head, f"{chosen.head.name} {run.name}", attributes=attributes)
+    shown[tags.RUN] = str(run)
+    return states.AvatarShown(created=True)
 
 
 def _push_undo() -> None:
@@ -175,54 +259,45 @@ def _push_undo() -> None:
         bpy.ops.ed.undo_push(message="Show Training")
 
 
-class _Reader:
-    """Reads avatar files in a thread, each once for every time that it changes."""
+class _Loader:
+    """Reads avatar files in a thread, one for each scene."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._coming: dict[Path, Future[tuple[Avatar, SplatAttributes]]] = {}
-        self._stamps: dict[Path, tuple[int, int]] = {}
+        self._loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
 
-    def poll(self, path: Path) -> tuple[Avatar, SplatAttributes] | None:
-        """What has been read and not been taken; None where there is nothing new, or not yet.
+    def load(self, scene: Any, path: Path) -> None:
+        self._pool = self._pool or ThreadPoolExecutor(1, "stga")
+        self._loading[scene.session_uid] = self._pool.submit(_load, path)
 
-        Raises StgaError where the file cannot be read.
-        """
-        coming = self._coming.get(path)
-        if coming is not None:
-            return coming.result() if coming.done() else None
-        try:
-            found = path.stat()
-        except OSError as error:
-            if path.name == PREVIEW:
-                return None
-            raise StgaError(f"{path}: cannot be read ({error.strerror})") from error
-        stamp = found.st_mtime_ns, found.st_size
-        if self._stamps.get(path) != stamp:
-            self._stamps[path] = stamp
-            self._pool = self._pool or ThreadPoolExecutor(1, "stga")
-            self._coming[path] = self._pool.submit(_read, path)
-        return None
+    def result(self, scene: Any) -> tuple[Avatar, SplatAttributes] | None:
+        """The file's content; None while it is being read. Raises StgaError where it cannot be read."""
+        future = self._loading[scene.session_uid]
+        return future.result() if future.done() else None
 
-    def take(self, path: Path) -> None:
-        """What was read is shown, or never will be: read again once the file has changed."""
-        self._coming.pop(path, None)
+    def discard(self, scene: Any) -> None:
+        self._loading.pop(scene.session_uid, None)
 
     def close(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown()
-        self.__init__()  # type: ignore[misc]
+            self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool, self._loading = None, {}
 
 
-_reader = _Reader()
+_loader = _Loader()
 
 
-def _read(path: Path) -> tuple[Avatar, SplatAttributes]:
+def _load(path: Path) -> tuple[Avatar, SplatAttributes]:
     avatar = read_avatar(path)
     return avatar, avatar_attributes(avatar)
 
 
-def _redraw() -> None:
+def _start_timer() -> None:
+    if has_timer() and not bpy.app.timers.is_registered(tick):
+        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
+
+
+def redraw() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES"):
@@ -233,10 +308,12 @@ def _redraw() -> None:
 
 @persistent
 def _after_load(_: Any) -> None:
+    _loader.close()
+    _states.clear()  # of scenes of the file before
     for scene in bpy.data.scenes:
         if scene.library is None:
             _adopt(scene)
-    follow()
+    _start_timer()
 
 
 def _adopt(scene: Any) -> None:
@@ -252,7 +329,7 @@ def _adopt(scene: Any) -> None:
 
 def register() -> None:
     bpy.app.handlers.load_post.append(_after_load)
-    follow()
+    _start_timer()
 
 
 def unregister() -> None:
@@ -260,6 +337,6 @@ def unregister() -> None:
     for timer in (tick, _push_undo):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    _reader.close()
-    for known in (_snapshots, _processes, _jobs):
+    _loader.close()
+    for known in (_states, _curves, _snapshots, _processes):
         known.clear()

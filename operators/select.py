@@ -1,4 +1,4 @@
-"""Tracked head → one vertex group a frame, and what it amounts to."""
+"""Selects the moving triangles of each frame as vertex groups, and counts and colors them."""
 
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -18,7 +18,7 @@ from .common import capture_of, head_of, needs_head, needs_own_head, reporting, 
 
 
 class Select(bpy.types.Operator):
-    """Select, for every frame, the triangles that really moved; write them as one vertex group a frame"""
+    """Select the triangles that move from the neutral face in each frame, as one vertex group for each frame"""
 
     bl_idname = ids.SELECT
     bl_label = "Select Moving Triangles"
@@ -26,7 +26,7 @@ class Select(bpy.types.Operator):
 
     threshold: bpy.props.FloatProperty(
         name="Threshold",
-        description="How far a triangle moves from the neutral face before it is trained in a frame of its own",
+        description="Distance from the neutral face above which a triangle is selected in a frame",
         default=SelectionOptions.threshold,
         min=0.0,
         soft_max=0.05,
@@ -36,16 +36,17 @@ class Select(bpy.types.Operator):
     )
     zero_pose: bpy.props.EnumProperty(
         name="Ignore",
-        description="Which pose is no expression",
+        description="Motion that does not count as expression",
         items=(
-            ("head", "Head Motion", "Head rotation, translation and neck; jaw and eyes are expression"),
+            ("head", "Head Motion", "Head rotation, translation and neck; jaw and eyes count as expression"),
             ("all", "Whole Pose", "Head motion, jaw and eyes"),
         ),
     )
     regions: bpy.props.StringProperty(
         name="Key Regions",
         description="Regions or vertex groups that are selected as a whole, separated by commas; "
-        "empty: those ticked in the panel",
+        "empty: those chosen in the panel",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
@@ -72,7 +73,7 @@ class Select(bpy.types.Operator):
 
 
 class ToggleRegion(bpy.types.Operator):
-    """Select this region as a whole, or triangle by triangle, the next time triangles are selected"""
+    """Select this region as a whole, or triangle by triangle, when triangles are selected next"""
 
     bl_idname = ids.TOGGLE_REGION
     bl_label = "Key Region"
@@ -96,10 +97,10 @@ class ToggleRegion(bpy.types.Operator):
 
 
 class CountSelected(bpy.types.Operator):
-    """Count again how many triangles and splats each frame trains, after vertex groups were painted"""
+    """Update the number of triangles and splats that each frame trains, after painting vertex groups"""
 
     bl_idname = ids.COUNT_SELECTED
-    bl_label = "Count Selected"
+    bl_label = "Update Counts"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -113,13 +114,15 @@ class CountSelected(bpy.types.Operator):
 
 
 class HeatMap(bpy.types.Operator):
-    """Colour the head by how often each triangle is selected, in the viewport and when rendered; or stop doing so"""
+    """Color the head by how often each triangle is selected, in the viewport and in renders"""
 
     bl_idname = ids.HEAT_MAP
     bl_label = "Heat Map"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    show: bpy.props.BoolProperty(name="Show", description="Off: show the head as it was", default=True)
+    show: bpy.props.BoolProperty(
+        name="Show", description="Off: restore the head's own colors", default=True, options={"SKIP_SAVE"}
+    )
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -138,15 +141,15 @@ class HeatMap(bpy.types.Operator):
             hide_heat_map(head)
         in_view = context.view_layer.objects
         if splats is not None and in_view.get(splats.name) is splats and in_view.get(head.name) is head:
-            # One of the two at a time: each covers the other.
+            # Only one of the two: each covers the other.
             splats.hide_set(self.show)
             head.hide_set(not self.show)
-        _colour_viewports(context, "VERTEX" if self.show else "MATERIAL")
+        _color_viewports(context, "VERTEX" if self.show else "MATERIAL")
         return {"FINISHED"}
 
 
 def possible_regions(head: Any) -> list[str]:
-    """What can be selected as a whole: regions of the capture, and vertex groups that are neither selection nor rig."""
+    """What can be selected as a whole: regions of the capture, and vertex groups of neither selection nor rig."""
     names = [name for name in head.data.attributes.keys() if name.startswith(tags.REGION_PREFIX)]  # noqa: SIM118
     rigs = [modifier.object for modifier in head.modifiers if modifier.type == "ARMATURE" and modifier.object]
     bones = {bone.name for rig in rigs for bone in rig.data.bones}
@@ -156,14 +159,14 @@ def possible_regions(head: Any) -> list[str]:
 
 
 def key_regions(head: Any) -> list[str]:
-    """What is ticked; at first the capture's eyes, mouth and nose."""
+    """Regions chosen to be selected as a whole; at first eyes, mouth and nose."""
     possible = possible_regions(head)
     ticked = head[tags.KEY_REGIONS].split("\n") if tags.KEY_REGIONS in head else KEY_REGIONS
     return [name for name in ticked if name in possible]
 
 
 def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
-    """The capture with those of the regions that are vertex groups; what was painted wins over a region of its name."""
+    """The capture with the named vertex groups as regions; a painted group replaces a region of the same name."""
     painted = read_regions(head, [name for name in names if name in head.vertex_groups])
     for name in names:
         if name not in painted and name not in capture.regions:
@@ -174,7 +177,7 @@ def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
 
 
 def _count(context: Any, head: Any) -> None:
-    """Fill the panel's table."""
+    """Fill the panel's table of selected triangles."""
     chosen, splats = scene_settings(context), scene_settings(context).splats
     per_face = splats_per_face(splats, head)
     every = (TrainingSettings.lattice + 1) * (TrainingSettings.lattice + 2) // 2  # at the start of a training
@@ -190,8 +193,8 @@ def _shares(head: Any) -> np.ndarray:
     return np.mean(list(read_selection(head).values()), axis=0)
 
 
-def _colour_viewports(context: Any, kind: str) -> None:
-    """What solid mode colours by, in every viewport of the screen; in background there is none."""
+def _color_viewports(context: Any, kind: str) -> None:
+    """Set the color type of solid mode in every viewport of the screen; without a window there is none."""
     for area in context.screen.areas if context.screen else ():
         if area.type == "VIEW_3D":
             area.spaces.active.shading.color_type = kind

@@ -1,30 +1,28 @@
-"""Avatar file → splats that follow the head."""
+"""Shows an avatar file as splats that follow the head."""
 
 from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display.hints import TRANSPARENT_BOUNCES, view_transform_hint
-from ..stga_addon.scene.display.splat_object import SplatAttributes, hide_object, show_avatar
+from ..stga_addon.scene.display.splat_attributes import SplatAttributes
+from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
-from .common import file_path, head_of, needs_head, reporting, scene_settings
+from .common import FileImport, file_path, head_of, needs_head, reporting, scene_settings
 
 
-class ShowAvatar(bpy.types.Operator):
+class ShowAvatar(bpy.types.Operator, FileImport):
     """Show a trained avatar: splats that follow the animated head"""
 
     bl_idname = ids.SHOW_AVATAR
     bl_label = "Show Avatar"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(
-        name="Avatar", description="Avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
-    )
+    filename_ext = ".npz"
     hide_head: bpy.props.BoolProperty(
         name="Hide Head",
-        description="Hide the head's own mesh, which covers the splats; it still moves them",
+        description="Hide the head's mesh, which covers the splats; it still deforms them",
         default=True,
     )
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
@@ -32,12 +30,6 @@ class ShowAvatar(bpy.types.Operator):
     @classmethod
     def poll(cls, context: Any) -> bool:
         return needs_head(cls, context)
-
-    def invoke(self, context: Any, event: Any) -> set[str]:
-        if self.filepath:
-            return self.execute(context)
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -53,13 +45,13 @@ class ShowAvatar(bpy.types.Operator):
 
 
 def show(
-    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, prepared: SplatAttributes | None = None
+    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, attributes: SplatAttributes | None = None
 ) -> Any:
-    """Show the avatar on the head; the splat object becomes the one that the scene's panel works on.
+    """Show the avatar on the head, and make the splat object the one that the panel works on.
 
-    prepared: as `show_avatar` takes it.
+    attributes: those of the avatar, where they are computed already.
     """
-    shown = show_avatar(avatar, head, name, prepared)
+    shown = show_avatar(avatar, head, name, attributes)
     if hide_head:
         hide_object(head, scene)
     getattr(scene, ids.SETTINGS).splats = shown
@@ -67,7 +59,7 @@ def show(
 
 
 class StandardView(bpy.types.Operator):
-    """Show colours as they were trained: set the scene's view transform to Standard"""
+    """Show colors as trained: set the scene's view transform to Standard"""
 
     bl_idname = ids.STANDARD_VIEW
     bl_label = "Use Standard View Transform"
@@ -80,7 +72,7 @@ class StandardView(bpy.types.Operator):
 
 
 class MoreBounces(bpy.types.Operator):
-    """Let Cycles look through enough overlapping splats: raise the scene's transparent bounces to 64"""
+    """Raise the scene's transparent bounces to 64, so that Cycles sees through overlapping splats"""
 
     bl_idname = ids.MORE_BOUNCES
     bl_label = "Use 64 Transparent Bounces"

@@ -1,4 +1,4 @@
-"""Capture and selection → trained avatar, by a worker process beside Blender."""
+"""Trains the avatar in a worker process beside Blender, and cancels or dismisses that training."""
 
 import subprocess
 import sys
@@ -25,36 +25,49 @@ from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import failure_report, inspect_worker, request_cancel
 from . import ids, monitor
-from .common import file_path, head_of, needs_head, reporting, scene_settings
+from .common import file_path, head_of, needs_head, reporting
 from .environment import training_python
 
 
 def strategy_property() -> Any:
-    """The choice of strategy: the operator's, and the panel's that is handed to it."""
+    """Training strategy: of the operator, and of the panel that calls it."""
     return bpy.props.EnumProperty(
         name="Strategy",
-        description="Which splats an iteration trains",
+        description="Which splats each iteration trains",
         items=(
-            ("global", "Global", "Every iteration trains all splats: best on the captures measured so far"),
-            ("selective", "Selective", "Local iterations on what each frame selects, global ones in between"),
-            ("gaussian-avatars", "GaussianAvatars", "That method's binding, losses and rates"),
+            ("global", "Global", "Every iteration trains all splats; most accurate on the captures measured so far"),
+            ("selective", "Selective", "Local iterations train the triangles selected in each frame; global ones, all"),
+            ("gaussian-avatars", "GaussianAvatars", "The binding, losses and learning rates of GaussianAvatars"),
         ),
     )
 
 
 def preset_property(**more: Any) -> Any:
-    """The choice of a preset: the operator's, and the panel's that is handed to it."""
+    """Training preset: of the operator, and of the panel that calls it."""
     purposes = [(name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()]
     return bpy.props.EnumProperty(
         name="Preset",
-        description="How good, and so how long",
-        items=(("none", "Default", "The default settings, for as long as Minutes says"), *purposes),
+        description="Accuracy, and with it training time",
+        items=(("none", "Default", "Default settings, trained for the time in Minutes"), *purposes),
         **more,
     )
 
 
+def device_property() -> Any:
+    """Training device: of the operator, and of the panel that calls it."""
+    return bpy.props.EnumProperty(
+        name="Device",
+        description="What trains; a resumed run keeps its own",
+        items=(
+            ("auto", "Auto", "An NVIDIA GPU where one works, else the CPU"),
+            ("cpu", "CPU", "The processor"),
+            ("cuda", "GPU", "An NVIDIA GPU; training fails where none works"),
+        ),
+    )
+
+
 class Train(bpy.types.Operator):
-    """Train the avatar on the capture's images: in a process beside Blender, which goes on when Blender is closed"""
+    """Train the avatar on the capture's images, in a process that continues when Blender is closed"""
 
     bl_idname = ids.TRAIN
     bl_label = "Train Avatar"
@@ -62,42 +75,50 @@ class Train(bpy.types.Operator):
 
     directory: bpy.props.StringProperty(
         name="Run Folder",
-        description="Where the avatar and its checkpoints are written",
+        description="Folder for the avatar and its checkpoints",
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
     )
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
+    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
     iterations: bpy.props.IntProperty(
-        name="Iterations", description="Train this many iterations, whatever time they take; 0: by time", min=0
+        name="Iterations",
+        description="Number of iterations, instead of a time; 0: train for Minutes",
+        min=0,
+        options={"SKIP_SAVE"},
     )
     strategy: strategy_property()
     preset: preset_property()
-    seed: bpy.props.IntProperty(name="Seed", description="Fixes every random choice", min=0)
+    device: device_property()
+    seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
-        description="NAME=on or NAME=off, separated by spaces, for what the capture is not to decide itself",
+        description="NAME=on or NAME=off, separated by spaces, for effects that the capture should not decide",
+        options={"SKIP_SAVE"},
     )
     resume: bpy.props.BoolProperty(
         name="Resume",
-        description="Continue the run in the folder, with the settings and the budget it was started with",
+        description="Continue the run in the folder, with the settings, budget and device it was started with",
+        options={"SKIP_SAVE"},
     )
     python: bpy.props.StringProperty(
         name="Python",
-        description="The interpreter that trains; empty: the training environment",
+        description="Python interpreter that trains; empty: the training environment of the preferences",
         subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     wait: bpy.props.BoolProperty(
         name="Wait",
-        description="Return when training has ended, as it always does without a window; "
-        "Blender's own Python trains then, where it has all that it takes",
+        description="Return when training has ended, as always without a window; "
+        "Blender's own Python trains then, if it has the packages",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
     def poll(cls, context: Any) -> bool:
         if not needs_head(cls, context):
             return False
-        if monitor.snapshot_of(context.scene).state.is_alive:
-            cls.poll_message_set("Training is under way; cancel it first")
+        if monitor.training_of(context.scene).snapshot.state.is_alive:
+            cls.poll_message_set("Training is running; cancel it first")
             return False
         return True
 
@@ -110,17 +131,15 @@ class Train(bpy.types.Operator):
         python = "" if here else training_python(context, self.python)
         write_job(run, self._job(head), training_selection(head))
         if here:
-            monitor.set_job(context.scene, run)
-            avatar = _work_here(context, run)
+            monitor.start_training(context.scene, run, None)
+            avatar = _train_here(context, run)
         else:
             process = start_worker(job_folder(run), python, worker_arguments(run))
-            monitor.set_job(context.scene, run)
-            monitor.started(job_folder(run), process)
+            monitor.start_training(context.scene, run, process)
             if not waits:
                 return {"FINISHED"}
             avatar = _wait(run, process)
-        scene_settings(context).avatar = str(avatar)
-        scene_settings(context).result_shown = True
+        monitor.finish_training(context.scene)
         self.report({"INFO"}, f"Trained {avatar}")
         return {"FINISHED"}
 
@@ -133,12 +152,12 @@ class Train(bpy.types.Operator):
             chosen = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
         capture, model = Path(head[tags.CAPTURE]), head.get(tags.FLAME_MODEL)
         if not capture.is_dir():
-            raise StgaError(f"{capture}: is not a folder; expected that of the capture, which the head came from")
+            raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
         return TrainingJob(capture, Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap"), chosen)
 
 
 class CancelTraining(bpy.types.Operator):
-    """Stop training soon, and keep the avatar as it is by then; Resume goes on from there"""
+    """Stop training and keep the avatar trained so far; Resume continues from there"""
 
     bl_idname = ids.CANCEL_TRAINING
     bl_label = "Cancel Training"
@@ -146,21 +165,20 @@ class CancelTraining(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if monitor.snapshot_of(context.scene).state.is_alive:
+        if monitor.training_of(context.scene).snapshot.state.is_alive:
             return True
-        cls.poll_message_set("Nothing is being trained")
+        cls.poll_message_set("No training is running")
         return False
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = job_folder(monitor.run_of(context.scene))
-        request_cancel(folder)
-        monitor.follow(folder)
+        request_cancel(job_folder(_folder(context.scene)))
+        monitor.check_now(context.scene)
         return {"FINISHED"}
 
 
 class DismissTraining(bpy.types.Operator):
-    """Forget how training ended: its log and messages; the run, its avatar and checkpoints stay"""
+    """Remove the status and log of the last training; the run, its avatar and checkpoints stay"""
 
     bl_idname = ids.DISMISS_TRAINING
     bl_label = "Dismiss"
@@ -168,24 +186,30 @@ class DismissTraining(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if monitor.run_of(context.scene) is None:
-            cls.poll_message_set("There is nothing to dismiss")
+        if monitor.training_of(context.scene).run is None:
+            cls.poll_message_set("Nothing was trained in this scene yet")
             return False
-        if monitor.snapshot_of(context.scene).state.is_alive:
-            cls.poll_message_set("Training is under way; cancel it first")
+        if monitor.training_of(context.scene).snapshot.state.is_alive:
+            cls.poll_message_set("Training is running; cancel it first")
             return False
         return True
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = job_folder(monitor.run_of(context.scene))
-        remove_job(monitor.run_of(context.scene))
-        monitor.forget(folder)
-        monitor.set_job(context.scene, None)
+        remove_job(_folder(context.scene))
+        monitor.dismiss_training(context.scene)
         return {"FINISHED"}
 
 
-def _work_here(context: Any, run: Path) -> Path:
+def _folder(scene: Any) -> Path:
+    """The run folder of the scene's training."""
+    folder = monitor.training_of(scene).folder
+    if folder is None:
+        raise StgaError("Nothing was trained in this scene yet")
+    return folder
+
+
+def _train_here(context: Any, run: Path) -> Path:
     manager = context.window_manager
 
     def show(progress: Any) -> bool:
@@ -200,7 +224,7 @@ def _work_here(context: Any, run: Path) -> Path:
 
 
 def _wait(run: Path, process: "subprocess.Popen[bytes]") -> Path:
-    """Wait for the worker. Raises StgaError with its sentence where it failed; the traceback goes to the terminal."""
+    """Wait for the worker. Raises StgaError with its error where it failed; the traceback goes to the console."""
     process.wait()
     last = inspect_worker(job_folder(run), process)
     if last.state.failed:

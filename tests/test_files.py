@@ -1,13 +1,17 @@
-"""Reading without trust and writing without halves."""
+"""Atomic file writes and bounded reads."""
 
 import json
 import os
+import stat
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stga_addon import files
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, read_npz, replacing, write_json, write_npz
 
@@ -139,3 +143,85 @@ def test_an_npz_of_something_else(tmp_path: Path) -> None:
             archive.writestr(name, b"not an array")
         with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz file"):
             read_npz(path)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from stga_addon.files import replacing
+with replacing(Path(sys.argv[1])) as partial:
+    partial.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+WRITE = (
+    "import sys; from pathlib import Path; from stga_addon.files import write_json; write_json(Path(sys.argv[1]), 1)"
+)
+
+
+def run(code: str, path: Path) -> int:
+    return subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
+    """Catches temporary files that stay after kill -9, and others, or those of living processes, that are removed."""
+    other_host = ".a.json.00000000-4194304-00000000.partial"
+    kept = {".notes.partial", ".a.json.123.partial", other_host, "a.json.partial"}
+    for name in kept:
+        (tmp_path / name).touch()
+    assert run(KILLED, tmp_path / "a.json") == -9
+    (leftover,) = {path.name for path in tmp_path.iterdir()} - kept
+    assert files.PARTIAL_NAME.fullmatch(leftover)
+    with replacing(tmp_path / "b.json") as partial:
+        partial.write_text("mine")
+        assert run(WRITE, tmp_path / "a.json") == 0
+        assert {path.name for path in tmp_path.iterdir()} == {*kept, "a.json", partial.name}
+    assert {path.name for path in tmp_path.iterdir()} == {*kept, "a.json", "b.json"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
+def test_temporary_name_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a predictable temporary name, and a link under that name that is followed and overwritten."""
+    names = set()
+    for _ in range(2):
+        with replacing(tmp_path / "a.json") as partial:
+            names.add(partial.name)
+    assert len(names) == 2
+    monkeypatch.setattr(files.secrets, "token_hex", lambda size: "00000000")
+    with replacing(tmp_path / "a.json") as partial:
+        pass
+    (tmp_path / "target").write_text("mine")
+    partial.symlink_to(tmp_path / "target")
+    with pytest.raises(StgaError, match=r"a\.json: cannot be written"):
+        write_json(tmp_path / "a.json", {})
+    assert (tmp_path / "target").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["x" * 250, "y" * 5000, "null\0", "\ud800"])
+def test_impossible_names_are_sentences(tmp_path: Path, name: str) -> None:
+    """Catches a traceback for a name that is too long, or that no file can have."""
+    with pytest.raises(StgaError, match="cannot be written"):
+        write_json(tmp_path / name, {})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="modes of POSIX systems")
+def test_mode_follows_the_umask(tmp_path: Path) -> None:
+    """Catches results that a group cannot read although its umask allows that."""
+    before = os.umask(0o027)
+    try:
+        write_json(tmp_path / "a.json", {})
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o640
+
+
+@pytest.mark.parametrize("name", [".", "/", "folder", "pipe"])
+def test_only_regular_files_are_replaced(tmp_path, name):
+    """Catches a device, such as /dev/null, that is replaced by a file, and a traceback for a path without a name."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    path = Path(name) if name in "./" else tmp_path / name
+    with pytest.raises(StgaError, match="is not a regular file"), files.replacing(path):
+        pytest.fail("the block must not run")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["folder", "pipe"]

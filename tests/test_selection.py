@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
 from stga_addon.selection import SelectionOptions, select_capture, select_faces
 
 THRESHOLD = 0.01
@@ -121,3 +122,16 @@ def test_selection_that_came_with_the_capture_wins():
         6: [],
     }
     assert asked == [(1, "head")]
+
+
+@pytest.mark.parametrize("threshold", [float("nan"), -1.0, float("inf"), "5", None])
+def test_threshold_is_a_distance(threshold: object) -> None:
+    """Catches a threshold that selects nothing, or everything, without saying so."""
+    with pytest.raises(StgaError, match="selection threshold must be a distance"):
+        SelectionOptions(threshold=threshold)  # type: ignore[arg-type]
+
+
+def test_zero_pose_is_known() -> None:
+    """Catches a misspelled option that is found only where the first FLAME mesh is posed, or never."""
+    with pytest.raises(StgaError, match="zero_pose is 'face'"):
+        SelectionOptions(zero_pose="face")

@@ -1,1 +1,1 @@
-"""What a person sees."""
+"""Panels, preferences and the properties of a scene."""

@@ -1,4 +1,4 @@
-"""A run's curve as a picture in the panel: read from the run's folder whenever an evaluation was added to it."""
+"""Picture of a run's accuracy curve in the panel."""
 
 from pathlib import Path
 from typing import Any
@@ -6,60 +6,43 @@ from typing import Any
 import bpy.utils.previews
 import numpy as np
 
-from ..stga_addon.errors import StgaError
-from ..stga_addon.report.curve_image import SIZE, curve_image
-from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
+from ..operators import monitor
+from ..stga_addon.report.curve_image import SIZE
 
 SCALE = 8.0
 """Side of the picture in the panel, in heights of a button."""
 
-_pictures: Any = None
-"""Previews, which are in no .blend file."""
-_drawn: dict[Path, tuple[tuple[int, int], str | None]] = {}
-"""Run folder -> size and time of its evaluations as they were last drawn, and what the axes say; None: too few."""
+_previews: Any = None
+"""Blender's preview collection: pictures that are not saved in the .blend file."""
+_shown: dict[Path, monitor.Curve] = {}
+"""Run folder -> the curve that its preview shows."""
 
 
-def draw_curve(layout: Any, run: Path) -> None:
-    """Draw nothing where the run has not been evaluated twice."""
-    axes = _update(run)
-    if axes is None:
+def draw_curve(layout: Any, folder: Path) -> None:
+    """Draw the curve of the run in this folder; nothing before its second evaluation."""
+    curve = monitor.curve(folder)
+    if curve is None:
         return
+    if _shown.get(folder) is not curve:
+        _shown[folder] = curve
+        _fill_preview(str(folder), curve[0])
     column = layout.column(align=True)
-    column.template_icon(_pictures[str(run)].icon_id, scale=SCALE)
-    column.label(text=axes)
+    column.template_icon(_previews[str(folder)].icon_id, scale=SCALE)
+    column.label(text=curve[1])
 
 
-def _update(run: Path) -> str | None:
-    try:
-        found = (run / METRICS).stat()
-    except OSError:
-        return None
-    stamp = found.st_mtime_ns, found.st_size
-    if run not in _drawn or _drawn[run][0] != stamp:
-        _drawn[run] = stamp, _paint(run)
-    return _drawn[run][1]
-
-
-def _paint(run: Path) -> str | None:
-    try:
-        drawn = curve_image(read_metrics(run))
-    except (StgaError, KeyError, TypeError, ValueError):
-        return None  # a damaged file is training's to report
-    if drawn is None:
-        return None
-    pixels, axes = drawn
-    _pictures.pop(str(run), None)  # a new one: Blender keeps what it once uploaded
-    picture = _pictures.new(str(run))
-    picture.image_size = SIZE, SIZE
-    picture.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
-    return axes
+def _fill_preview(name: str, pixels: np.ndarray) -> None:
+    _previews.pop(name, None)  # a new one, because Blender keeps the texture of the old one
+    preview = _previews.new(name)
+    preview.image_size = SIZE, SIZE
+    preview.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
 
 
 def register() -> None:
-    global _pictures
-    _pictures = bpy.utils.previews.new()
+    global _previews
+    _previews = bpy.utils.previews.new()
 
 
 def unregister() -> None:
-    bpy.utils.previews.remove(_pictures)
-    _drawn.clear()
+    bpy.utils.previews.remove(_previews)
+    _shown.clear()

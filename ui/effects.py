@@ -1,11 +1,11 @@
-"""The plan below the Train step: each effect, what was decided, and why."""
+"""The effects below the Train step: what the analysis of the capture decided, and why."""
 
 from typing import Any, ClassVar
 
 import bpy
 
 from ..operators import ids
-from ..operators.analyze import is_looking
+from ..operators.analyze import is_analyzing
 from ..operators.common import scene_settings
 from .sidebar import SidebarPanel
 from .text import draw_text
@@ -19,8 +19,12 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, chosen = self.layout, scene_settings(context)
-        looking = is_looking(context.scene)
-        layout.operator(ids.ANALYZE_CAPTURE, text="Looking…" if looking else "Look at Capture", icon="VIEWZOOM")
+        if is_analyzing(context.scene):
+            row = layout.row(align=True)
+            row.label(text="Analyzing Capture…", icon="VIEWZOOM")
+            row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
+        else:
+            layout.operator(ids.ANALYZE_CAPTURE, icon="VIEWZOOM")
         if chosen.analysis_error:
             draw_text(layout, context, chosen.analysis_error, "ERROR")
         for row in chosen.effects:
@@ -33,5 +37,5 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
         split.prop(row, "choice", text="")
         reasons = box.column(align=True)
         reasons.active = False
-        for text in (row.reason, f"costs {row.cost}" if row.on else ""):
+        for text in (row.reason, f"Cost: {row.cost}" if row.on else ""):
             draw_text(reasons, context, text, "BLANK1")

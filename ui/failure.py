@@ -1,4 +1,4 @@
-"""A worker's mishap: one sentence, the end of its log, and a way to copy all of it."""
+"""A worker's failure: its error message, the end of its log, and a button that copies the report."""
 
 import textwrap
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from .text import columns, draw_text
 
 
 def draw_failure(layout: Any, context: Any, sentence: str, tail: Sequence[str], folder: Path | None) -> None:
-    """Draw the sentence, wrapped, and below it the log's last lines; `folder` is the worker's, None without one."""
+    """Draw the error message and the log's last lines. folder: the worker's status folder; None: nothing to report."""
     draw_text(layout, context, sentence)
     width = columns(context)
     log = layout.column(align=True)

@@ -1,4 +1,4 @@
-"""The Motion step: another person's motion on this head, and the sliders to move it by hand."""
+"""The Motion step: applying the motion of others, and sliders for expression and identity."""
 
 from typing import Any, ClassVar
 
@@ -6,10 +6,10 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, scene_settings
-from ..stga_addon.scene.rig.flame_rig import EXPRESSION_KEY, IDENTITY_KEY
+from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY
 from .sidebar import SidebarPanel
 
-FIRST_SLIDERS = 10  # the components are sorted by how much they change
+MAX_SLIDERS = 10  # the first components vary most
 
 
 class MotionPanel(SidebarPanel, bpy.types.Panel):
@@ -18,13 +18,11 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, chosen = self.layout, scene_settings(context)
-        layout.operator(ids.APPLY_MOTION, text="Apply Motion from File", icon="IMPORT").source = ""
+        layout.operator(ids.APPLY_MOTION, text="Apply Motion from File", icon="IMPORT")
         row = layout.row(align=True)
         row.prop(chosen, "motion_source")
-        button = row.row(align=True)
-        button.enabled = chosen.motion_source is not None
-        apply = button.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK")
-        apply.source = chosen.motion_source.name if chosen.motion_source else ""
+        if chosen.motion_source is not None:
+            row.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK").source = chosen.motion_source.name
 
 
 class _Sliders(SidebarPanel):
@@ -38,7 +36,7 @@ class _Sliders(SidebarPanel):
 
     def draw(self, context: Any) -> None:
         column = self.layout.column(align=True)
-        for key in _sliders(context, self.start)[:FIRST_SLIDERS]:
+        for key in _sliders(context, self.start)[:MAX_SLIDERS]:
             column.prop(key, "value", text=key.name, slider=True)
 
 

@@ -73,11 +73,11 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
                 owner, prop = modifier_input_owner(modifier, identifier)
                 column.prop(owner, prop, text=name)
         if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
-            layout.label(text="Solid mode shows no colours", icon="INFO")
-            look = layout.operator("wm.context_set_enum", text="Use Material Preview")
-            look.data_path, look.value = "space_data.shading.type", "MATERIAL"
+            layout.label(text="Solid mode shows no splat colors", icon="INFO")
+            preview = layout.operator("wm.context_set_enum", text="Use Material Preview")
+            preview.data_path, preview.value = "space_data.shading.type", "MATERIAL"
         if view_transform_hint(context.scene):
-            layout.label(text="View transform changes the colours", icon="ERROR")
+            layout.label(text="View transform changes the colors", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)
         hint = transparent_bounces_hint(context.scene)
         if hint:

@@ -1,4 +1,4 @@
-"""What the panel's steps remember between clicks; saved with the .blend."""
+"""Properties of a scene, saved with the .blend file."""
 
 import json
 from typing import Any
@@ -7,45 +7,45 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import register_classes, unregister_classes
-from ..operators.train import preset_property, strategy_property
+from ..operators.train import device_property, preset_property, strategy_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
 class SelectedFrame(bpy.types.PropertyGroup):
-    """A line of the table of what each frame trains; filled by the operators of `operators.select`."""
+    """Row of the table of selected triangles; filled by `operators.select`."""
 
-    frame: bpy.props.IntProperty(name="Frame", description="Frame of the scene, which is the timestep of the capture")
-    triangles: bpy.props.IntProperty(name="Triangles", description="Triangles that the frame selects")
+    frame: bpy.props.IntProperty(name="Frame", description="Frame of the scene: the timestep of the capture")
+    triangles: bpy.props.IntProperty(name="Triangles", description="Triangles selected in the frame")
     splats: bpy.props.IntProperty(name="Splats", description="Splats on those triangles")
 
 
 def _forget_rows(chosen: Any, context: Any) -> None:
-    chosen.selected_frames.clear()  # they counted another head
+    chosen.selected_frames.clear()  # rows of another head
     chosen.effects.clear()
     chosen.preset_timing = ""
 
 
-def seconds_of_presets(chosen: Any) -> dict[str, float]:
-    """Preset -> seconds that it trains on this machine, where the capture was looked at."""
+def preset_times(chosen: Any) -> dict[str, float]:
+    """Preset -> seconds of training on this machine; empty before the capture was analyzed."""
     return dict(json.loads(chosen.preset_timing or "{}"))
 
 
 def _take_minutes(chosen: Any, context: Any) -> None:
-    seconds = seconds_of_presets(chosen).get(chosen.preset)
+    seconds = preset_times(chosen).get(chosen.preset)
     if seconds:
         chosen.minutes = seconds / 60
 
 
 class EffectRow(bpy.types.PropertyGroup):
-    """A line of the plan; filled by `operators.plan`. Its `name` is the effect's."""
+    """Row of the table of effects, `name` is the effect's; filled by `operators.analyze`."""
 
     choice: bpy.props.EnumProperty(
         name="Choice",
-        description="Who decides",
+        description="Whether training models this effect",
         items=(
-            ("auto", "Auto", "The capture decides"),
-            ("on", "On", "Computed, whatever the capture says"),
-            ("off", "Off", "Not computed"),
+            ("auto", "Auto", "Decided by analyzing the capture"),
+            ("on", "On", "Always"),
+            ("off", "Off", "Never"),
         ),
     )
     on: bpy.props.BoolProperty(name="On")
@@ -54,45 +54,46 @@ class EffectRow(bpy.types.PropertyGroup):
 
 
 class SceneSettings(bpy.types.PropertyGroup):
-    """One per scene; operators read what the scene works on, the panel hands the rest to them as arguments."""
+    """Settings of the panel, one group for each scene; passed to operators as arguments, but for head and splats."""
 
     # The module bpy 4.2 crashes when its Python ends where a property has a poll or update function; Blender does not.
 
     head: bpy.props.PointerProperty(
         name="Head",
-        description="The imported head that the steps work on",
+        description="Imported head that the steps work on",
         type=bpy.types.Object,
         update=_forget_rows,
     )
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: bpy.props.IntProperty(options={"HIDDEN"})
     motion_source: bpy.props.PointerProperty(
-        name="From", description="Another imported head, whose motion this head takes", type=bpy.types.Object
+        name="From", description="Another imported head, whose motion is applied to this one", type=bpy.types.Object
     )
     splats: bpy.props.PointerProperty(
-        name="Splats", description="The splats whose display is set here", type=bpy.types.Object
+        name="Splats", description="Splats whose display is set here", type=bpy.types.Object
     )
     run_folder: bpy.props.StringProperty(
         name="Run Folder",
-        description="Where training writes the avatar and its checkpoints",
+        description="Folder for the avatar and its checkpoints",
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
         default="//stga_run",
     )
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Wall time of training", default=5.0, min=0.01)
+    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
     strategy: strategy_property()
     preset: preset_property(update=_take_minutes)
-    preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON: preset -> what `operators.plan` was told
+    device: device_property()
+    preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
-    analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the capture could not be looked at
+    analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the analysis failed
     live_preview: bpy.props.BoolProperty(
-        name="Live Preview", description="Refresh the splats every few seconds while they train", default=True
+        name="Live Preview", description="Update the splats every few seconds during training", default=True
     )
     show_result: bpy.props.BoolProperty(
-        name="Show When Done", description="Show the avatar on the head as soon as it is trained", default=True
+        name="Show When Trained", description="Show the avatar on the head when training has finished", default=True
     )
     training_run: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last run
-    result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its result has reached the scene
+    result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its avatar has reached the scene
     avatar: bpy.props.StringProperty(
         name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
     )

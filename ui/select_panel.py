@@ -1,4 +1,4 @@
-"""The Select step: what is selected as a whole, how much each frame trains, and where on the head."""
+"""The Select step: regions selected as a whole, table of selected triangles, heat map."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from .sidebar import SidebarPanel
 
 
 class SelectedFrames(bpy.types.UIList):
-    """Frame, triangles and splats, one frame a line; a click goes to the frame."""
+    """Frame, triangles and splats of each frame; a click goes to the frame."""
 
     bl_idname = "STGA_UL_selected_frames"
 
@@ -42,9 +42,9 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
             _draw_table(layout, chosen)
         if any(tags.group_timestep(group.name) is not None for group in chosen.head.vertex_groups):
             row = layout.row(align=True)
-            row.operator(ids.COUNT_SELECTED, text="Count Again", icon="FILE_REFRESH")
+            row.operator(ids.COUNT_SELECTED, icon="FILE_REFRESH")
             shown = has_heat_map(chosen.head)
-            text = "Hide Heat Map" if shown else "Heat Map"
+            text = "Hide Heat Map" if shown else "Show Heat Map"
             row.operator(ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown).show = not shown
         else:
             layout.label(text="No selection yet")

@@ -1,4 +1,4 @@
-"""What the panels of the sidebar tab have in common."""
+"""Base of the panels in the sidebar tab."""
 
 
 class SidebarPanel:

@@ -1,4 +1,4 @@
-"""The Train step: what to train, how far it is, and what went wrong."""
+"""The Train step: settings, progress, and result or failure."""
 
 from pathlib import Path
 from typing import Any
@@ -7,17 +7,18 @@ import bpy
 
 from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
-from ..operators.common import package, scene_settings
+from ..operators.common import is_head, package, scene_settings
 from ..operators.environment import has_training_python
 from ..stga_addon.format import format_duration
+from ..stga_addon.jobs.monitor_state import MonitorState
 from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effect_plan import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
-from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
+from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
 from .failure import draw_failure
-from .properties import seconds_of_presets
+from .properties import preset_times
 from .sidebar import SidebarPanel
 from .text import draw_text
 
@@ -27,13 +28,14 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "3 Train"
 
     def draw(self, context: Any) -> None:
-        run = monitor.run_of(context.scene)
-        now = monitor.snapshot_of(context.scene)
-        if now.state.is_alive:
-            _draw_progress(self.layout, context, run, now)
+        training = monitor.training_of(context.scene)
+        if training.error:
+            draw_text(self.layout, context, training.error, "ERROR")
+        if training.snapshot.state.is_alive:
+            _draw_progress(self.layout, context, training)
             return
-        if run is not None:
-            _draw_end(self.layout, context, run, now)
+        if training.run is not None:
+            _draw_end(self.layout, context, training)
         _draw_choices(self.layout, context)
 
 
@@ -41,62 +43,61 @@ def _draw_choices(layout: Any, context: Any) -> None:
     chosen = scene_settings(context)
     layout.prop(chosen, "run_folder", text="Folder")
     layout.prop(chosen, "preset")
-    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in seconds_of_presets(chosen).items())
+    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in preset_times(chosen).items())
     if times:
         draw_text(layout, context, f"On this machine: {times}", "TIME")
     layout.prop(chosen, "minutes")
     layout.prop(chosen, "strategy")
+    layout.prop(chosen, "device")
     layout.prop(chosen, "show_result")
     row = layout.row(align=True)
     for resume, text, icon in ((False, "Train", "PLAY"), (True, "Resume", "FRAME_NEXT")):
         train = row.operator(ids.TRAIN, text=text, icon=icon)
         train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, resume
-        train.strategy, train.preset = chosen.strategy, chosen.preset
+        train.strategy, train.preset, train.device = chosen.strategy, chosen.preset, chosen.device
         train.effects = " ".join(chosen_effects(chosen))
     if not has_training_python(context):
         layout.label(text="No training environment yet", icon="INFO")
         layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()
 
 
-def _draw_progress(layout: Any, context: Any, run: Path, now: WorkerSnapshot) -> None:
-    status = now.status
-    text = {WorkerState.STARTING: "starting", WorkerState.CANCELLING: "cancelling"}.get(now.state, status.message)
+def _draw_progress(layout: Any, context: Any, training: MonitorState) -> None:
+    state, status = training.snapshot.state, training.snapshot.status
+    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(state, status.message)
     layout.progress(factor=status.progress, text=f"{100 * status.progress:.0f} %  {text}")
     column = layout.column(align=True)
     for line in (*describe_figures(status.figures), status.detail):
         draw_text(column, context, line)
-    draw_curve(layout, run)
+    draw_curve(layout, training.folder)
     layout.prop(scene_settings(context), "live_preview")
     layout.prop(scene_settings(context), "show_result")
     layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
 
 
-def _draw_end(layout: Any, context: Any, run: Path, now: WorkerSnapshot) -> None:
+def _draw_end(layout: Any, context: Any, training: MonitorState) -> None:
+    state, status, folder = training.snapshot.state, training.snapshot.status, training.folder
     box = layout.box()
     row = box.row()
-    if now.state == WorkerState.NONE:
-        row.label(text="The run is gone", icon="ERROR")
-        draw_failure(box, context, f"{run}: is not there; was it moved? Choose its folder and press Resume", (), None)
-    elif now.state.failed:
+    if state == WorkerState.NONE:
+        row.label(text="Run not found", icon="ERROR")
+        draw_failure(box, context, f"{folder}: does not exist; choose its new folder and press Resume", (), None)
+    elif state.failed:
         row.label(text="Training failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.log_tail, job_folder(run))
+        draw_failure(box, context, status.error, training.snapshot.log_tail, job_folder(folder))
     else:
-        done = {WorkerState.FINISHED: "Trained", WorkerState.CANCELLED: "Cancelled, avatar kept"}[now.state]
+        done = {WorkerState.FINISHED: "Trained", WorkerState.CANCELLED: "Cancelled, avatar kept"}[state]
         row.label(text=done, icon="CHECKMARK")
-        for line in describe_figures(now.status.figures)[1:]:
+        for line in describe_figures(status.figures)[1:]:
             draw_text(box, context, line)
-        draw_curve(box, run)
-        if (run / TRACKING).is_file():
-            _draw_refined(box, context, run / TRACKING)
+        draw_curve(box, folder)
+        if training.files.tracking is not None:
+            _draw_refined(box, context, folder / TRACKING)
     row.operator(ids.DISMISS_TRAINING, text="", icon="X", emboss=False)
 
 
 def _draw_refined(layout: Any, context: Any, path: Path) -> None:
-    """The splats were trained on other meshes than the imported ones, which a click exchanges."""
+    """Draw a button that exchanges the imported tracking for the refined one, which the splats were trained with."""
     head = scene_settings(context).head
-    column = layout.column()
-    column.operator_context = "EXEC_DEFAULT"  # without a file dialog
-    column.enabled = head is not None
-    apply = column.operator(ids.APPLY_MOTION, text="Apply Refined Tracking", icon="CON_FOLLOWTRACK")
-    apply.filepath, apply.source, apply.own_offsets = str(path), "", True
-    apply.start = head[tags.TIMESTEPS][0] if head is not None else 1
+    apply = layout.operator(ids.APPLY_MOTION, text="Apply Refined Tracking", icon="CON_FOLLOWTRACK")
+    apply.filepath, apply.own_offsets = str(path), True
+    apply.start = head[tags.TIMESTEPS][0] if is_head(head) else 1

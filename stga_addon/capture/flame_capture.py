@@ -1,9 +1,12 @@
-"""Captures tracked with FLAME, as VHAP exports them and GaussianAvatars reads them."""
+"""Opening captures tracked with FLAME (the layout of VHAP and GaussianAvatars)."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ..errors import StgaError
 from ..flame.masks import key_regions
@@ -18,7 +21,7 @@ from ..flame.sequence import (
     sequence_mesh,
 )
 from ..flame.teeth import TEMPLATE_VERTICES, with_teeth
-from .meshes import file_of, remembered
+from .meshes import cached_meshes, check_extent, file_of
 from .model import Capture, View
 from .transforms import Transforms, tracked_files
 
@@ -33,7 +36,7 @@ def open_flame_capture(
 
     A model of FLAME's published 5023 vertices always gets teeth, because VHAP and GaussianAvatars track and train
     with them; a model of any other size is taken as it is. Shape and static offset come from the first timestep.
-    Raises StgaError, also where the model file is not given: FLAME's licence does not let anyone pass it on.
+    Raises StgaError, also where the model file is not given: FLAME's licence forbids passing it on.
     """
     model = _model_for(root, model_file)
     files = parameter_files(root, transforms)
@@ -52,12 +55,7 @@ def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
 
 def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
     """The FLAME capture with another motion of the same person, and the meshes that it makes."""
-    return replace(
-        capture,
-        mesh=remembered(lambda timestep: sequence_mesh(sequence, timestep), len(sequence.model.v_template)),
-        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
-        flame=sequence,
-    )
+    return replace(capture, **_posed(capture.root, sequence))
 
 
 def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tuple[View, ...]]) -> Capture:
@@ -68,15 +66,26 @@ def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tupl
         root=root,
         layout="flame",
         faces=model.faces,
-        neutral=neutral_mesh(sequence),
+        neutral=check_extent(f"{root}: neutral mesh", neutral_mesh(sequence)),
         views=views,
         timesteps=sequence.timesteps,
         regions=regions,
-        mesh=remembered(lambda timestep: sequence_mesh(sequence, timestep), len(model.v_template)),
-        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
-        flame=sequence,
         warnings=() if regions else (missing,),
+        **_posed(root, sequence),
     )
+
+
+def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
+    """The fields of a capture that depend on its motion."""
+
+    def mesh(timestep: int) -> np.ndarray:
+        return check_extent(f"{root}: timestep {timestep}", sequence_mesh(sequence, timestep))
+
+    return {
+        "mesh": cached_meshes(mesh, len(sequence.model.v_template)),
+        "expression_mesh": lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        "flame": sequence,
+    }
 
 
 def _model_for(root: Path, model_file: Path | None) -> FlameModel:

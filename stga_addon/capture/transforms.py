@@ -6,21 +6,24 @@ import posixpath
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from os.path import isfile
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_json
-from .camera import MAX_IMAGE_PIXELS, Camera, camera_from_gl
+from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
 from .model import View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
 ROTATION_TOLERANCE = 1e-3  # Exporters write float32 poses, some of them rounded to a few decimals.
 MAX_NUMBER = sys.float_info.max  # JSON's whole numbers know no limit.
-MAX_NATURAL = 1 << 31
+INDEX_LIMIT = 1 << 31
+MIN_ANGLE = 1e-9  # radians; half of it still has a tangent
+MAX_PATH_CHARACTERS, MAX_NAME_BYTES = 2000, 255
 MATRIX = "a 4x4 matrix of finite numbers"
 
 
@@ -124,16 +127,14 @@ def inside(root: Path, relative: str, where: str) -> Path:
     """
     text = relative.replace("\\", "/")
     parts = posixpath.normpath(text).split("/")
-    if (
-        not text
-        or "\0" in text
-        or text.startswith("/")
-        or any(":" in part and PureWindowsPath(part).drive for part in parts)
-    ):
-        raise StgaError(f"{where}: {relative!r} is not a path relative to {root}")
+    absolute = text.startswith("/") or any(":" in part and PureWindowsPath(part).drive for part in parts)
+    if absolute or "\0" in text or parts == ["."]:
+        raise StgaError(f"{where}: {shorten(relative)} is not a path of a file relative to {root}")
+    if len(text) > MAX_PATH_CHARACTERS or any(len(part.encode()) > MAX_NAME_BYTES for part in parts):
+        raise StgaError(f"{where}: {shorten(relative)} is longer than a path can be")
     # The first .. leads to the parent, where only a named sibling may follow.
     if parts[:2] == ["..", ".."] or parts == [".."]:
-        raise StgaError(f"{where}: {relative!r} leads outside {root.parent}, where the capture must stay")
+        raise StgaError(f"{where}: {shorten(relative)} leads outside {root.parent}, where the capture must stay")
     return root.parent.joinpath(*parts[1:]) if parts[0] == ".." else root.joinpath(*parts)
 
 
@@ -161,16 +162,15 @@ class _Record:
             or not low < value < high
             or abs(value) > MAX_NUMBER
         ):
-            bounds = (
-                "" if low == -math.inf else f" above {low:g}" + ("" if high == math.inf else f" and below {high:g}")
-            )
-            raise StgaError(f"{self.where(key)}: expected a finite number{bounds}, not {value!r:.40}")
+            limits = [f"{word} {limit:g}" for word, limit in (("above", low), ("below", high)) if math.isfinite(limit)]
+            expected = " ".join(["a finite number", " and ".join(limits)]).strip()
+            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
         return float(value)
 
     def natural(self, key: str) -> int:
         value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < MAX_NATURAL:
-            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {value!r:.40}")
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
+            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {shorten(value)}")
         return value
 
     def path_of(self, key: str) -> Path | None:
@@ -178,7 +178,7 @@ class _Record:
         if value is None:
             return None
         if not isinstance(value, str):
-            raise StgaError(f"{self.where(key)}: expected a relative path, not {value!r}")
+            raise StgaError(f"{self.where(key)}: expected a relative path, not {shorten(value)}")
         return inside(self.folder, value, self.where(key))
 
 
@@ -202,7 +202,7 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     frames = []
     for number, entry in enumerate(values["frames"]):
         if not isinstance(entry, dict):
-            raise StgaError(f"{path}: frames[{number}]: expected an object, not {entry!r:.40}")
+            raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
         frames.append(
             _frame(replace(shared, place=f"frames[{number}].", values=entry), shared, timed, principal_point, cameras)
         )
@@ -226,7 +226,7 @@ def _frame(
     if timed and key is None:
         raise StgaError(f"{record.where('timestep_index')}: is missing, though other frames have it")
     width, height = _image_size(record, shared, image)
-    written = _number(record, shared, "cx", width / 2), _number(record, shared, "cy", height / 2)
+    written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
     focal = _focal(record, shared, width, height)
     matrix = _matrix(record)
     key_of_camera = matrix.tobytes(), width, height, *focal, *written
@@ -252,37 +252,46 @@ def _timestep_key(values: dict[str, Any]) -> str | None:
     return next((key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None)
 
 
-def _number(record: _Record, shared: _Record, key: str, otherwise: float) -> float:
+def _principal(record: _Record, shared: _Record, key: str, size: int) -> float:
+    """One coordinate of the principal point as written; the image's center where there is none."""
     source = record if record.has(key) else shared
-    return source.number(key) if source.has(key) else otherwise
+    return source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS) if source.has(key) else size / 2
 
 
 def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int]:
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
-        if not image.is_file():
+        if not isfile(image):
             raise StgaError(f"{record.where('w')}: w and h are missing, and so is the image {image} to take them from")
         from .images import image_size
 
         return image_size(image)
     width, height = source.number("w", low=0), source.number("h", low=0)
-    if width % 1 or height % 1 or width * height > MAX_IMAGE_PIXELS:
+    if not is_image_size(width, height):
         raise StgaError(f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}")
     return int(width), int(height)
 
 
 def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
+    focal = _written_focal(record, shared, width, height)
+    for name, value in zip(("fl_x", "fl_y"), focal, strict=True):
+        if not 1 <= value <= MAX_FOCAL_PIXELS:
+            raise StgaError(f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}")
+    return focal
+
+
+def _written_focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
     for source in (record, shared):
         if source.has("fl_x"):
             fl_x = source.number("fl_x", low=0)
         elif source.has("camera_angle_x"):
-            fl_x = width / 2 / math.tan(source.number("camera_angle_x", low=0, high=math.pi) / 2)
+            fl_x = width / 2 / math.tan(source.number("camera_angle_x", low=MIN_ANGLE, high=math.pi) / 2)
         else:
             continue
         if source.has("fl_y"):
             return fl_x, source.number("fl_y", low=0)
         if source.has("camera_angle_y") and not source.has("fl_x"):
-            return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=0, high=math.pi) / 2)
+            return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=MIN_ANGLE, high=math.pi) / 2)
         return fl_x, fl_x
     raise StgaError(f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level")
 
@@ -298,6 +307,8 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
     where = record.where("transform_matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
+    if np.abs(matrix).max() > MAX_COORDINATE_M:
+        raise StgaError(f"{where}: the camera lies farther than {MAX_COORDINATE_M:g} from the origin")
     rotation = matrix[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:

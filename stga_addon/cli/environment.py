@@ -4,6 +4,7 @@ The variable STGA_PYTHON names a Python that takes precedence over all of these.
 """
 
 import os
+import shutil
 import sys
 import time
 from argparse import ArgumentParser, Namespace
@@ -13,6 +14,7 @@ from ..errors import StgaError
 from ..jobs.delegate import OpenHead
 from ..worker.environment import (
     DEVICES,
+    PYTHON_VARIABLE,
     check_python,
     find_training_python,
     made_python,
@@ -23,6 +25,7 @@ from ..worker.environment import (
 )
 from ..worker.launch import prepare_status_folder, start_worker
 from ..worker.status import inspect_worker, request_cancel
+from .arguments import usable_path
 
 NAME, HELP = "environment", "make, choose, test or remove the Python with torch that trains beside Blender"
 FOLDER_VARIABLE = "STGA_ENVIRONMENT_FOLDER"
@@ -32,12 +35,12 @@ POLL_INTERVAL_S = 0.3
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
-        "--folder", type=Path, help="folder of the environment (default: in Blender's or your user data)"
+        "--folder", type=usable_path, help="folder of the environment (default: in Blender's or your user data)"
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     make = actions.add_parser("make", help="make an environment with PyTorch, and use it")
     make.add_argument("--device", choices=DEVICES, default="auto", help="device that it supports")
-    make.add_argument("--wheels", type=Path, metavar="FOLDER", help="wheel files to install from without a network")
+    make.add_argument("--wheels", type=usable_path, metavar="FOLDER", help="wheel files, to install without a network")
     make.add_argument("--python", default=sys.executable, metavar="PATH", help="Python 3.11 or newer to make it from")
     use = actions.add_parser("use", help="test a Python that has the packages, and use it")
     use.add_argument("python", metavar="PATH")
@@ -47,15 +50,21 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     folder = (options.folder or _default_folder()).absolute()
-    if options.action == "make":
-        print(f"{_make(folder, options)}: {made_python(folder)}")
-    elif options.action == "use":
-        print(f"{store_choice(folder, options.python)}: {options.python}")
-    elif options.action == "test":
-        python = find_training_python(folder)
-        print(f"{check_python(python)}: {python}")
-    else:
+    if options.action == "remove":
         print(f"Removed {remove_environment(folder)} environment(s) from {folder}")
+        return
+    if options.action == "make":
+        line, python = _make(folder, options), str(made_python(folder))
+    elif options.action == "use":
+        python = shutil.which(options.python) or os.path.abspath(options.python)
+        line = store_choice(folder, python)
+    else:
+        python = find_training_python(folder)
+        line = check_python(python)
+    print(f"{python}: {line}")
+    used = find_training_python(folder)
+    if used != python:
+        print(f"{used} takes precedence: {PYTHON_VARIABLE} or the add-on's preferences name it")
 
 
 def _default_folder() -> Path:

@@ -30,7 +30,8 @@ ALIASES = {
 }
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSES = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
-TURN = 0.5  # degrees by which a joint must turn to count as moving
+MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
 LAST_TIMESTEP = 1 << 20  # Blender's last frame; a motion is played with all frames between its timesteps
 MOTION_PACKING = 256  # dynamic offsets that are all zero, as most are, pack a published FLAME's motion 116 times
 
@@ -88,7 +89,7 @@ def with_identity(sequence: FlameSequence) -> FlameSequence:
     return replace(sequence, model=person, shape=np.zeros(0), static_offset=None)
 
 
-def turns(frames: Sequence[FlameFrame]) -> np.ndarray:
+def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     """Largest angle (5,) in degrees by which the frames turn each of `JOINTS`."""
     return np.asarray(np.degrees(np.linalg.norm([frame.pose for frame in frames], axis=2).max(axis=0)))
 
@@ -189,8 +190,8 @@ def _identity(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
 def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
-    if not np.isfinite(array).all():
-        raise StgaError(f"{path}: {name} holds values that are not finite")
+    if not (np.abs(array.astype(np.float64)) <= MAX_PARAMETER).all():
+        raise StgaError(f"{path}: {name} holds values that are not finite, or beyond {MAX_PARAMETER:g}")
     return array.astype(np.float64)
 
 

@@ -21,7 +21,8 @@ from ..avatar.embedding import WORLD, FaceFrames
 from ..avatar.file import Avatar
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
-from .cpu.rasterize import Parameters, frames_in_camera, render_forward
+from .cpu.layout import Parameters
+from .cpu.rasterize import frames_in_camera, render_forward
 
 WHITE = (1.0, 1.0, 1.0)
 

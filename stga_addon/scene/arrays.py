@@ -1,4 +1,4 @@
-"""Bulk reads and writes of Blender's meshes, as numpy arrays."""
+"""Bulk reads and writes of Blender's meshes as numpy arrays."""
 
 from typing import Any
 
@@ -13,6 +13,11 @@ def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> 
     return values.reshape(-1, width)
 
 
+def flat_floats(values: np.ndarray) -> np.ndarray:
+    """The values as `foreach_set` takes them: one axis, float32."""
+    return np.ascontiguousarray(values, np.float32).ravel()
+
+
 def mesh_vertices(mesh: Any) -> np.ndarray:
     """(V, 3) float32 positions of a mesh's vertices."""
     return read_values(mesh.vertices, "co", 3)
@@ -23,26 +28,29 @@ def mesh_triangles(mesh: Any) -> np.ndarray:
     return read_values(mesh.loops, "vertex_index", 1, np.int32).reshape(-1, 3)
 
 
-def evaluated_vertices(thing: Any) -> np.ndarray:
+def has_triangles(mesh: Any, faces: np.ndarray) -> bool:
+    """Whether the mesh's faces are these triangles (F, 3), in this order."""
+    return len(mesh.loops) == faces.size and np.array_equal(mesh_triangles(mesh), faces)
+
+
+def evaluated_vertices(obj: Any) -> np.ndarray:
     """(V, 3) float32 vertex positions of a mesh object at the current frame, in object space.
 
     Shape keys, drivers and modifiers are applied.
     """
-    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     try:
-        vertices = np.empty(len(mesh.vertices) * 3, np.float32)
-        mesh.vertices.foreach_get("co", vertices)
+        return mesh_vertices(mesh)
     finally:
         evaluated.to_mesh_clear()
-    return vertices.reshape(-1, 3)
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
     """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3); order and vertex order of the faces are kept."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", np.asarray(vertices, np.float32).ravel())
+    mesh.vertices.foreach_set("co", flat_floats(vertices))
     mesh.loops.add(faces.size)
     mesh.loops.foreach_set("vertex_index", np.asarray(faces, np.int32).ravel())
     mesh.polygons.add(len(faces))

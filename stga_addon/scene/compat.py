@@ -1,5 +1,6 @@
-"""What differs between Blender 4.2 and 5.2, and the bulk reads and writes that every scene module shares."""
+"""Differences between Blender 4.2 and 5.3: every version switch of the add-on."""
 
+from contextlib import suppress
 from typing import Any
 
 import bpy
@@ -7,8 +8,7 @@ import numpy as np
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
-NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")
-# Options of a path property that may start with "//"; newer versions want to be told, older ones refuse the word.
+# Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
 PATH_OPTIONS = (
     {"PATH_SUPPORTS_BLEND_RELATIVE"}
     if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties
@@ -19,7 +19,7 @@ PATH_OPTIONS = (
 def action_curves(owner: Any) -> Any:
     """The f-curve collection that animates the data-block `owner`; makes its action (and slot) where it has none.
 
-    Call `.new(data_path, index=…)` on it, or `write_curve`.
+    Call `.new(data_path, index=…)` on it, or `animation.write_curve`.
     """
     animation = owner.animation_data or owner.animation_data_create()
     if animation.action is None:
@@ -29,13 +29,13 @@ def action_curves(owner: Any) -> Any:
         return action.fcurves
     if animation.action_slot is None:
         animation.action_slot = action.slots.new(id_type=owner.id_type, name=owner.name)
-    layer = action.layers[0] if action.layers else action.layers.new("PosedSplats")
+    layer = action.layers[0] if action.layers else action.layers.new("Layer")
     strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
     return strip.channelbag(animation.action_slot, ensure=True).fcurves
 
 
 def copy_action(owner: Any, name: str) -> Any:
-    """Make a copy of the action that animates `owner`, or an empty one, its action; the old one stays in the file.
+    """Give `owner` a copy of its action, or an empty one if it has none; the old one stays in the file.
 
     Returns the f-curve collection of the new action, as `action_curves`.
     """
@@ -95,6 +95,30 @@ def modifier_input_owner(modifier: Any, identifier: str) -> tuple[Any, str]:
     return modifier, f'["{identifier}"]'
 
 
+def enable_nodes(owner: Any) -> Any:
+    """The node tree of a new material or world, which comes without one before Blender 5."""
+    if owner.node_tree is None:
+        owner.use_nodes = True
+    return owner.node_tree
+
+
 def world_nodes(world: Any) -> Any:
-    """The node tree that a world uses; None where it is a plain colour, which ended with Blender 4."""
+    """The node tree that a world uses; None where it is a plain color, which is possible before Blender 5."""
     return world.node_tree if bpy.app.version >= (5, 0, 0) or world.use_nodes else None
+
+
+def native_splats(tree: Any, points: Any) -> Any:
+    """Add nodes that turn points into Blender's native splats; None before 5.3, or where the menu item is unknown.
+
+    points: geometry socket of the node tree. Returns the output socket.
+    """
+    if not hasattr(bpy.types, "GeometryNodePointsSetType"):
+        return None
+    node = tree.nodes.new("GeometryNodePointsSetType")
+    for name in ("Gaussian Splat", "Gaussian Splats", "GAUSSIAN_SPLAT"):
+        with suppress(TypeError):  # there is no such item
+            node.inputs["Type"].default_value = name
+            tree.links.new(points, node.inputs["Points"])
+            return node.outputs[0]
+    tree.nodes.remove(node)
+    return None

@@ -142,11 +142,11 @@ def check_python(python: str) -> str:
         except subprocess.TimeoutExpired as error:
             child.kill()
             raise StgaError(f"{python}: did not answer within {CHECK_TIMEOUT_S:.0f} s") from error
-    with suppress(OSError):
-        print(output + errors, file=sys.stderr, flush=True)
     try:
         return describe_check(python, json.loads(output.strip().splitlines()[-1]))
     except (ValueError, IndexError, KeyError, TypeError) as error:
+        with suppress(OSError):  # the stream may be closed
+            print(output + errors, file=sys.stderr, flush=True)
         raise StgaError(f"{python}: is not a Python that runs this add-on (exit status {child.returncode})") from error
 
 

@@ -1,6 +1,10 @@
-"""The plan in the panel: asked of a worker, kept in the scene, and handed to training."""
+"""Analysis of the capture: in a worker, shown in the panel, and passed on to training."""
 
 import json
+import re
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -21,8 +25,8 @@ def chosen(extension, tmp_path):
     return bpy.context.scene.stga
 
 
-def test_the_plan_reaches_the_run(chosen, extension, tmp_path):
-    """Catches a plan that is empty, choices that are lost by looking again, and ones that training does not get."""
+def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
+    """Catches an empty analysis, choices that are lost by analyzing again, and ones that training does not get."""
     from types import SimpleNamespace
 
     assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
@@ -47,8 +51,8 @@ def test_the_plan_reaches_the_run(chosen, extension, tmp_path):
     assert {decision.effect: decision.choice for decision in run.effect_plan}["strain-color"] == "on"
 
 
-def test_another_head_has_another_plan(chosen):
-    """Catches a plan that outlives the capture it was made for."""
+def test_another_head_clears_the_analysis(chosen):
+    """Catches results that are shown for another capture."""
     chosen.effects.add().name = "jaw"
     chosen.preset_timing = '{"draft": 1}'
     chosen.head = chosen.head
@@ -56,7 +60,7 @@ def test_another_head_has_another_plan(chosen):
     assert not chosen.preset_timing
 
 
-def test_a_choice_that_cannot_be(chosen):
+def test_impossible_choice_is_a_sentence(chosen):
     """Catches a mistake that shows nowhere, or as a traceback."""
     row = chosen.effects.add()
     row.name, row.choice = "jaw", "on"
@@ -64,3 +68,72 @@ def test_a_choice_that_cannot_be(chosen):
         bpy.ops.stga.analyze_capture()
     assert chosen.analysis_error.startswith("jaw=on: ")
     assert "Traceback" not in chosen.analysis_error
+
+
+def write_interpreter(path: Path, body: str) -> str:
+    """A program that stands in for the Python of the training environment."""
+    path.write_text(f"#!{sys.executable}\nimport json, sys, time\n{body}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.fixture
+def analyze(extension, monkeypatch, tmp_path):
+    """Start an analysis by a stand-in for the worker, with a timer that the test calls."""
+
+    def start(body: str) -> None:
+        python = write_interpreter(tmp_path / "python", body)
+        monkeypatch.setattr(extension.operators.analyze, "training_python", lambda context: python)
+        assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
+
+    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    yield start
+    extension.operators.analyze.stop()
+
+
+def tick_until_done(extension) -> None:
+    for _ in range(300):
+        if extension.operators.analyze.tick() is None:
+            return
+        time.sleep(0.02)
+    raise AssertionError("the analysis did not end")
+
+
+def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
+    """Catches a worker that waits for ever because nobody reads its pipes before it ends: they hold some 64 kB."""
+    rows = {"effect": "jaw", "choice": "auto", "on": True, "reason": "x" * 200_000, "cost": ""}
+    analyze(f"sys.stderr.write('warning ' * 100_000); print(json.dumps({{'plan': [{rows}], 'presets': []}}))")
+    assert not bpy.ops.stga.analyze_capture.poll()
+    tick_until_done(extension)
+    assert [row.name for row in chosen.effects] == ["jaw"]
+    assert len(chosen.effects[0].reason) == 200_000
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        ("sys.exit(3)", r"Analysis exited unexpectedly \(exit code 3\)"),
+        ("sys.exit('stga: no memory')", "no memory"),
+        ("print('no JSON')", "Analysis printed something other than JSON"),
+        ("print('{}')", r"Unexpected error \(KeyError"),
+    ],
+)
+def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentence):
+    """Catches a timer that ends with a traceback, and a panel that says nothing; earlier results stay."""
+    chosen.effects.add().name = "jaw"
+    analyze(body)
+    tick_until_done(extension)
+    assert re.match(sentence, chosen.analysis_error)
+    assert not extension.operators.analyze.is_analyzing(bpy.context.scene)
+
+
+def test_analysis_can_be_cancelled(chosen, extension, analyze):
+    """Catches an analysis that nobody can stop, and one that goes on after it was cancelled."""
+    assert not bpy.ops.stga.cancel_analysis.poll()
+    analyze("time.sleep(600)")
+    begin = time.monotonic()
+    assert bpy.ops.stga.cancel_analysis() == {"FINISHED"}
+    assert time.monotonic() - begin < 60
+    assert bpy.ops.stga.analyze_capture.poll()
+    assert extension.operators.analyze.tick() is None
+    assert chosen.analysis_error == ""

@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,21 +47,32 @@ def test_too_little_is_no_curve():
     assert axes == "30 to 30.1 dB, 0 to 3 s"
 
 
-def test_it_is_painted_anew_after_every_evaluation(extension, tmp_path):
+def test_preview_follows_the_evaluations(extension, tmp_path):
     """Catches a picture that stays as it was, one for nothing, a panel that fails on a damaged file, and pictures that
     are saved in the .blend file."""
     bpy = pytest.importorskip("bpy")
-    curve = extension.ui.curve
-    assert curve._update(tmp_path) is None
+    curve, monitor = extension.ui.curve, extension.operators.monitor
+    drawn = []
+    layout = SimpleNamespace(
+        column=lambda **_: SimpleNamespace(template_icon=lambda *_, **__: None, label=lambda text: drawn.append(text))
+    )
+
+    def draw() -> list[str]:
+        """Read the run's evaluations as the training monitor does, and draw; the texts below the picture."""
+        drawn.clear()
+        monitor._curves[tmp_path] = monitor._read_curve(tmp_path)
+        curve.draw_curve(layout, tmp_path)
+        return list(drawn)
+
+    assert draw() == []
     file = tmp_path / "metrics.jsonl"
     seen = []
     for count in (1, 3, 6):
         file.write_text("".join(json.dumps(line) + "\n" for line in lines(count)))
-        seen.append(curve._update(tmp_path))
-    assert seen[0] is None
-    assert seen[1] is not None
-    painted = np.array(curve._pictures[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
+        seen.append(draw())
+    assert [len(texts) for texts in seen] == [0, 1, 1]
+    painted = np.array(curve._previews[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
     np.testing.assert_allclose(painted, curve_image(lines())[0], atol=1 / 255)
     file.write_text('{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n')
-    assert curve._update(tmp_path) is None
+    assert draw() == []
     assert len(bpy.data.images) == 0

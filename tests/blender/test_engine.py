@@ -376,7 +376,7 @@ def test_cameras_that_cannot_be_drawn_through(kind):
     """Catches a picture that is silently of another kind than the camera."""
     if kind is not None:
         camera_at(type=kind)
-    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is no perspective camera"):
+    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"):
         bpy.ops.render.render()
 
 

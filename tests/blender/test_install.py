@@ -1,4 +1,4 @@
-"""The built zip, installed the way a person installs it: into a fresh Blender profile, in a process of its own."""
+"""The built zip, installed as a user installs it: into a new Blender profile, in its own process."""
 
 import json
 import os
@@ -67,7 +67,27 @@ def test_same_files_as_blenders_own_build(zip_file, tmp_path):
     blender_ext("build", "--source-dir", ROOT, "--output-filepath", tmp_path / "reference.zip", home=tmp_path)
     names, reference = (set(zipfile.ZipFile(path).namelist()) for path in (zip_file, tmp_path / "reference.zip"))
     assert names == reference
-    assert not [name for name in names if name.startswith(("tests/", "docs/", ".")) or name.endswith(".pyc")]
+
+
+def test_zip_holds_what_the_extension_runs(zip_file):
+    """Catches tests, docs, the benchmark, the demo or the photo studio in the zip, and a module left out."""
+    names = set(zipfile.ZipFile(zip_file).namelist())
+    left_out = ("tests/", "docs/", "benchmarks/", "stga_addon/development/", ".")
+    assert not [name for name in names if name.startswith(left_out) or name.endswith(".pyc")]
+    assert {name for name in names if "/" not in name} == {
+        "LICENSE",
+        "README.md",
+        "CHANGELOG.md",
+        "__init__.py",
+        "blender_manifest.toml",
+    }
+    assert {
+        "operators/train.py",
+        "ui/panel.py",
+        "stga_addon/worker/launch.py",
+        "stga_addon/cli/environment.py",
+    } <= names
+    assert {name for name in names if name.startswith("wheels/")} == {f"wheels/{name}" for name in WHEELS}
 
 
 def test_equal_sources_give_an_equal_zip(zip_file, tmp_path):
@@ -95,7 +115,7 @@ class Bare(importlib.machinery.PathFinder):
         package = name.split(".")[0]
         if package in {"torch", "numba", "scipy", "PIL", "smplx"}:
             return None
-        if path is None and package in {"trimesh", "tqdm"}:
+        if path is None and package in {"filelock", "trimesh", "tqdm"}:
             path = [folder for folder in sys.path if folder.startswith(os.environ["BLENDER_USER_RESOURCES"])]
         return super().find_spec(name, path, target)
 
@@ -114,7 +134,7 @@ names = "import_capture import_motion import_meshes select heat_map train show_a
 names += "standard_view import_ply export_avatar".split()
 result["missing"] = [name for name in names if not hasattr(bpy.types, "STGA_OT_" + name)]
 result["tabs"] = [name for name in dir(bpy.types) if name.startswith("STGA_PT_")]
-result["wheels"] = [__import__(name).__file__ for name in ("trimesh", "tqdm")]
+result["wheels"] = [__import__(name).__file__ for name in ("filelock", "trimesh", "tqdm")]
 
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.preferences.addon_enable(module=module)

@@ -32,6 +32,7 @@ OPERATORS = (
     "count_selected",
     "heat_map",
     "analyze_capture",
+    "cancel_analysis",
     "train",
     "cancel_training",
     "dismiss_training",
@@ -45,6 +46,7 @@ OPERATORS = (
     "more_bounces",
     "import_ply",
     "export_avatar",
+    "open_npz",
 )
 
 
@@ -110,6 +112,28 @@ def test_every_operator_explains_itself(extension):
         assert kind.description not in ("", "(undocumented operator)"), name
         for prop in kind.properties:
             assert prop.identifier == "rna_type" or prop.is_hidden or prop.description, (name, prop.identifier)
+
+
+SET_BY_PANEL = {
+    "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "effects"},
+    "apply_motion": {"filter_glob"},
+    "show_avatar": {"hide_head", "filter_glob"},
+    "export_avatar": {"format", "filter_glob", "check_existing"},
+    "heat_map": set(),
+    "copy_report": set(),
+}
+"""Operator -> properties that its button in the panel sets, or that a user chooses in its file dialog."""
+
+
+@pytest.mark.parametrize("name", SET_BY_PANEL)
+def test_no_hidden_state_between_calls(extension, name):
+    """Catches a script's `resume` or `own_offsets` that Blender remembers for the next click on a button.
+
+    Without a window Blender remembers nothing, so what tells it not to is checked.
+    """
+    properties = getattr(bpy.ops.stga, name).get_rna_type().properties
+    remembered = {prop.identifier for prop in properties if not prop.is_skip_save} - {"rna_type"}
+    assert remembered <= SET_BY_PANEL[name]
 
 
 def test_steps_wait_for_a_capture(extension):
@@ -239,24 +263,24 @@ def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
 
 def test_more_bounces_where_cycles_needs_them(extension):
     """Catches a hint that shows where nothing has to be done, and a button that lowers what somebody raised."""
-    materials = extension.stga_addon.scene.display.materials
+    hints = extension.stga_addon.scene.display.hints
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.transparent_max_bounces = 8
-    assert "8 layers" in materials.transparent_bounces_hint(scene)
+    assert "8 layers" in hints.transparent_bounces_hint(scene)
     bpy.ops.stga.more_bounces()
     assert scene.cycles.transparent_max_bounces == 64
-    assert materials.transparent_bounces_hint(scene) is None
+    assert hints.transparent_bounces_hint(scene) is None
     scene.cycles.transparent_max_bounces = 200
     bpy.ops.stga.more_bounces()
     assert scene.cycles.transparent_max_bounces == 200
     scene.cycles.transparent_max_bounces = 8
     scene.render.engine = "BLENDER_WORKBENCH"
-    assert materials.transparent_bounces_hint(scene) is None
+    assert hints.transparent_bounces_hint(scene) is None
 
 
 def test_standard_view(extension):
-    """Catches a one-click cure that does not cure: AgX turns trained colours grey."""
+    """Catches a one-click cure that does not cure: AgX turns trained colors grey."""
     bpy.context.scene.view_settings.view_transform = "AgX"
     bpy.ops.stga.standard_view()
     assert bpy.context.scene.view_settings.view_transform == "Standard"
@@ -292,5 +316,5 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     )
     color = np.empty(4 * len(points.points), np.float32)
     points.attributes["stga_display_color"].data.foreach_get("color", color)
-    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_GREY).all(1)
+    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_COLOR).all(1)
     np.testing.assert_array_equal(~frozen, read_selection(scene.stga.head)[3][avatar.splats.face])

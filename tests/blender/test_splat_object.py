@@ -14,9 +14,9 @@ from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.color_nodes import SH  # noqa: E402
 from stga_addon.scene.display.display_modes import ELLIPSOIDS, QUADS  # noqa: E402
-from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT, OPACITY  # noqa: E402
+from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT  # noqa: E402
+from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
 
 FRAMES = (1, 5, 9)
@@ -154,9 +154,7 @@ def test_attributes_hold_activated_values():
     splats = replace(avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32))
     mesh = show_avatar(replace(avatar, splats=splats), animated_head(avatar.neutral, avatar.faces)).data
     assert [item.value for item in mesh.attributes[OPACITY].data] == pytest.approx([0.5] * 50)
-    assert list(mesh.attributes[splat_nodes.SCALE].data[3].vector) == pytest.approx(
-        np.exp(splats.log_scale[3]), rel=1e-5
-    )
+    assert list(mesh.attributes[SCALE].data[3].vector) == pytest.approx(np.exp(splats.log_scale[3]), rel=1e-5)
     assert [SH.format(i) in mesh.attributes for i in range(5)] == [True, True, True, True, False]
 
 
@@ -320,7 +318,7 @@ def test_selection_greys_what_the_frame_freezes():
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
 
     def grey() -> np.ndarray:
-        return np.isclose(displayed_colors(shown), splat_nodes.FROZEN_GREY[:3]).all(1)
+        return np.isclose(displayed_colors(shown), splat_nodes.FROZEN_COLOR[:3]).all(1)
 
     bpy.context.scene.frame_set(5)
     assert 0 < selected.sum() < 1000

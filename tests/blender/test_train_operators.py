@@ -1,5 +1,5 @@
-"""Training from Blender: in its own process, in a worker's, and what the panel sees of it. Timers need a window: here
-their function is called by hand."""
+"""Training from Blender: in its own process, in a worker, and the training monitor. Timers need a window: tests call
+their function."""
 
 import sys
 import time
@@ -33,29 +33,25 @@ def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's job: the test says what it does."""
     from contextlib import ExitStack
 
-    status, job, watch = (
-        extension.stga_addon.worker.status,
-        extension.stga_addon.jobs.training_job,
-        extension.operators.monitor,
-    )
+    job, monitor = extension.stga_addon.jobs.training_job, extension.operators.monitor
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
         job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
-        watch.set_job(bpy.context.scene, run)
-        writer = stack.enter_context(status.status_writer(job.job_folder(run)))
-        writer.update(0.25, "training")
+        monitor.start_training(bpy.context.scene, run, None)
+        writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(job.job_folder(run)))
+        writer.update(0.25, "Training")
         writer.run, writer.leave = run, stack.close
         yield writer
 
 
-def tick_until(watch, done: Callable[[], bool]) -> None:
+def tick_until(monitor, done: Callable[[], bool]) -> None:
     for _ in range(200):
-        watch.tick()
+        monitor.tick()
         if done():
             return
         time.sleep(0.02)
-    raise AssertionError("waited in vain")
+    raise AssertionError("the expected state was not reached")
 
 
 @pytest.mark.slow
@@ -80,7 +76,7 @@ def test_training_in_process(extension, tmp_path, layout):
 
 
 @pytest.mark.slow
-def test_a_worker_trains_the_same(head, tmp_path):
+def test_worker_trains_the_same(head, tmp_path):
     """Catches painted groups or settings that reach the one kind of training and not the other."""
     pytest.importorskip("torch")
     chosen = {"iterations": 8, "seed": 5, "strategy": "selective"}
@@ -124,19 +120,19 @@ def test_mistakes_of_training_are_sentences(head, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_failing_worker_is_a_sentence(head, tmp_path):
+def test_failed_worker_is_a_sentence(head, tmp_path):
     """Catches a background render farm that takes a failed training for a finished one."""
     (tmp_path / "capture/transforms_train.json").write_text("{")
     with pytest.raises(RuntimeError, match=r"^Error: .*transforms_train\.json: is not valid JSON"):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=sys.executable)
 
 
-def test_a_living_worker_is_not_disturbed(worker):
-    """Catches a second worker in the same folder, and a dismissed job whose worker goes on unseen."""
+def test_running_worker_cannot_be_replaced_or_dismissed(worker):
+    """Catches a second worker in the same folder, and a dismissed training whose worker continues."""
     assert not bpy.ops.stga.train.poll()
     assert not bpy.ops.stga.dismiss_training.poll()
     assert bpy.ops.stga.cancel_training() == {"FINISHED"}
-    assert worker.update(0.5, "training")
+    assert worker.update(0.5, "Training")
     worker.leave()
     assert not bpy.ops.stga.cancel_training.poll()
     assert bpy.ops.stga.train.poll()
@@ -146,12 +142,34 @@ def test_a_living_worker_is_not_disturbed(worker):
     assert not bpy.ops.stga.dismiss_training.poll()
 
 
+def test_dismiss_removes_a_jobs_files_only(worker):
+    """Catches a Dismiss that deletes what a user put into the job's folder."""
+    (worker.folder / "notes.txt").write_text("mine")
+    worker.leave()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
+
+
+def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
+    """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no training wrote."""
+    folder = tmp_path / "documents/job"
+    folder.mkdir(parents=True)
+    names = ["job.json", "preview.npz", "selection.npz", "status.json", "worker.log"]
+    for name in names:
+        (folder / name).write_text("[]")
+    bpy.context.scene.stga.training_run = str(tmp_path / "documents")
+    extension.operators.monitor.tick()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert bpy.context.scene.stga.training_run == ""
+
+
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
     """Catches a new object for each preview, display settings that are lost, and splats whose number may not change."""
-    watch, scene = extension.operators.monitor, bpy.context.scene
+    monitor, scene = extension.operators.monitor, bpy.context.scene
     preview = worker.folder / "preview.npz"
     write_ball_avatar(preview)
-    tick_until(watch, lambda: scene.stga.splats is not None)
+    tick_until(monitor, lambda: scene.stga.splats is not None)
     shown = scene.stga.splats
     assert scene.stga.head.hide_render
     count = len(evaluated_splats(shown)[0])
@@ -162,7 +180,7 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
     fewer = type(avatar.splats)(**{name: array[keep] for name, array in vars(avatar.splats).items()})
     fewer.xyz[:] += 0.01
     extension.stga_addon.avatar.file.write_avatar(preview, type(avatar)(**{**vars(avatar), "splats": fewer}))
-    tick_until(watch, lambda: len(shown.data.vertices) == keep.sum())
+    tick_until(monitor, lambda: len(shown.data.vertices) == keep.sum())
     bpy.context.view_layer.update()
     assert len(evaluated_splats(shown)[0]) == keep.sum()
     assert len(bpy.data.objects) == objects
@@ -171,48 +189,48 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
     scene.stga.live_preview = False
     write_ball_avatar(preview)
     for _ in range(5):
-        assert watch.tick() is not None
+        assert monitor.tick() is not None
         time.sleep(0.02)
     assert len(shown.data.vertices) == keep.sum()
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_the_end_reaches_the_scene_once(extension, worker, wanted):
+def test_result_reaches_the_scene_once(extension, worker, wanted):
     """Catches a result that is not shown, shown although it is not wanted, or shown again at every reopening."""
-    watch, scene = extension.operators.monitor, bpy.context.scene
+    monitor, scene = extension.operators.monitor, bpy.context.scene
     scene.stga.show_result = wanted
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
-    tick_until(watch, lambda: scene.stga.result_shown)
+    tick_until(monitor, lambda: scene.stga.result_shown)
     assert scene.stga.avatar == str(worker.run / "avatar.npz")
     assert (scene.stga.splats is not None) == wanted
-    assert watch.tick() is None
+    assert monitor.tick() is None
     if wanted:
         bpy.data.objects.remove(scene.stga.splats)
-        assert watch.tick() is None
+        assert monitor.tick() is None
         assert scene.stga.splats is None
 
 
 def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
-    """Catches a job that a saved file forgets: its worker goes on while Blender is closed, and may end meanwhile."""
-    watch = extension.operators.monitor
+    """Catches a training that a saved file forgets: its worker continues, and may end, while Blender is closed."""
+    monitor = extension.operators.monitor
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    assert watch.tick() is None
+    assert monitor.tick() is None
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
-    assert watch.tick() is not None
+    assert monitor.tick() is not None
     assert not bpy.ops.stga.train.poll()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
-    tick_until(watch, lambda: bpy.context.scene.stga.result_shown)
+    tick_until(monitor, lambda: bpy.context.scene.stga.result_shown)
     assert bpy.context.scene.stga.splats is not None
 
 
-def test_a_blend_that_moved(extension, worker, tmp_path):
-    """Catches a job that is lost when file and run move together, and silence when the file moves alone."""
-    watch, scene = extension.operators.monitor, bpy.context.scene
+def test_moved_blend_file(extension, worker, tmp_path):
+    """Catches a training that is lost when file and run move together, and silence when the run is gone."""
+    monitor, scene = extension.operators.monitor, bpy.context.scene
     worker.leave()
     scene.stga.run_folder, scene.stga.show_result = "//run", False
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
@@ -220,36 +238,36 @@ def test_a_blend_that_moved(extension, worker, tmp_path):
     moved.mkdir()
     (tmp_path / "run").rename(moved / "run")
     bpy.ops.wm.save_as_mainfile(filepath=str(moved / "head.blend"))
-    assert watch.run_of(bpy.context.scene) == moved / "run"
-    tick_until(watch, lambda: bpy.context.scene.stga.result_shown)
+    assert monitor.training_of(bpy.context.scene).folder == moved / "run"
+    tick_until(monitor, lambda: bpy.context.scene.stga.result_shown)
     (moved / "run").rename(moved / "gone")
-    assert watch.snapshot_of(bpy.context.scene).state == "none"
-    assert watch.run_of(bpy.context.scene) == tmp_path / "run"
+    assert monitor.training_of(bpy.context.scene).snapshot.state == "none"
+    assert monitor.training_of(bpy.context.scene).folder == tmp_path / "run"
     assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
 
 
 def test_undo_does_not_lose_the_worker(extension, worker):
     """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
-    watch, scene = extension.operators.monitor, bpy.context.scene
-    watch.tick()
+    monitor, scene = extension.operators.monitor, bpy.context.scene
+    monitor.tick()
     scene.stga.training_run = ""
-    assert watch.tick() is not None
+    assert monitor.tick() is not None
     assert scene.stga.training_run == str(worker.run)
 
 
-def test_a_worker_that_died(extension, worker):
-    """Catches a progress bar that stands still for ever, and a report that says less than is known."""
-    watch = extension.operators.monitor
+def test_failed_worker_ends_the_timer(extension, worker):
+    """Catches a progress bar that never ends, and a failure without the end of the log."""
+    monitor = extension.operators.monitor
     (worker.folder / "worker.log").write_text("Killed\n")
     write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
-    last = watch.snapshot_of(bpy.context.scene)
+    last = monitor.training_of(bpy.context.scene).snapshot
     assert last.state.failed
     assert last.log_tail == ("Killed",)
-    assert watch.tick() is None
+    assert monitor.tick() is None
 
 
-def test_a_file_that_was_made_without_the_panel(extension, tmp_path):
-    """Catches a demo.blend that an artist opens to an empty panel, and a choice of theirs that is not kept."""
+def test_file_made_without_the_panel(extension, tmp_path):
+    """Catches a demo.blend that opens with an empty panel, and a chosen head that is replaced at loading."""
     folder = write_mesh_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder))
     name = bpy.context.scene.stga.head.name

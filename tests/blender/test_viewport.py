@@ -1,108 +1,201 @@
-"""The viewport's drawing thread, without a GPU."""
+"""The viewport's render thread and redraw timer, without a GPU; views as calibrated cameras."""
 
+import gc
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-pytest.importorskip("bpy")
+bpy = pytest.importorskip("bpy")
 
-from stga_addon.capture.camera import Camera
-from stga_addon.errors import StgaError
-from stga_addon.scene.render import viewport
-from stga_addon.scene.render.camera import camera_of, viewport_camera
-from stga_addon.scene.render.viewport import Sketcher, Wish
+from stga_addon.capture.camera import Camera  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene.render import redraw, viewport  # noqa: E402
+from stga_addon.scene.render.camera import camera_of, viewport_camera  # noqa: E402
+from stga_addon.scene.render.viewport import RenderRequest, ViewportRenderer  # noqa: E402
 
 CAMERA = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, np.eye(4))
 
 
-def wish(x: float = 0.0, layers=(), world=None) -> Wish:
+def request(x: float = 0.0, layers=(), background=None) -> RenderRequest:
     pose = np.eye(4)
     pose[0, 3] = x
-    return Wish(layers, replace(CAMERA, world_to_camera=pose), world)
+    return RenderRequest(layers, replace(CAMERA, world_to_camera=pose), background)
 
 
-class Sketches:
-    """A sketcher whose pictures only name what they show; each waits until it is let go."""
+class Recorder:
+    """A renderer whose images are empty; records the requests, and lets the thread go on one image per `go`."""
 
     def __init__(self, error: Exception | None = None, waits: bool = False) -> None:
-        self.painted: list[tuple[Wish, float]] = []
+        self.rendered: list[tuple[RenderRequest, float]] = []
         self.error, self.go = error, threading.Semaphore(0 if waits else 10**6)
-        self.rested = threading.Event()
-        self.sketcher = Sketcher(self.paint, lambda: None)
+        self.started = threading.Event()
+        self.renderer = ViewportRenderer(self.render)
 
-    def paint(self, wanted: Wish, share: float) -> np.ndarray:
+    def render(self, requested: RenderRequest, scale: float) -> np.ndarray:
+        self.started.set()
         self.go.acquire()
-        self.painted.append((wanted, share))
+        self.rendered.append((requested, scale))
         if self.error:
             raise self.error
-        return np.zeros((round(600 * share), round(800 * share), 4), np.float32)
+        return np.zeros((round(600 * scale), round(800 * scale), 4), np.float32)
 
-    def rest(self) -> None:
-        for _ in range(500):
-            if not self.sketcher._busy:
-                return
-            time.sleep(0.01)
-        raise AssertionError("the thread never came to rest")
-
-
-def test_a_resting_view_gets_the_full_picture():
-    """Catches a view that stays coarse, and one that is drawn again and again."""
-    seen = Sketches()
-    asked = wish()
-    seen.sketcher.ask(asked)
-    seen.rest()
-    shares = [share for _, share in seen.painted]
-    assert shares[0] < 1
-    assert shares[-1] == 1
-    assert seen.sketcher.picture is not None
-    assert seen.sketcher.picture.shape == (600, 800, 4)
-    seen.sketcher.ask(wish(layers=asked.layers))
-    seen.rest()
-    assert len(seen.painted) == len(shares)
+    def wait_for(self, images: int) -> None:
+        deadline = time.monotonic() + 5
+        while len(self.rendered) < images:
+            assert time.monotonic() < deadline, "the thread renders nothing"
+            time.sleep(0.001)
 
 
-def test_a_moving_view_gets_the_newest_picture():
-    """Catches a queue: views that have passed by must not be drawn."""
-    seen = Sketches(waits=True)
+class Engine:
+    """Records from which threads it was asked to redraw."""
+
+    def __init__(self, freed: bool = False) -> None:
+        self.threads: list[threading.Thread] = []
+        self.freed = freed
+
+    def tag_redraw(self) -> None:
+        if self.freed:
+            raise ReferenceError("StructRNA of type STGA_SPLATS has been removed")
+        self.threads.append(threading.current_thread())
+
+
+@pytest.fixture(autouse=True)
+def _stopped_timer() -> Iterator[None]:
+    yield
+    redraw.stop()
+
+
+def test_a_resting_view_is_rendered_at_full_resolution():
+    """Catches a view that stays coarse, and one that is rendered again and again."""
+    recorder = Recorder()
+    first = request()
+    assert recorder.renderer.request(first)
+    recorder.renderer.join()
+    scales = [scale for _, scale in recorder.rendered]
+    assert scales[0] < 1
+    assert scales[-1] == 1
+    assert recorder.renderer.image is not None
+    assert recorder.renderer.image.shape == (600, 800, 4)
+    assert not recorder.renderer.request(request(layers=first.layers))
+    assert not recorder.renderer.is_busy()
+    assert len(recorder.rendered) == len(scales)
+
+
+def test_a_moving_view_is_rendered_from_its_latest_request():
+    """Catches a queue: views that have passed by must not be rendered."""
+    recorder = Recorder(waits=True)
     for x in range(20):
-        seen.sketcher.ask(wish(float(x)))
-    seen.go.release(10**6)
-    seen.rest()
-    assert len(seen.painted) <= 4
-    last, share = seen.painted[-1]
-    assert (last.camera.world_to_camera[0, 3], share) == (19, 1)
+        recorder.renderer.request(request(float(x)))
+    recorder.go.release(10**6)
+    recorder.renderer.join()
+    assert len(recorder.rendered) <= 4
+    last, scale = recorder.rendered[-1]
+    assert (last.camera.world_to_camera[0, 3], scale) == (19, 1)
 
 
-def test_slow_pictures_get_coarser(monkeypatch):
+def test_slow_images_get_coarser(monkeypatch):
     """Catches a viewport that stutters on a slow machine."""
-    monkeypatch.setattr(viewport, "PATIENCE_S", 1e-9)
-    seen = Sketches()
+    monkeypatch.setattr(viewport, "MAX_RENDER_TIME_S", 1e-9)
+    recorder = Recorder()
     for x in range(12):
-        seen.sketcher.ask(wish(float(x)))
-        seen.rest()
-    coarse = [share for _, share in seen.painted if share < 1]
-    assert coarse[-1] == viewport.COARSEST < coarse[0]
+        recorder.renderer.request(request(float(x)))
+        recorder.renderer.join()
+    coarse = [scale for _, scale in recorder.rendered if scale < 1]
+    assert coarse[-1] == viewport.MIN_SCALE < coarse[0]
 
 
 @pytest.mark.parametrize("error", [StgaError("no head"), ValueError("no head")])
-def test_mishaps_are_said(error):
-    """Catches a thread that dies silently, and one that tries for ever."""
-    seen = Sketches(error)
-    seen.sketcher.ask(wish())
-    seen.rest()
-    assert "no head" in seen.sketcher.error
-    assert len(seen.painted) == 1
-    seen.error = None
-    seen.sketcher.ask(wish(1.0))
-    seen.rest()
-    assert seen.sketcher.error == ""
+def test_failures_are_reported(error):
+    """Catches a thread that ends without a message, and one that retries forever."""
+    recorder = Recorder(error)
+    recorder.renderer.request(request())
+    recorder.renderer.join()
+    assert "no head" in recorder.renderer.error
+    assert len(recorder.rendered) == 1
+    recorder.error = None
+    recorder.renderer.request(request(1.0))
+    recorder.renderer.join()
+    assert recorder.renderer.error == ""
 
 
-def test_orthographic_views_are_seen_from_afar():
-    """Catches views of the numpad that show something else than Blender's grid: points fall where it draws them."""
+def poll_until_idle() -> None:
+    """Call the timer's function as Blender's main loop would."""
+    for _ in range(1000):
+        if redraw._poll() is None:
+            return
+        time.sleep(0.005)
+    raise AssertionError("the timer never ends")
+
+
+def test_viewports_are_redrawn_from_the_main_thread():
+    """Catches bpy called from the render thread, a last image that is never shown, and a timer that runs when idle."""
+    recorder, engine = Recorder(waits=True), Engine()
+    recorder.renderer.request(request())
+    redraw.redraw_when_rendered(recorder.renderer, engine)
+    assert bpy.app.timers.is_registered(redraw._poll)
+    assert redraw._poll() == redraw.POLL_INTERVAL_S
+    assert engine.threads == []  # nothing was rendered yet
+    for images in (1, 2):  # a coarse one, then the full one
+        recorder.go.release()
+        recorder.wait_for(images)
+        while not recorder.renderer._has_update:
+            time.sleep(0.001)
+        redraw._poll()
+        assert engine.threads == [threading.main_thread()] * images
+    poll_until_idle()
+    assert len(engine.threads) == 2
+    assert redraw._active == {}
+
+
+@pytest.mark.parametrize("freed", [False, True])
+def test_a_closed_viewport_ends_its_thread(freed):
+    """Catches a thread that refines a view nobody sees, an engine kept alive by the timer, and a timer that fails."""
+    recorder, engine = Recorder(waits=True), Engine(freed)
+    recorder.renderer.request(request())
+    recorder.started.wait()
+    redraw.redraw_when_rendered(recorder.renderer, engine)
+    if not freed:  # else Blender's part of it is gone while Python still holds its own
+        del engine
+        gc.collect()
+        redraw._poll()
+    recorder.go.release()
+    recorder.wait_for(1)
+    if freed:
+        while not recorder.renderer._has_update:
+            time.sleep(0.001)
+        redraw._poll()
+        recorder.go.release()
+    recorder.renderer.join()
+    assert recorder.rendered[-1][1] < 1 or freed
+    assert redraw._poll() is None
+
+
+def test_stopping_ends_timer_and_threads():
+    """Catches an extension that still renders, or calls its timer, after it was disabled."""
+    recorder, engine = Recorder(waits=True), Engine()
+    recorder.renderer.request(request())
+    recorder.started.wait()
+    redraw.redraw_when_rendered(recorder.renderer, engine)
+
+    def finish_image_once_cancelled() -> None:
+        while recorder.renderer._request is not None:
+            time.sleep(0.001)
+        recorder.go.release(10**6)
+
+    threading.Thread(target=finish_image_once_cancelled).start()
+    redraw.stop()
+    assert not bpy.app.timers.is_registered(redraw._poll)
+    assert not recorder.renderer.is_busy()
+    assert len(recorder.rendered) == 1
+    assert engine.threads == []
+
+
+def test_orthographic_views():
+    """Catches an orthographic view whose points fall elsewhere than where Blender draws them."""
     from mathutils import Matrix
 
     class Region:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from stga_addon.effects import rules
-from stga_addon.effects.evidence import calm, fit_cameras
+from stga_addon.effects.evidence import fit_cameras, stable_colors
 from stga_addon.effects.facts import CaptureFacts
 from stga_addon.effects.plan import plan_effects
-from stga_addon.effects.samples import MOST_VIEWS, sample_views, take_samples
+from stga_addon.effects.samples import MAX_VIEWS, sample_views, take_samples
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.training.effect_plan import EFFECTS, parse_choices
@@ -76,7 +76,7 @@ def test_one_camera(painted):
     plan, settings = planned(painted(cameras=1, paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density"}
     for name in ("view-color", "exposure", "hull-points"):
-        with pytest.raises(StgaError, match=f"--effect {name}=on: cannot be, because one camera"):
+        with pytest.raises(StgaError, match=f"--effect {name}=on: cannot be, because a single camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
     assert settings.sh_steps == ()
 
@@ -106,7 +106,7 @@ def test_background(painted):
 def test_a_room_behind_the_head(painted):
     """Catches a background of many colours that is exchanged as if it had one."""
     facts = CaptureFacts(painted(), make_settings(iterations=1))
-    facts.samples = replace(facts.samples, unevenness=np.full(len(facts.samples.camera), 40.0))
+    facts.samples = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
     verdict = rules.background(facts)
     assert (verdict.on, verdict.only) == (False, True)
 
@@ -163,7 +163,7 @@ def with_frames(*frames):
     """Facts of a FLAME capture that has these frames and no teeth."""
     model = SimpleNamespace(v_template=np.zeros((10, 3)))
     flame = SimpleNamespace(timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model)
-    capture = SimpleNamespace(views={"train": ()}, flame=flame)
+    capture = SimpleNamespace(views={"train": ()}, flame=flame, timesteps=flame.timesteps)
     return CaptureFacts(capture, make_settings(iterations=1))
 
 
@@ -286,7 +286,7 @@ def test_views_are_spread():
     """Catches cameras or timesteps that are left out of a long sequence, and more views than there is time for."""
     views = [SimpleNamespace(timestep=t, camera_index=c) for t in range(500) for c in range(16)]
     chosen = sample_views(views)
-    assert len(chosen) == MOST_VIEWS == len({(view.timestep, view.camera_index) for view in chosen})
+    assert len(chosen) == MAX_VIEWS == len({(view.timestep, view.camera_index) for view in chosen})
     counts = np.bincount([view.camera_index for view in chosen], minlength=16)
     assert counts.max() - counts.min() <= 1
     assert {view.timestep for view in chosen} >= {0, 499}
@@ -297,5 +297,5 @@ def test_views_are_spread():
 def test_two_cameras_that_are_alike(painted):
     """Catches a fit that explains noise by cameras."""
     samples = take_samples(painted())
-    found = fit_cameras(samples, calm(samples.color.astype(float)))
+    found = fit_cameras(samples, stable_colors(samples.color.astype(float)))
     assert abs(found.gain * 120 + found.offset - 120).max() < 1.5

@@ -1,5 +1,6 @@
 """Reading FLAME model files: every pickle dialect they come in, and everything that must be refused."""
 
+import codecs
 import io
 import os
 import pickle
@@ -17,7 +18,7 @@ import scipy.sparse
 from stga_addon.errors import StgaError
 from stga_addon.flame.masks import key_regions
 from stga_addon.flame.model import read_flame
-from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.flame.unpickle import _RestrictedUnpickler, read_pickled_arrays
 
 from .conftest import random_arrays
 
@@ -265,3 +266,18 @@ def test_missing_file(tmp_path: Path) -> None:
     for name in ("none.npz", "none.pkl"):
         with pytest.raises(StgaError, match=name):
             read_flame(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "name", ["_codecs\nencode", "copy_reg\n_reconstructor", "numpy.core.multiarray\n_reconstruct", "__builtin__\nset"]
+)
+@pytest.mark.parametrize("state", [b"}S'left'\nI1\ns", b"N}S'_call'\nI1\ns\x86"])
+def test_functions_cannot_be_changed(tmp_path: Path, name: str, state: bytes) -> None:
+    """Catches a pickle that sets attributes of a function by BUILD, which would outlive its reading."""
+    path = tmp_path / "model.pkl"
+    path.write_bytes(b"\x80\x02c" + name.encode() + b"\n" + state + b"b.")
+    with pytest.raises(StgaError, match="sets attributes of a function"):
+        read_pickled_arrays(path)
+    for method in (vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild", "array_shell", "collect")):
+        assert vars(method) == {}
+    assert not hasattr(codecs.encode, "left")

@@ -244,6 +244,8 @@ def generate_arguments(rng: random.Random, case: Path) -> tuple[list[str], dict[
         variables["STGA_HEAD"] = rng.choice([str(case / "head")] * 3 + [str(case), "a" * 5000, ".", str(case / "none")])
     if rng.random() < 0.05:
         variables["STGA_LPIPS"] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
+    if rng.random() < 0.05:
+        variables["STGA_PYTHON"] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
     variables = {name: value.encode("utf-8", "replace").decode() for name, value in variables.items()}
     return arguments, variables
 
@@ -350,6 +352,11 @@ def demo(rng: random.Random, case: Path) -> list[str]:
     return [*option(rng, 0.5, "--budget", *NUMBERS), *option(rng, 0.5, "--out", some_path(rng, case))]
 
 
+def environment(rng: random.Random, case: Path) -> list[str]:
+    action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
+    return ["--folder", some_path(rng, case, "new"), *action]
+
+
 COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
     "info": (3, info),
     "select": (3, select),
@@ -361,6 +368,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
     "demo": (0.2, demo),
+    "environment": (0.2, environment),
     "x": (0.1, lambda rng, case: []),
 }
 
@@ -390,10 +398,10 @@ def mutate_bytes(rng: random.Random, path: Path) -> str:
 
 def mutate_json(rng: random.Random, path: Path) -> str:
     """Replace, delete, add or copy one value, at any depth."""
-    lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
     try:
-        document = [json.loads(line) for line in lines]
-    except ValueError:  # an earlier damage
+        text = path.read_text(encoding="utf-8")
+        document = [json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])]
+    except (ValueError, RecursionError):  # an earlier damage
         return mutate_bytes(rng, path)
     node: Any = document
     trail: list[Any] = []

@@ -1,4 +1,4 @@
-"""Runs inside a Blender with a window, started by test_scenario.py: trains as a person would, and mistreats the worker.
+"""Runs inside a Blender with a window, started by test_scenario.py: trains as a user would, and kills the worker.
 
 `blender [FILE] --python scenario.py -- PART RESULT CAPTURE BLEND PYTHON`: PART is the name of a function below, RESULT
 the JSON file that says what was seen.
@@ -22,7 +22,7 @@ STEP_S, PATIENCE_S = 0.1, 180.0
 seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-watch = sys.modules[f"{extension}.operators.monitor"]
+monitor = sys.modules[f"{extension}.operators.monitor"]
 environment_folder = sys.modules[f"{extension}.operators.environment"].environment_folder
 status_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].status_folder
 lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
@@ -47,11 +47,11 @@ def chosen() -> Any:
 
 
 def state() -> str:
-    return str(watch.snapshot_of(bpy.context.scene).state)
+    return str(monitor.training_of(bpy.context.scene).snapshot.state)
 
 
 def figures() -> dict[str, float]:
-    return dict(watch.snapshot_of(bpy.context.scene).status.figures)
+    return dict(monitor.training_of(bpy.context.scene).snapshot.status.figures)
 
 
 def is_training() -> bool:
@@ -63,7 +63,7 @@ def splats() -> int:
 
 
 def job_folder() -> Path:
-    return watch.job_folder(watch.run_of(bpy.context.scene))
+    return monitor.job_folder(monitor.training_of(bpy.context.scene).folder)
 
 
 def first() -> Iterator[Callable[[], bool]]:
@@ -72,8 +72,8 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_environment()
     environment = status_folder(environment_folder())
-    yield lambda: not watch.snapshot(environment).state.is_alive
-    seen["environment"] = watch.snapshot(environment).status.message or watch.snapshot(environment).status.error
+    yield lambda: not monitor.snapshot(environment).state.is_alive
+    seen["environment"] = monitor.snapshot(environment).status.message or monitor.snapshot(environment).status.error
     with in_window():
         bpy.ops.stga.import_capture(directory=CAPTURE)
     yield looks_at_head
@@ -95,7 +95,7 @@ def first() -> Iterator[Callable[[], bool]]:
     seen["resumed at"] = figures()["iteration"]
     os.kill(lock_owner(job_folder() / "worker.lock"), signal.SIGKILL)
     yield lambda: state() == "lost"
-    seen["lost"] = watch.snapshot_of(bpy.context.scene).status.error
+    seen["lost"] = monitor.training_of(bpy.context.scene).snapshot.status.error
     bpy.ops.stga.copy_report()
     seen["clipboard"] = bpy.context.window_manager.clipboard
 
@@ -184,7 +184,7 @@ class Player:
         return None
 
 
-bpy.app.timers.unregister(watch.tick) if bpy.app.timers.is_registered(watch.tick) else None
-watch.tick, watch._push_undo = timed("tick", watch.tick), timed("undo step", watch._push_undo)
-watch.follow()
+bpy.app.timers.unregister(monitor.tick) if bpy.app.timers.is_registered(monitor.tick) else None
+monitor.tick, monitor._push_undo = timed("tick", monitor.tick), timed("undo step", monitor._push_undo)
+monitor._start_timer()
 bpy.app.timers.register(Player({"first": first, "second": second}[PART]()), first_interval=1.0, persistent=True)

@@ -15,7 +15,7 @@ from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
 from stga_addon.flame.forward_torch import flame_forward as torch_forward
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.raster.cpu.layout import Parameters
 
 from .meshes import DEGENERATE, WHOLE, mesh_of
 from .scenes import NAMES, random_cotangents

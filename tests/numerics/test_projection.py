@@ -11,7 +11,8 @@ from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera, render_forward
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 
 from .scenes import (
     NAMES,
@@ -174,7 +175,7 @@ def test_a_broken_splat_is_dropped_and_counted(name: str) -> None:
         assert not gradients[parameter][3].any(), parameter
     splats = Parameters(*(scene.splats[n] for n in NAMES))
     rendering = render_forward(splats, np.zeros(20, np.int32), frames_in_camera(WORLD, scene.camera), 1)
-    np.testing.assert_array_equal(np.flatnonzero(rendering.rect[:, 0] < 0), [3])
+    np.testing.assert_array_equal(np.flatnonzero(rendering.projection.rect[:, 0] < 0), [3])
 
 
 def test_one_nan_component_of_a_quaternion_is_enough() -> None:

@@ -8,8 +8,9 @@ from training.toys import bits, random_splats
 
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
+from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit
-from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera, render_backward, render_forward
+from stga_addon.raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
 from stga_addon.training.optimize.state import new_state

@@ -7,7 +7,7 @@ import torch
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.raster.cpu.layout import Parameters
 
 TOLERANCE = 2e-5  # gsplat computes in float32
 

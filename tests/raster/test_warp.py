@@ -32,8 +32,9 @@ from stga_addon.avatar.strain import strain_basis
 from stga_addon.raster import reference
 from stga_addon.raster.cpu import autograd as cpu
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX, change_background
+from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import adam_rows
-from stga_addon.raster.cpu.rasterize import Parameters, frames_in_camera
+from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.gpu import blend, embed, image_loss, optimizer, self_test
 from stga_addon.raster.gpu.autograd import render_differentiable, shared
 from stga_addon.raster.gpu.rasterize import DeviceFrames, Rasterizer, device_camera

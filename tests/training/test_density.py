@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.optimize.density import MIN_OPACITY, control_density
 from stga_addon.training.optimize.state import TrainState, keep_rows, new_state, tensors_of
 

@@ -65,10 +65,10 @@ def test_training_compiles_nothing_new(tmp_path: Path, transparent: bool) -> Non
 
 COLD = """
 import json
-from stga_addon.raster.cpu import image_loss, project, rows
+from stga_addon.raster.cpu import image_loss, optimizer, project
 from stga_addon.training.optimize.precompile import precompile_kernels
 precompile_kernels()
-kernels = [kernel.__wrapped__ for kernel in (project.project_backward, image_loss.image_loss, rows.adam_rows)]
+kernels = [kernel.__wrapped__ for kernel in (project.project_backward, image_loss.image_loss, optimizer.adam_rows)]
 print(json.dumps([[sum(kernel.stats.cache_hits.values()), len(kernel.signatures)] for kernel in kernels]))
 """
 

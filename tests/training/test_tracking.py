@@ -17,12 +17,13 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.sequence import read_motion, sequence_mesh
-from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.tracking import Tracking, frame_gradient, refinable_tracking, with_refined_tracking
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.run.folder import Run, read_checkpoint, read_run
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.schedule import view_order

@@ -1,7 +1,7 @@
-"""A small multi-view capture of the synthetic head, path-traced in Blender.
+"""Synthetic capture: a multi-view capture of the synthetic head, path-traced in Blender.
 
-Laid out as VHAP and GaussianAvatars lay theirs out. The pictures show a denser head than the tracked one, with
-texture, hair strands, teeth and eyes that are in no tracked mesh, so that nothing trained on them is its own judge.
+The layout is that of VHAP and GaussianAvatars. The pictures show a denser head than the tracked mesh, with texture,
+hair strands, teeth and eyes that the tracked mesh lacks, as in a real capture.
 """
 
 import math
@@ -16,14 +16,16 @@ from ...capture.camera import Camera, camera_from_gl
 from ...errors import StgaError
 from ...files import replacing, write_json, write_npz
 from ...flame.forward import FlameFrame, flame_forward, neutral_frame
-from .head import EXPRESSIONS, Head, hair_offset, synthetic_head, write_flame
+from .blend_shapes import EXPRESSIONS
+from .head import Head, synthetic_head, write_flame
 from .paint import paint
+from .skin import hair_offset
 
 DENSITY = 4  # rows and columns of the pictured head for each of the tracked one
-STRANDS = 0.0012  # metres of relief in the hair that the tracker does not see
+STRANDS = 0.0012  # meters of relief in the hair that the tracker does not see
 DISTANCE, AIM = 1.05, np.array([0.0, -0.012, -0.010])
 FOCAL = 3.7  # image widths
-OFF_CENTRE = np.array([0.031, -0.022])  # principal point off the image centre, in image widths
+OFF_CENTER = np.array([0.031, -0.022])  # principal point off the image center, in image widths
 
 # Strong actions, so that every region moves somewhere in training; the jaw's opening is in radians.
 TRAIN_ACTIONS: tuple[dict[str, float], ...] = (
@@ -46,7 +48,7 @@ TEST_ACTIONS: tuple[dict[str, float], ...] = (
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Size of a made capture.
+    """Size of a synthetic capture.
 
     train, test   timesteps to train on, and timesteps of unseen expressions
     cameras       of which the middle one is held out as `val`
@@ -68,7 +70,7 @@ def make_capture(
     options: CaptureOptions | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
-    """Write a capture of the synthetic person `seed` to `folder` and return its model file, `flame_model.npz` there.
+    """Write a capture of the synthetic person `seed` into `folder`; returns its FLAME model file.
 
     Needs Blender's bpy; `progress(done, total)` is called after each image. The same seed and options give the same
     cameras, parameters and meshes. Raises StgaError where the folder cannot be written or the sizes make no sense.
@@ -76,7 +78,7 @@ def make_capture(
     options = options or CaptureOptions()
     if min(options.train, options.test) < 1 or options.cameras < 2 or min(options.width, options.height) < 16:
         raise StgaError(f"demo capture: {options} is too small, expected 1 + 1 timesteps, 2 cameras and 16 pixels")
-    from .studio import Sitter, photograph
+    from .studio import StudioHead, render_poses
 
     folder = Path(folder)
     rng = np.random.default_rng([seed, 2])
@@ -88,7 +90,7 @@ def make_capture(
     write_flame(tracked.model, model_file)
     _write_parameters(folder, tracked, shape, frames)
 
-    sitter = Sitter(pictured.model.faces, pictured.rest, *paint(pictured, seed))
+    subject = StudioHead(pictured.model.faces, pictured.rest, *paint(pictured, seed))
     offset = hair_offset(pictured.rest) * _strands(pictured.rest)[:, None]
     poses = [flame_forward(pictured.model, shape, frame, offset) for frame in frames]
     total = len(frames) * len(cameras)
@@ -97,8 +99,8 @@ def make_capture(
         _write_image(folder, timestep, camera, rgba)
         progress(timestep * len(cameras) + camera + 1, total)
 
-    photograph(sitter, poses, cameras, keep, options.samples, seed)
-    _write_transforms(folder, cameras, options)  # last: a capture without them is not taken for a whole one
+    render_poses(subject, poses, cameras, keep, options.samples, seed)
+    _write_transforms(folder, cameras, options)  # last, so that an interrupted capture is not opened
     return model_file
 
 
@@ -124,9 +126,9 @@ def _frames(options: CaptureOptions, rng: np.random.Generator) -> list[FlameFram
 
 
 def _cameras(options: CaptureOptions) -> list[Camera]:
-    """An arc in front of the head, alternately from below and above, all off-centre by `OFF_CENTRE`."""
+    """An arc in front of the head, alternately from below and above, all off-center by `OFF_CENTER`."""
     width, height = options.width, options.height
-    cx, cy = np.array([width, height]) / 2 + OFF_CENTRE * width
+    cx, cy = np.array([width, height]) / 2 + OFF_CENTER * width
     cameras = []
     for index, azimuth in enumerate(np.radians(np.linspace(-62, 62, options.cameras))):
         elevation = math.radians((-9, 15)[index % 2])

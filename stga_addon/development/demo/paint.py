@@ -1,16 +1,18 @@
-"""What the synthetic head looks like: colours by place on the face, so that they fit it at any density."""
+"""Vertex colors of the synthetic head, as functions of position."""
 
 import numpy as np
 
-from .head import EYE, EYE_RADIUS, MOUTH, PARTS, Head, above_hairline
+from .head import Head
+from .head_mesh import PARTS
+from .skin import EYE, EYE_RADIUS, MOUTH, above_hairline
 
-SKIN = np.array([0.56, 0.33, 0.235])  # linear RGB, as all colours here
+SKIN = np.array([0.56, 0.33, 0.235])  # linear RGB, as all colors here
 LIPS = np.array([0.40, 0.115, 0.100])
 HAIR = np.array([0.035, 0.020, 0.012])
 GUMS = np.array([0.22, 0.035, 0.035])
 TEETH = np.array([0.80, 0.74, 0.62])
 IRISES = np.array([[0.10, 0.20, 0.30], [0.12, 0.20, 0.09], [0.13, 0.055, 0.02]])
-LIMBUS, PUPIL = 0.0061, 0.0026  # radii of iris and pupil, metres
+LIMBUS, PUPIL = 0.0061, 0.0026  # radii of iris and pupil, meters
 
 
 def paint(head: Head, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -28,12 +30,12 @@ def paint(head: Head, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return tint, roughness, np.where(shiny | part["mouth"], 0.0, 1.0)
 
 
-def _mix(tint: np.ndarray, colour: np.ndarray, amount: np.ndarray) -> np.ndarray:
-    return np.asarray(tint + np.clip(amount, 0, 1)[:, None] * (colour - tint))
+def _mix(tint: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarray:
+    return np.asarray(tint + np.clip(amount, 0, 1)[:, None] * (color - tint))
 
 
-def _spot(at: np.ndarray, centre: tuple[float, float], size: tuple[float, float]) -> np.ndarray:
-    return np.asarray(np.exp(-(((abs(at[:, 0]) - centre[0]) / size[0]) ** 2) - ((at[:, 1] - centre[1]) / size[1]) ** 2))
+def _spot(at: np.ndarray, center: tuple[float, float], size: tuple[float, float]) -> np.ndarray:
+    return np.asarray(np.exp(-(((abs(at[:, 0]) - center[0]) / size[0]) ** 2) - ((at[:, 1] - center[1]) / size[1]) ** 2))
 
 
 def _skin(at: np.ndarray, skin: np.ndarray, hair: np.ndarray, rng: np.random.Generator) -> np.ndarray:

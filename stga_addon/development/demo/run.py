@@ -1,4 +1,4 @@
-"""The whole chain on a synthetic capture: what a new user sees first, and what proves that everything works."""
+"""Demo: make a synthetic capture, train an avatar on it, show it in Blender and compare the pictures."""
 
 from pathlib import Path
 from time import perf_counter
@@ -26,19 +26,19 @@ from .capture import CaptureOptions, make_capture
 from .pictures import selection_picture, side_by_side
 
 SEED = 0
-TOLERANCE = 1e-5
-"""Metres between where Blender puts a splat and where numpy does."""
+MAX_POSITION_ERROR_M = 1e-5
+"""Largest distance between a splat in Blender and in numpy."""
 
 
 def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -> None:
-    """Make a capture of a synthetic head, import, select, train and show it in Blender, and picture the result.
+    """Make a capture of a synthetic head, import it into Blender, select, train, and show the avatar.
 
     Leaves avatar.npz, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's bpy.
-    Raises StgaError where the folder cannot be written or Blender's splats do not stand where they should.
+    Raises StgaError where the folder cannot be written or Blender places a splat elsewhere than numpy does.
     """
     begin = perf_counter()
     folder = out / "capture"
-    with tqdm(desc="path-tracing the capture", unit="image") as bar:
+    with tqdm(desc="Rendering the capture", unit="image") as bar:
         model = make_capture(folder, SEED, options, progress=lambda done, total: _advance(bar, done, total))
     capture = open_capture(folder, model)
     head, selection = _import_and_select(capture)
@@ -59,7 +59,7 @@ def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
 
 
 def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
-    """A Blender scene with head, cameras and one vertex group a frame; the selection as Blender gives it back."""
+    """Make a Blender scene with head, cameras and a vertex group per frame; returns head and selection read back."""
     from ...scene.blend_file import current_scene, new_file
     from ...scene.cameras import configure_scene, import_cameras
     from ...scene.objects import capture_root
@@ -75,12 +75,12 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 
 
 def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
-    # What was pictured is what the files say, and Blender shows the head as they do.
+    # The tracking of a synthetic capture is exact, and Blender shows it unrefined.
     settings = make_settings(seconds=seconds, seed=SEED, effects={"tracking": "off"})
     run = with_effect_plan(Run(capture.root, model.resolve(), "vhap", settings), capture)
     folder = out / "run"
     if (folder / "run.json").exists():
-        (folder / "run.json").unlink()  # the demo always starts anew
+        (folder / "run.json").unlink()  # the demo always starts a new run
     with ProgressBar() as bar:
         path = train(capture, folder, run, selection, report=bar.report)
     avatar = read_avatar(path)
@@ -90,7 +90,7 @@ def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: 
 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
-    """Show the avatar, save, reopen, and return how far (metres) a splat is from where numpy puts it, at worst."""
+    """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat from numpy's."""
     from ...scene.blend_file import current_scene, look_through_camera, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats, hide_object, show_avatar
     from ...scene.timeline import go_to_frame
@@ -108,14 +108,16 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
         frames = avatar.frames(capture.mesh(timestep))
         expected = to_world(avatar.splats, frames).xyz
         worst = max(worst, float(np.abs(evaluated_splats(object_named(name))[0] - expected).max()))
-    if worst > TOLERANCE:
-        raise StgaError(f"{path}: a splat stands {worst:.1e} m from where it should, more than {TOLERANCE:g} m")
+    if worst > MAX_POSITION_ERROR_M:
+        raise StgaError(
+            f"{path}: a splat is {worst:.1e} m from its position in numpy, more than {MAX_POSITION_ERROR_M:g} m"
+        )
     return worst
 
 
 def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], out: Path) -> None:
-    """comparison.png: ground truth beside rendering, of a held-out view and of an unseen expression; selection.png:
-    the held-out view of the frame that selects most."""
+    """Write comparison.png (ground truth and rendering of a held-out view and of an unseen expression) and
+    selection.png (the held-out view of the frame that selects most)."""
     pictures = []
     for view in (capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]):
         image = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)

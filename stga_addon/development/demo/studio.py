@@ -1,4 +1,4 @@
-"""A photo studio in Blender: path-traced pictures of a moving mesh from calibrated cameras."""
+"""Path-traced pictures of an animated mesh from calibrated cameras, rendered by Cycles."""
 
 import os
 import sys
@@ -15,15 +15,15 @@ from mathutils import Matrix
 from ...capture.camera import Camera
 
 SENSOR_MM = 36.0
-# Soft boxes around the sitter: azimuth and elevation in degrees (0, 0 is straight ahead), watts.
+# Soft boxes around the head: azimuth and elevation in degrees (0, 0 is straight ahead), watts.
 SOFT_BOXES = ((-50, 32, 8.0), (48, 36, 6.0), (0, -20, 2.0))
-BOX_DISTANCE, BOX_SIZE = 1.2, 0.6  # metres
+BOX_DISTANCE, BOX_SIZE = 1.2, 0.6  # meters
 AMBIENT = 0.5
 
 
 @dataclass(frozen=True)
-class Sitter:
-    """What stands in the studio.
+class StudioHead:
+    """The mesh to render.
 
     faces (F, 3); rest (V, 3) positions the skin's fine texture is attached to; tint (V, 3) linear RGB;
     roughness and grain (V,): grain is how much fine texture shows, 0 to 1.
@@ -36,8 +36,8 @@ class Sitter:
     grain: np.ndarray
 
 
-def photograph(
-    sitter: Sitter,
+def render_poses(
+    subject: StudioHead,
     poses: Sequence[np.ndarray],
     cameras: Sequence[Camera],
     keep: Callable[[int, int, np.ndarray], None],
@@ -49,7 +49,7 @@ def photograph(
     `keep(pose, camera, rgba)` gets each picture: (H, W, 4) uint8, sRGB, straight alpha. Works in a scene of its own
     with Cycles on the CPU and leaves the open file as it was. All cameras share one size.
     """
-    with _studio(sitter, samples, seed) as (scene, head, camera), TemporaryDirectory() as folder:
+    with _studio(subject, samples, seed) as (scene, head, camera), TemporaryDirectory() as folder:
         for index, vertices in enumerate(poses):
             head.data.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
             head.data.update()
@@ -81,7 +81,7 @@ def _render(scene: bpy.types.Scene, path: Path) -> np.ndarray:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Blender announces every saved picture on the process's standard output, in between our own progress bar."""
+    """Hide what Blender prints on standard output for every saved picture, which would break the progress bar."""
     sys.stdout.flush()
     kept = os.dup(1)
     try:
@@ -95,16 +95,16 @@ def _silent() -> Iterator[None]:
 
 @contextmanager
 def _studio(
-    sitter: Sitter, samples: int, seed: int
+    subject: StudioHead, samples: int, seed: int
 ) -> Iterator[tuple[bpy.types.Scene, bpy.types.Object, bpy.types.Object]]:
-    """A scene with the sitter and a camera; everything made for it is gone when the block ends."""
+    """A scene with the head and a camera, removed with all its data when the block ends."""
     kinds = ("scenes", "worlds", "lights", "cameras", "meshes", "materials", "objects")
     before = {kind: set(getattr(bpy.data, kind)) for kind in kinds}
     try:
         scene = _scene(samples, seed)
         for azimuth, elevation, watts in SOFT_BOXES:
             _soft_box(scene, azimuth, elevation, watts)
-        head = _head(scene, sitter)
+        head = _head(scene, subject)
         camera = bpy.data.objects.new("studio camera", bpy.data.cameras.new("studio camera"))
         scene.collection.objects.link(camera)
         scene.camera = camera
@@ -143,32 +143,32 @@ def _soft_box(scene: bpy.types.Scene, azimuth: float, elevation: float, watts: f
     light.energy, light.size = watts, BOX_SIZE
     box = bpy.data.objects.new("soft box", light)
     scene.collection.objects.link(box)
-    # A light shines along its own -z: turn +z to look from the sitter at the box, then step back along it.
+    # A light shines along its own -z: turn +z to look from the subject at the box, then step back along it.
     turn = Matrix.Rotation(np.radians(azimuth), 4, "Y") @ Matrix.Rotation(np.radians(-elevation), 4, "X")
     box.matrix_world = turn @ Matrix.Translation((0, 0, BOX_DISTANCE))
 
 
-def _head(scene: bpy.types.Scene, sitter: Sitter) -> bpy.types.Object:
-    mesh = bpy.data.meshes.new("sitter")
-    mesh.from_pydata(sitter.rest.tolist(), [], sitter.faces.tolist())
-    mesh.polygons.foreach_set("use_smooth", np.ones(len(sitter.faces), bool))
+def _head(scene: bpy.types.Scene, subject: StudioHead) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new("subject")
+    mesh.from_pydata(subject.rest.tolist(), [], subject.faces.tolist())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(subject.faces), bool))
     for name, kind, key, values in (
-        ("rest", "FLOAT_VECTOR", "vector", sitter.rest),
-        ("tint", "FLOAT_VECTOR", "vector", sitter.tint),
-        ("roughness", "FLOAT", "value", sitter.roughness),
-        ("grain", "FLOAT", "value", sitter.grain),
+        ("rest", "FLOAT_VECTOR", "vector", subject.rest),
+        ("tint", "FLOAT_VECTOR", "vector", subject.tint),
+        ("roughness", "FLOAT", "value", subject.roughness),
+        ("grain", "FLOAT", "value", subject.grain),
     ):
         attribute = mesh.attributes.new(name, kind, "POINT")
         attribute.data.foreach_set(key, np.ascontiguousarray(values, np.float32).ravel())
     mesh.materials.append(_surface())
-    head = bpy.data.objects.new("sitter", mesh)
+    head = bpy.data.objects.new("subject", mesh)
     scene.collection.objects.link(head)
     return head
 
 
 def _surface() -> bpy.types.Material:
     """Tint times fine noise, and pores as bumps, both fixed to the rest position and faded by `grain`."""
-    material = bpy.data.materials.new("sitter")
+    material = bpy.data.materials.new("subject")
     if material.node_tree is None:  # Blender 4: a new material has no tree
         material.use_nodes = True
     nodes, link = material.node_tree.nodes, material.node_tree.links.new

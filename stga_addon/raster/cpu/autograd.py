@@ -7,7 +7,8 @@ import torch
 
 from ...avatar.embedding import WORLD, FaceFrames
 from ...capture.camera import Camera
-from .rasterize import CameraFrames, Parameters, frames_in_camera, render_backward, render_forward
+from .layout import CameraFrames, Parameters
+from .rasterize import frames_in_camera, render_backward, render_forward
 
 
 def render_differentiable(

@@ -108,19 +108,13 @@ def _set_coordinates(s):
 
 @parallel(lambda tiles, *_: len(tiles))
 @jit
-def blend_forward(
-    first_tile, past_tile,
-    tiles, tiles_x, start, pair_splat, projected, extent_y, background, pair_rows, image, transmittance, last,
-):  # fmt: skip
-    """Render the listed tiles.
+def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, background, blended):
+    """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
-    tiles (T,) int32 tile ids, row-major with `tiles_x` tiles a row; start (tiles + 1,) int64 into the pair
-    list; pair_splat (P,) int32 front to back in each tile; projected (N, 9) and extent_y (N,) from `project_forward`.
-    background (3,): composited behind the splats. Writes image (3, H, W), transmittance (H, W) (1 − alpha, kept
-    because the backward needs its small values exactly), last (H, W) int32: one past the last contributing pair
-    of the tile, counted from the tile's start, and pair_rows (P, 4) uint8: first and past-the-last row of the tile's
-    left and right half that the splat may reach, of those pairs that were looked at.
+    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; background (3,): composited behind the splats.
     """
+    start, pair_splat, projected, extent_y = lists.start, lists.pair_splat, projection.columns, projection.extent_y
+    image, transmittance, last, pair_rows = blended.image, blended.transmittance, blended.last, blended.pair_rows
     height, width = last.shape
     s, batch = np.empty(STATE, np.float32), np.empty(COLUMNS, np.float32)
     _set_coordinates(s)
@@ -187,16 +181,17 @@ def blend_forward(
 @parallel(lambda tiles, *_: len(tiles))
 @jit
 def blend_backward(
-    first_tile, past_tile,
-    tiles, tiles_x, start, pair_splat, pair_rows, wanted, projected, background, transmittance, last,
-    v_image, v_transmittance, grads,
+    first_tile, past_tile, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
+    pair_gradients,
 ):  # fmt: skip
-    """Gradient of every wanted (tile, splat) pair of the listed tiles.
+    """Write the gradient of every wanted (tile, splat) pair of the listed tiles to pair_gradients (P, PROJECTED).
 
-    wanted (N,) bool: splats whose gradient is needed. v_image (3, H, W) and v_transmittance (H, W): gradients of the
-    composited image and of the transmittance. Writes grads (P, 9), with the columns of `projected`: one row for each
-    pair, so that the sum over a splat's pairs has one order whatever the threads do.
+    wanted (N,) bool: splats whose gradient is needed. projected (N, PROJECTED): the columns of the projection. v_image
+    (3, H, W), v_transmittance (H, W): gradients of the image over the background and of the transmittance. Each pair
+    has a row of its own, so that the sum over a splat's pairs has one order whatever the threads do.
     """
+    start, pair_splat, grads = lists.start, lists.pair_splat, pair_gradients
+    transmittance, last, pair_rows = blended.transmittance, blended.last, blended.pair_rows
     height, width = last.shape
     s, batch = np.empty(STATE, np.float32), np.empty(COLUMNS, np.float32)
     _set_coordinates(s)

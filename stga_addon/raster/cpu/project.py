@@ -124,28 +124,23 @@ def compose_frames(begin, end, origin, rotation, scale, turn, shift, camera_orig
 @parallel(lambda rows, *_: len(rows))
 @jit
 def project_forward(
-    begin, end, rows, rendered,
-    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, intrinsics,
-    size, depth_as_color, antialiased, projected, depth, extent_y, rect,
+    begin, end, rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection
 ):  # fmt: skip
-    """Project the listed ones of N embedded splats.
+    """Write the listed rows of `projection`; the tuples are those of `layout.py`.
 
-    rows (M,): the splats to project. rendered (tiles_y, tiles_x) bool: one that reaches none of these tiles is not
-    visible.
-    xyz, rotation (wxyz), log_scale, opacity (logit), sh (N, K, 3), strain_color (N, S, 3), face: as in `Splats`;
-    `degree` ≤ the stored.
-    origin (F, 3), matrix (F, 3, 3): camera-space frames, scale included: camera point = matrix @ xyz + origin.
-    strain (F, S): how the triangles deform; colors follow as many columns as both it and strain_color have.
-    to_world (3, 3): camera to world rotation. intrinsics (4,): fl_x, fl_y, cx, cy. size (2,): width, height.
-    depth_as_color: blend (z, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to a splat's area is taken
-    from its opacity (Mip-Splatting's 2D filter, as gsplat's "antialiased" mode).
-    Writes projected (N, 9), depth (N,), extent_y (N,) half height in pixels up to α = 1/255, and rect (N, 4) int32
-    tile bounds x0, y0, x1, y1: all 0 for a splat that cannot be seen, all −1 for one that is not finite or would be
-    wider than float32 can square (some 1e9 pixels).
+    rows (M,): the splats to project. rendered (tiles_y, tiles_x) bool: a splat that reaches none of these tiles counts
+    as not visible. face (N,) int32. degree: of the spherical harmonics used, at most the stored one. Colors follow as
+    many components of strain as both the frames and the splats have.
+    depth_as_color: blend (depth, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to a splat's area is
+    taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased" mode).
     """
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    xyz, rotation, log_scale, opacity = splats.xyz, splats.rotation, splats.log_scale, splats.opacity
+    sh, strain_color = splats.sh, splats.strain_color
+    origin, matrix, strain, to_world = frames.origin, frames.matrix, frames.strain, frames.to_world
+    projected, depth, extent_y, rect = projection.columns, projection.depth, projection.extent_y, projection.rect
+    fx, fy, cx, cy = frames.intrinsics[0], frames.intrinsics[1], frames.intrinsics[2], frames.intrinsics[3]
     strains = min(strain.shape[1], strain_color.shape[1])
-    width, height = size[0], size[1]
+    width, height = frames.size[0], frames.size[1]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, width, height)
     basis = np.empty(16, np.float32)
@@ -269,8 +264,9 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
 
 
 @part_jit
-def _sum_pairs(splats, first_pair, pairs, splat_pairs, grads, sums):
+def _sum_pairs(splats, lists, pair_gradients, sums):
     """Sum the gradients of each splat's pairs to sums (BLOCK, 9): a short loop asks memory for many of them at once."""
+    first_pair, pairs, splat_pairs, grads = lists.first_pair, lists.pairs, lists.splat_pairs, pair_gradients
     for n in range(len(splats)):
         i = splats[n]
         g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
@@ -286,19 +282,22 @@ def _sum_pairs(splats, first_pair, pairs, splat_pairs, grads, sums):
 @parallel(lambda visible, *_: len(visible))
 @jit
 def project_backward(
-    begin, end, visible,
-    xyz, rotation, log_scale, opacity, sh, strain_color, degree, face, origin, matrix, strain, to_world, intrinsics,
-    size, depth_as_color, antialiased, projected, first_pair, pairs, splat_pairs, grads,
-    v_xyz, v_rotation, v_log_scale, v_opacity, v_sh, v_strain_color, screen,
+    begin, end, visible, splats, face, frames, degree, depth_as_color, antialiased,
+    projected, lists, pair_gradients, gradients, screen_gradient,
 ):  # fmt: skip
-    """Write the gradient of each listed splat to its row of v_*; the counterpart of `project_forward`.
+    """Write the gradient of each listed splat to its row of `gradients`; the counterpart of `project_forward`.
 
-    visible (M,) int32: the splats to image_loss_gradient. grads (P, 9): gradients of all pairs; those of splat i are
-    its rows
-    splat_pairs[first_pair[i] : first_pair[i] + pairs[i]]. screen (N,): length of the gradient with respect to the
-    projected center in units of half the image (what density control asks for), written for each listed splat.
+    visible (M,) int32: the splats to differentiate. projected (N, PROJECTED): the columns of the projection.
+    pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with respect to the
+    projected center in units of half the image, for density control.
     """
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    xyz, rotation, log_scale, opacity = splats.xyz, splats.rotation, splats.log_scale, splats.opacity
+    sh, strain_color = splats.sh, splats.strain_color
+    v_xyz, v_rotation, v_log_scale = gradients.xyz, gradients.rotation, gradients.log_scale
+    v_opacity, v_sh, v_strain_color = gradients.opacity, gradients.sh, gradients.strain_color
+    origin, matrix, strain, to_world = frames.origin, frames.matrix, frames.strain, frames.to_world
+    fx, fy, cx, cy = frames.intrinsics[0], frames.intrinsics[1], frames.intrinsics[2], frames.intrinsics[3]
+    size = frames.size
     strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
     basis, weight = np.empty(16, np.float32), np.empty(16, np.float32)
@@ -306,12 +305,12 @@ def project_backward(
     for n in range(begin, end):
         i = visible[n]
         if (n - begin) % BLOCK == 0:
-            _sum_pairs(visible[n : min(end, n + BLOCK)], first_pair, pairs, splat_pairs, grads, sums)
+            _sum_pairs(visible[n : min(end, n + BLOCK)], lists, pair_gradients, sums)
         g = sums[(n - begin) % BLOCK]
         v_sh[i, :, :] = ZERO
         v_strain_color[i, :, :] = ZERO
         half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]
-        screen[i] = math.sqrt(half_x * half_x + half_y * half_y)
+        screen_gradient[i] = math.sqrt(half_x * half_x + half_y * half_y)
         f = face[i]
         lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         c00, c01, c02 = matrix[f, 0, 0], matrix[f, 0, 1], matrix[f, 0, 2]

@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from ...capture.camera import Camera
-from ..cpu.layout import PIXELS, TILE
-from ..cpu.rasterize import BLACK_BACKGROUND, Parameters, tile_grid
+from ..cpu.layout import PIXELS, TILE, Parameters
+from ..cpu.rasterize import BLACK_BACKGROUND, tile_grid
 from . import blend
 from .buffers import DeviceBufferPool
 from .project import DeviceCamera, Projected, project_backward, project_forward
@@ -222,7 +222,7 @@ def device_camera(
     lens = DeviceCamera()
     lens.fx, lens.fy, lens.cx, lens.cy = camera.fl_x, camera.fl_y, camera.cx, camera.cy
     lens.width, lens.height = camera.width, camera.height
-    lens.tiles_x, lens.tiles_y = tile_grid(camera)
+    lens.tiles_x, lens.tiles_y = tile_grid(camera.width, camera.height)
     lens.to_world = wp.mat33(*camera.world_to_camera[:3, :3].T.ravel().tolist())
     lens.degree, lens.strains = degree, strains
     lens.depth_as_color, lens.antialiased = depth_as_color, antialiased

@@ -7,7 +7,8 @@ import warp as wp
 
 from ...avatar.embedding import WORLD
 from ...capture.camera import Camera
-from ..cpu.rasterize import Parameters, frames_in_camera
+from ..cpu.layout import Parameters
+from ..cpu.rasterize import frames_in_camera
 from . import blend, embed, image_loss, optimizer, project, tiles
 from .rasterize import PARAMETER_TYPES, DeviceFrames, Rasterizer, device_camera
 

@@ -1,106 +1,88 @@
-"""A splat's colour as nodes: constant, by the direction it is seen from, and by how its triangle deforms."""
+"""Node groups for splat colors: constant, by view direction (spherical harmonics), and by the strain of triangles."""
 
 from math import pi, sqrt
 from typing import Any
 
-import numpy as np
-
 from ...avatar.splats import SH_C0
-from ...avatar.strain import GAIN, LIMIT, STRAINS, StrainBasis
-from .node_builder import Nodes, Part
+from ...avatar.strain import GAIN, LIMIT, STRAINS
+from .node_builder import NodeGroup, Nodes
+from .splat_attributes import FACE, GRAM, PLANE, SH, STRAIN_COLOR, TENSOR, TENSOR_HALVES
 
-# Attributes of the splat object that are read here.
-FACE = "stga_face"
-SH = "stga_sh_{}"
-STRAIN_COLOR = "stga_strain_color_{}"
-
-# Attributes of the neutral mesh (see `StrainBasis`): a symmetric tensor is two vectors, xx yy zz and xy yz zx.
-_HALVES = ("stga_strain_squares", "stga_strain_products")
-_GRAM, _TENSOR, _PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
-_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
+# Temporary attributes on the faces of the deformed neutral mesh.
+_GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
 
 
-def constant(nodes: Nodes, strain: Any) -> Any:
-    """Display colour (sRGB, not clamped) of each splat but for what depends on where it is seen from.
+def constant_color(nodes: Nodes, strain: Any) -> Any:
+    """The part of each splat's sRGB color, not clamped, that does not depend on the view direction.
 
-    strain: vector from STRAIN, None where colours do not follow it. Coefficients as in `Splats`.
+    strain: vector from STRAIN, None where colors do not follow it. Coefficients as in `Splats`.
     """
-    parts = [nodes.scaled(_sh(nodes, 0), SH_C0), (0.5, 0.5, 0.5)]
+    terms = [nodes.scale(_sh(nodes, 0), SH_C0), (0.5, 0.5, 0.5)]
     if strain is not None:
-        parts += [
-            nodes.scaled(nodes.attribute(STRAIN_COLOR.format(index), "FLOAT_VECTOR"), factor)
+        terms += [
+            nodes.scale(nodes.attribute(STRAIN_COLOR.format(index), "FLOAT_VECTOR"), factor)
             for index, factor in enumerate(nodes.components(strain))
         ]
-    return nodes.plus(*parts)
+    return nodes.sum(*terms)
 
 
-def seen_from(nodes: Nodes, color: Any, degree: int, direction: Any) -> Any:
-    """The constant colour, and what spherical harmonics up to `degree` add to it for a unit direction."""
-    return nodes.plus(color, *(nodes.part(band, direction) for band in BANDS[:degree]))
-
-
-def _scene_linear(nodes: Nodes, srgb: Any) -> Any:
-    """sRGB, clamped to 0…1, as Blender stores colours: the transfer curve of IEC 61966-2-1, backwards."""
-    clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", srgb, (0, 0, 0)), (1, 1, 1))
-    linear = []
-    for value in nodes.components(clamped):
-        bent = nodes.math("POWER", nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055), 2.4)
-        low = nodes.math("DIVIDE", value, 12.92)
-        linear.append(nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.04045), low, bent))
-    return nodes.combine(*linear)
+def view_color(nodes: Nodes, color: Any, degree: int, direction: Any) -> Any:
+    """The constant color plus spherical harmonics of degrees 1 to `degree` in a unit direction."""
+    return nodes.sum(color, *(nodes.group(band, direction) for band in SH_BANDS[:degree]))
 
 
 def view_direction(nodes: Nodes, position: Any) -> tuple[Any, Any]:
-    """From the scene's active camera to each splat, in the splats' own space, in which they were trained.
+    """Unit vectors from the scene's active camera to each splat, in the space the splats were trained in.
 
     Returns the direction and whether there is a camera.
     """
-    camera = nodes.object(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
+    camera = nodes.object_info(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
     direction = nodes.vector("NORMALIZE", nodes.vector("SUBTRACT", position, camera))
-    # Without an object the location is zero, where no camera stands: inside the head.
+    # Without a camera object the location is zero, which is inside the head: no camera is there.
     return direction, nodes.compare("GREATER_THAN", nodes.vector("LENGTH", camera), 0.0)
 
 
+def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
+    """Scene-linear color of sRGB, clamped to 0…1 (IEC 61966-2-1)."""
+    clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", srgb, (0, 0, 0)), (1, 1, 1))
+    linear = []
+    for value in nodes.components(clamped):
+        power = nodes.math("POWER", nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055), 2.4)
+        line = nodes.math("DIVIDE", value, 12.92)
+        linear.append(nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.04045), line, power))
+    return nodes.combine(*linear)
+
+
 def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
-    """The neutral triangles where the posed ones are, each with the tensor of its deformation (`avatar.strain`)."""
-    place, number = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
-    moved = nodes.sample(posed, place, number, "FLOAT_VECTOR", "POINT")
+    """The neutral mesh moved to the posed vertices, with each face's deformation tensor (`avatar.strain`) stored."""
+    position, index = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
+    moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
     mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
-    p0, p1, p2 = (nodes.at(place, nodes.corner(index)) for index in range(3))
+    p0, p1, p2 = nodes.triangle_corners()
     e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
     gram = nodes.combine(*(nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2))))
-    change = nodes.vector("SUBTRACT", gram, nodes.attribute(_GRAM, "FLOAT_VECTOR"))
-    mesh = nodes.store(mesh, _CHANGE, change, "FLOAT_VECTOR", "FACE")
-    changes = nodes.components(nodes.attribute(_CHANGE, "FLOAT_VECTOR"))
-    for half in _HALVES:
-        tensor = (nodes.attribute(_TENSOR.format(index, half), "FLOAT_VECTOR") for index in range(STRAINS))
-        sum_ = nodes.plus(*(nodes.scaled(part, by) for part, by in zip(tensor, changes, strict=True)))
-        mesh = nodes.store(mesh, half, sum_, "FLOAT_VECTOR", "FACE")
+    change = nodes.vector("SUBTRACT", gram, nodes.attribute(GRAM, "FLOAT_VECTOR"))
+    mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
+    changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
+    for half in TENSOR_HALVES:
+        columns = (nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR") for k in range(STRAINS))
+        tensor = nodes.sum(*(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True)))
+        mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
     return mesh
 
 
 def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
-    """Each splat's triangle's strain (`avatar.strain.face_strain`) as a vector; mesh: from `_deformed`."""
-    # Faces to vertices and back: the mean over the triangles that touch a triangle.
-    halves = [nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT") for half in _HALVES]
+    """Strain of each splat's triangle (`avatar.strain.face_strain`) as a vector; mesh: from `_deformed`."""
+    # Faces to points and back: the mean over the triangles that touch a triangle.
+    means = [nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT") for half in TENSOR_HALVES]
     strains = []
     for index in range(STRAINS):
-        plane = (nodes.attribute(_PLANE.format(index, half), "FLOAT_VECTOR") for half in _HALVES)
-        parts = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(halves, plane, strict=True)]
-        strain = nodes.math("MULTIPLY", nodes.math("ADD", *parts), GAIN)
+        plane = (nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES)
+        products = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)]
+        strain = nodes.math("MULTIPLY", nodes.math("ADD", *products), GAIN)
         strains.append(nodes.math("MAXIMUM", nodes.math("MINIMUM", strain, LIMIT), -LIMIT))
     mesh = nodes.store(mesh, _STRAIN, nodes.combine(*strains), "FLOAT_VECTOR", "FACE")
     return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
-
-
-def strain_attributes(basis: StrainBasis) -> dict[str, np.ndarray]:
-    """What `_deformed` and `_sampled_strain` need of the neutral mesh: name -> vector (F, 3) of every triangle."""
-    vectors = {_GRAM: basis.gram}
-    for name, tensors in ((_TENSOR, basis.to_tensor), (_PLANE, basis.to_plane)):
-        for index in range(STRAINS):
-            for start, half in zip((0, 3), _HALVES, strict=True):
-                vectors[name.format(index, half)] = tensors[:, index, start : start + 3]
-    return vectors
 
 
 def _sh(nodes: Nodes, index: int) -> Any:
@@ -109,7 +91,7 @@ def _sh(nodes: Nodes, index: int) -> Any:
 
 def _band(nodes: Nodes, start: int, factors: list[Any]) -> Any:
     """Sum of the coefficients from `start` on, each with its factor."""
-    total = nodes.scaled(_sh(nodes, start), factors[0])
+    total = nodes.scale(_sh(nodes, start), factors[0])
     for index, factor in enumerate(factors[1:], start + 1):
         total = nodes.vector("MULTIPLY_ADD", _sh(nodes, index), factor, total)
     return total
@@ -122,7 +104,7 @@ def _times(nodes: Nodes, factor: float, *values: Any) -> Any:
     return nodes.math("MULTIPLY", product, factor)
 
 
-# Real spherical harmonics of a unit direction, band by band, as 3D Gaussian Splatting has them.
+# Real spherical harmonics of a unit direction, one band each, with the signs of 3D Gaussian Splatting.
 
 
 def _first_band(nodes: Nodes, direction: Any) -> Any:
@@ -157,10 +139,10 @@ def _third_band(nodes: Nodes, direction: Any) -> Any:
     return _band(nodes, 9, factors)
 
 
-SCENE_LINEAR = Part("STGA Scene Linear", {"sRGB": "Vector"}, "Color", _scene_linear)
-DEFORMED = Part("STGA Deformed", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
-STRAIN = Part("STGA Strain", {"Deformed": "Geometry"}, "Vector", _sampled_strain)
-BANDS = tuple(
-    Part(f"STGA Harmonics {degree}", {"Direction": "Vector"}, "Vector", build)
+SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
+DEFORMED = NodeGroup("STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
+STRAIN = NodeGroup("STGA Strain", {"Deformed": "Geometry"}, "Vector", _sampled_strain)
+SH_BANDS = tuple(
+    NodeGroup(f"STGA Spherical Harmonics {degree}", {"Direction": "Vector"}, "Vector", build)
     for degree, build in enumerate((_first_band, _second_band, _third_band), 1)
 )

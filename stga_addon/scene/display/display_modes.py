@@ -1,15 +1,14 @@
-"""What stands for a splat in Blender: a point, an ellipsoid, a quad that faces the camera, or Blender's own splat."""
+"""Node groups for the display modes: points, ellipsoids, camera quads and, from Blender 5.3, native splats."""
 
-from contextlib import suppress
 from typing import Any
 
 import bpy
 
-from ..compat import NATIVE_SPLATS
+from ..compat import native_splats
 from .materials import EXTENT, ellipsoid_material, point_material
-from .node_builder import Nodes, Part
+from .node_builder import NodeGroup, Nodes
 
-# Attributes that the splats have by now, under the names that Blender's own splats use.
+# Attributes that the splats have by now, under the names that Blender's native splats use.
 WORLD_ROTATION = "rotation"
 WORLD_SCALE = "scale"
 
@@ -19,27 +18,27 @@ QUADS = "Camera Quads"
 NATIVE = "Native Splats"
 
 
-def shown_as(nodes: Nodes, choice: Any, splats: Any, visible: Any, size: Any) -> Any:
-    """Geometry of the splats as the menu socket `choice` wants them.
+def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> Any:
+    """Geometry of the splats in the display mode that the menu socket `mode` chooses.
 
     visible: field, which splats; size: factor on their standard deviations.
     """
-    kinds = {name: nodes.part(part, splats, visible, size) for name, part in PARTS.items()}
-    native = _native(nodes, kinds[POINTS]) if NATIVE_SPLATS else None
+    geometries = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
+    native = native_splats(nodes.tree, geometries[POINTS])
     if native is not None:
-        kinds[NATIVE] = native
+        geometries[NATIVE] = native
     menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
     menu.enum_definition.enum_items.clear()
-    for name in kinds:
+    for name in geometries:
         menu.enum_definition.enum_items.new(name)
-    for name, geometry in kinds.items():
+    for name, geometry in geometries.items():
         nodes.tree.links.new(geometry, menu.inputs[name])
-    nodes.tree.links.new(choice, menu.inputs["Menu"])
+    nodes.tree.links.new(mode, menu.inputs["Menu"])
     return menu.outputs[0]
 
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    # The mean of the three standard deviations stands for a shape that a point cannot show.
+    # A point has one radius: the mean of the three standard deviations.
     mean = nodes.math("DIVIDE", nodes.vector("DOT_PRODUCT", nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), (1, 1, 1)), 3)
     radius = nodes.math("MULTIPLY", mean, size)
     points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible, "Radius": radius})
@@ -47,7 +46,7 @@ def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Nod
 
 
 def _ellipsoids(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    """Instances of one sphere; never realised, which would cost twenty times as much."""
+    """Instances of one sphere; realizing them would take twenty times as long."""
     sphere = nodes.out("GeometryNodeMeshIcoSphere", {"Radius": EXTENT, "Subdivisions": 2})
     sphere = nodes.out("GeometryNodeSetShadeSmooth", {"Geometry": sphere})
     sphere = nodes.out("GeometryNodeSetMaterial", {"Geometry": sphere, "Material": ellipsoid_material()})
@@ -58,53 +57,48 @@ def _ellipsoids(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types
             "Selection": visible,
             "Instance": sphere,
             "Rotation": nodes.attribute(WORLD_ROTATION, "QUATERNION"),
-            "Scale": nodes.scaled(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size),
+            "Scale": nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size),
         },
     )
 
 
-def _native(nodes: Nodes, points: Any) -> bpy.types.NodeSocket | None:
-    """The points as Blender's own splats; None where the menu calls them by no name known from its source."""
-    node = nodes.add("GeometryNodePointsSetType", {"Points": points})
-    for name in ("Gaussian Splat", "Gaussian Splats", "GAUSSIAN_SPLAT"):
-        with suppress(TypeError):  # there is no such item
-            node.inputs["Type"].default_value = name
-            return node.outputs[0]
-    nodes.tree.nodes.remove(node)
-    return None
-
-
 def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    """Two triangles a splat, which cover its ellipsoid as the scene's active camera sees it.
+    """Two triangles per splat, which cover its ellipsoid as the scene's active camera sees it.
 
-    In the ellipsoid's own space it is a sphere, and the quad faces the camera there; the material draws the same
-    Gaussian on it as on the sphere, because it looks at rays and not at the surface they hit.
+    In the ellipsoid's own space it is a sphere, and the quad faces the camera there. The ellipsoid material applies
+    unchanged, because it evaluates rays and not the surface they hit.
     """
     side = 2 * EXTENT
     quad = nodes.out("GeometryNodeMeshGrid", {"Size X": side, "Size Y": side, "Vertices X": 2, "Vertices Y": 2})
     quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": ellipsoid_material()})
     quads = nodes.out("GeometryNodeInstanceOnPoints", {"Points": splats, "Selection": visible, "Instance": quad})
+    transform = _quad_transform(nodes, size)
+    return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform})
+
+
+def _quad_transform(nodes: Nodes, size: Any) -> bpy.types.NodeSocket:
+    """Per splat: its ellipsoid's transform after a rotation that turns +Z to the active camera."""
     position = nodes.out("GeometryNodeInputPosition")
     rotation = nodes.attribute(WORLD_ROTATION, "QUATERNION")
-    scale = nodes.scaled(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
-    camera = nodes.object(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
-    back = nodes.out("FunctionNodeInvertRotation", {"Rotation": rotation})
-    toward = nodes.vector("SUBTRACT", camera, position)
-    toward = nodes.out("FunctionNodeRotateVector", {"Vector": toward, "Rotation": back})
-    toward = nodes.vector("NORMALIZE", nodes.vector("DIVIDE", toward, scale))
-    axes = {"Primary Axis": toward, "Secondary Axis": (1, 0, 0)}
-    turn = nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="Z", secondary_axis="X")
-    ellipsoid = nodes.out(
-        "FunctionNodeCombineTransform", {"Translation": position, "Rotation": rotation, "Scale": scale}
-    )
-    facing = nodes.out("FunctionNodeCombineTransform", {"Rotation": turn})
-    placed = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": [ellipsoid, facing]})
-    return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": placed})
+    scale = nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
+    camera = nodes.object_info(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
+    inverse = nodes.out("FunctionNodeInvertRotation", {"Rotation": rotation})
+    to_camera = nodes.vector("SUBTRACT", camera, position)
+    to_camera = nodes.out("FunctionNodeRotateVector", {"Vector": to_camera, "Rotation": inverse})
+    to_camera = nodes.vector("NORMALIZE", nodes.vector("DIVIDE", to_camera, scale))
+    axes = {"Primary Axis": to_camera, "Secondary Axis": (1, 0, 0)}
+    facing = nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="Z", secondary_axis="X")
+    ellipsoid = {"Translation": position, "Rotation": rotation, "Scale": scale}
+    transforms = [
+        nodes.out("FunctionNodeCombineTransform", ellipsoid),
+        nodes.out("FunctionNodeCombineTransform", {"Rotation": facing}),
+    ]
+    return nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
 
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
-PARTS = {
-    POINTS: Part("STGA Points", _INPUTS, "Geometry", _points),
-    ELLIPSOIDS: Part("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
-    QUADS: Part("STGA Camera Quads", _INPUTS, "Geometry", _quads),
+MODES = {
+    POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
+    ELLIPSOIDS: NodeGroup("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
+    QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }

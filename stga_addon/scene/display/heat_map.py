@@ -1,16 +1,20 @@
-"""How often each triangle is selected, as colours on the head."""
+"""How often each triangle is selected, as colors on the head."""
 
 from typing import Any
 
 import bpy
 import numpy as np
 
-SHARE = "stga_selected_share"  # on faces: 0 to 1 of the frames
-HEAT = "stga_heat"  # the same as a colour on face corners, the brightest for what is selected most
+from ..arrays import flat_floats
+from .node_builder import Nodes, new_material
+from .splat_attributes import write_attributes
+
+SHARE = "stga_selected_share"  # on faces: fraction of the frames that select them
+HEAT = "stga_heat"  # on face corners: that fraction as a color, relative to the most selected triangle
 MODIFIER = "STGA Heat Map"
-# Never to most often; linear red, green, blue.
+# Linear RGB from never to most often selected.
 STOPS = (0.0, 1e-9, 0.25, 0.5, 0.75, 1.0)
-COLOURS = (
+COLORS = (
     (0.1, 0.1, 0.1),
     (0.02, 0.03, 0.3),
     (0.05, 0.35, 0.6),
@@ -21,19 +25,18 @@ COLOURS = (
 
 
 def show_heat_map(head: Any, share: np.ndarray) -> None:
-    """Colour the head's triangles by share (F,), leaving its own materials alone: a modifier puts the colours on.
+    """Color the head's triangles by share (F,), 0 to 1. Its own materials stay: a modifier assigns the heat map's.
 
-    They are the active colour attribute, for solid mode, and a material, for EEVEE and Cycles.
+    The colors are the active color attribute, for solid shading, and a material, for EEVEE and Cycles.
     """
     hide_heat_map(head)
-    mesh = head.data
-    _attribute(mesh, SHARE, "FLOAT", "FACE", "value", share)
     scaled = share / max(share.max(initial=0.0), 1e-9)
-    channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLOURS, strict=True)]
-    colours = np.column_stack([*channels, np.ones(len(share))])
-    _attribute(mesh, HEAT, "FLOAT_COLOR", "CORNER", "color", np.repeat(colours, 3, axis=0))
-    mesh.attributes.active_color_name = HEAT
-    head.modifiers.new(MODIFIER, "NODES").node_group = _tree()
+    channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLORS, strict=True)]
+    colors = np.column_stack([*channels, np.ones(len(share))])
+    write_attributes(head.data, {SHARE: ("FLOAT", "value", flat_floats(share))}, "FACE")
+    write_attributes(head.data, {HEAT: ("FLOAT_COLOR", "color", flat_floats(np.repeat(colors, 3, axis=0)))}, "CORNER")
+    head.data.attributes.active_color_name = HEAT
+    head.modifiers.new(MODIFIER, "NODES").node_group = _node_group()
 
 
 def hide_heat_map(head: Any) -> None:
@@ -49,40 +52,22 @@ def has_heat_map(head: Any) -> bool:
     return MODIFIER in head.modifiers
 
 
-def _attribute(mesh: Any, name: str, kind: str, domain: str, field: str, values: np.ndarray) -> None:
-    mesh.attributes.new(name, kind, domain).data.foreach_set(field, np.ascontiguousarray(values, np.float32).ravel())
-
-
-def _tree() -> Any:
-    """Geometry → the same with the heat map's material."""
+def _node_group() -> Any:
+    """Assigns the heat map's material; built where the file has none."""
     if MODIFIER in bpy.data.node_groups:
         return bpy.data.node_groups[MODIFIER]
     tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
     tree.is_modifier = True
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    kinds = ("NodeGroupInput", "GeometryNodeSetMaterial", "NodeGroupOutput")
-    given, coloured, shown = (tree.nodes.new(kind) for kind in kinds)
-    coloured.inputs["Material"].default_value = _material()
-    tree.links.new(given.outputs[0], coloured.inputs["Geometry"])
-    tree.links.new(coloured.outputs[0], shown.inputs[0])
-    for column, node in enumerate((given, coloured, shown)):
-        node.location = (220 * column, 0)
+    nodes = Nodes(tree)
+    geometry, material = nodes.out("NodeGroupInput"), new_material(MODIFIER, _heat_shader)
+    colored = nodes.out("GeometryNodeSetMaterial", {"Geometry": geometry, "Material": material})
+    nodes.finish("NodeGroupOutput", {"Geometry": colored})
     return tree
 
 
-def _material() -> Any:
-    """The colours as they are, in any light."""
-    material = bpy.data.materials.new(MODIFIER)
-    if material.node_tree is None:  # Blender 4: a new material has no tree
-        material.use_nodes = True
-    tree = material.node_tree
-    tree.nodes.clear()
-    kinds = ("ShaderNodeAttribute", "ShaderNodeEmission", "ShaderNodeOutputMaterial")
-    colour, glow, output = (tree.nodes.new(kind) for kind in kinds)
-    colour.attribute_name = HEAT
-    tree.links.new(colour.outputs["Color"], glow.inputs["Color"])
-    tree.links.new(glow.outputs[0], output.inputs["Surface"])
-    for column, node in enumerate((colour, glow, output)):
-        node.location = (220 * column, 0)
-    return material
+def _heat_shader(nodes: Nodes) -> Any:
+    """The colors unlit."""
+    color = nodes.add("ShaderNodeAttribute", attribute_name=HEAT).outputs["Color"]
+    return nodes.out("ShaderNodeEmission", {"Color": color})

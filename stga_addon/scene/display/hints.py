@@ -1,22 +1,21 @@
-"""Scene settings that change how splats look, each as one sentence."""
+"""Scene settings that change how splats look, each reported in one sentence."""
 
 import bpy
 
+TRANSPARENT_BOUNCES = 64
+"""Layers of overlapping splats that Cycles has to see through; its default of 8 leaves black holes."""
+
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
-    """One sentence where the scene's view transform changes the colours that the splats were trained in."""
+    """A sentence where the view transform changes the colors that the splats were trained in, else None."""
     if scene.view_settings.view_transform == "Standard":
         return None
-    return f"View transform {scene.view_settings.view_transform} changes the splats' colours: choose Standard."
-
-
-TRANSPARENT_BOUNCES = 64
-"""Layers of overlapping splats that Cycles has to look through; its default of 8 leaves black holes."""
+    return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
 
 
 def transparent_bounces_hint(scene: bpy.types.Scene) -> str | None:
-    """One sentence where Cycles renders the scene and gives up before it has seen all splats of a pixel."""
-    cycles = getattr(scene, "cycles", None)
+    """A sentence where Cycles renders the scene with too few transparent bounces for splats, else None."""
+    cycles = getattr(scene, "cycles", None)  # None where the Cycles add-on is disabled
     if scene.render.engine != "CYCLES" or cycles is None or cycles.transparent_max_bounces >= TRANSPARENT_BOUNCES:
         return None
-    return f"Cycles sees {cycles.transparent_max_bounces} layers of splats: {TRANSPARENT_BOUNCES} are needed."
+    return f"Cycles sees through {cycles.transparent_max_bounces} layers of splats; {TRANSPARENT_BOUNCES} are needed"

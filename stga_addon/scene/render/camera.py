@@ -1,4 +1,4 @@
-"""Blender's view of the world as a calibrated camera."""
+"""Blender's cameras and views as calibrated cameras."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,33 +8,34 @@ import numpy as np
 from ...capture.camera import Camera, camera_from_gl
 from ...errors import StgaError
 
-FAR = 1000.0  # an orthographic view is drawn as one from this many times its own width away
+ORTHOGRAPHIC_DISTANCE = 1000.0
+"""An orthographic view is rendered in perspective from this many times its own width away."""
 
 
-def render_camera(thing: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int]) -> Camera:
+def render_camera(camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int]) -> Camera:
     """The scene's camera for a final image of width × height pixels.
 
-    thing: the evaluated camera object. border: x, y, width and height in pixels of what is drawn, from the bottom left.
-    Raises StgaError unless it is a perspective camera.
+    camera: the evaluated camera object. border: x, y, width and height in pixels of the render region, from the bottom
+    left. Raises StgaError unless it is a perspective camera.
     """
-    if thing is None or thing.type != "CAMERA":
-        raise StgaError("the scene has no camera to render through")
-    if thing.data.type != "PERSP":
-        raise StgaError(f"{thing.name}: is no perspective camera, and STGA Splats draws through no other")
+    if camera is None or camera.type != "CAMERA":
+        raise StgaError("The scene has no camera to render through")
+    if camera.data.type != "PERSP":
+        raise StgaError(f"{camera.name}: is not a perspective camera; STGA Splats renders through no other type")
     render = depsgraph.scene.render
-    projection = thing.calc_matrix_camera(
+    projection = camera.calc_matrix_camera(
         depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
     )
-    camera = camera_of(np.array(thing.matrix_world.normalized(), np.float64), projection, width, height)
-    return _cropped(camera, border)
+    whole = camera_of(np.array(camera.matrix_world.normalized(), np.float64), projection, width, height)
+    return _cropped(whole, border)
 
 
 def viewport_camera(region: Any, width: int, height: int) -> Camera:
-    """What a 3D viewport (a RegionView3D) looks through, for a picture of width × height pixels."""
+    """The view of a 3D viewport (a RegionView3D) for an image of width × height pixels."""
     pose = np.array(region.view_matrix.inverted(), np.float64)
     projection = np.array(region.window_matrix, np.float64)
     if not region.is_perspective:
-        projection, distance = _from_afar(projection)
+        projection, distance = _perspective_of_orthographic(projection)
         pose[:3, 3] += distance * pose[:3, 2]
     return camera_of(pose, projection, width, height)
 
@@ -53,13 +54,13 @@ def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Cam
     )
 
 
-def _from_afar(projection: np.ndarray) -> tuple[np.ndarray, float]:
-    """A perspective projection that shows nearly what an orthographic one does, and how far to step back for it."""
-    distance = FAR * 2 / projection[0, 0]
-    afar = np.zeros((4, 4))
-    afar[0, 0], afar[1, 1] = projection[0, 0] * distance, projection[1, 1] * distance
-    afar[0, 2], afar[1, 2] = -projection[0, 3], -projection[1, 3]
-    return afar, distance
+def _perspective_of_orthographic(projection: np.ndarray) -> tuple[np.ndarray, float]:
+    """A perspective projection (4, 4) that nearly equals an orthographic one, and how many metres to step back."""
+    distance = ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
+    perspective = np.zeros((4, 4))
+    perspective[0, 0], perspective[1, 1] = projection[0, 0] * distance, projection[1, 1] * distance
+    perspective[0, 2], perspective[1, 2] = -projection[0, 3], -projection[1, 3]
+    return perspective, distance
 
 
 def _cropped(camera: Camera, border: tuple[int, int, int, int]) -> Camera:

@@ -1,32 +1,56 @@
-"""The render engine "STGA Splats": final images, animations and viewports drawn by the training rasteriser.
+"""The render engine "STGA Splats": final images, animations and viewports through the training rasterizer.
 
-It draws splats and nothing else; meshes are composited with its alpha and depth. Registering it imports nothing that
-draws: that happens with the first image.
+It renders splats and nothing else; meshes are composited by its alpha and depth. Registering it imports no rasterizer:
+that happens with the first image.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Any
-from weakref import ref
 
 import bpy
 import numpy as np
 
 from ...errors import StgaError
-from ...raster.render_client import RenderClient
+from ...raster.render_client import RenderClient, missing_packages
 from ..compat import world_nodes
 from ..display.colors import linear_to_srgb, srgb_to_linear
+from . import redraw
 from .camera import render_camera, viewport_camera
 from .scene_splats import SplatCache, visible_layers
-from .viewport import Screen, Sketcher, Wish, painted
+from .viewport import RenderRequest, ViewportImage, ViewportRenderer
 
 ENGINE = "STGA_SPLATS"
-FAR_AWAY = 1e10  # metres: what Blender writes into the depth of pixels that show nothing
-# Blender's panels that are for some engines only and make sense here, beside those that are for any.
-PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
+BACKGROUND_DEPTH = 1e10  # metres: what Blender's engines write where a pixel shows nothing
+MIN_DEPTH_ALPHA = 1 / 255  # pixels with less show nothing
+# Blender's panels that are for some engines only and apply to this one too.
+SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
 
-_painter = RenderClient(lambda: "")
+
+class Interpreter:
+    """The Python that renders where Blender's own cannot: looked up by the main thread, used by render threads."""
+
+    def __init__(self, find: Callable[[], str]) -> None:
+        self._find = find
+        self._path = self._error = ""
+
+    def update(self) -> None:
+        """Look it up again; reads preferences and files, so only where another Python is needed."""
+        if missing_packages():
+            try:
+                self._path, self._error = self._find(), ""
+            except StgaError as error:
+                self._error = str(error)
+
+    def path(self) -> str:
+        """As last looked up. Raises StgaError where there was none."""
+        if self._error:
+            raise StgaError(self._error)
+        return self._path
+
+
+_interpreter = Interpreter(lambda: "")
+_client = RenderClient(_interpreter.path)
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -34,7 +58,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_label = "STGA Splats"
     bl_use_eevee_viewport = True  # Material Preview stays EEVEE's
 
-    # No __init__: its signature differs between Blender's versions. Made when a viewport is first drawn.
+    # No __init__: its signature differs between Blender's versions. Created when a viewport is first drawn.
     _viewport: "Viewport | None" = None
 
     def update_render_passes(self, scene: Any = None, renderlayer: Any = None) -> None:
@@ -46,102 +70,109 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         try:
             self._render(depsgraph)
         except StgaError as error:
-            self.report({"ERROR"}, str(error))  # what a script catches
+            self.report({"ERROR"}, str(error))  # raised in scripts
             if not bpy.app.background:
-                self.error_set(str(error))  # what stands where the image would be
+                self.error_set(str(error))  # shown in place of the image
 
     def _render(self, depsgraph: Any) -> None:
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
         border = _border(scene.render, *size)
-        thing = scene.camera.evaluated_get(depsgraph) if scene.camera else None
-        camera = render_camera(thing, depsgraph, *size, border)
+        camera_object = scene.camera.evaluated_get(depsgraph) if scene.camera else None
+        camera = render_camera(camera_object, depsgraph, *size, border)
         layers = visible_layers(depsgraph, SplatCache())
         self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
-        picture = _painter.compose(layers, camera, with_depth=True)
+        _interpreter.update()
+        image = _client.compose(layers, camera, with_depth=True)
         result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
         passes = result.layers[0].passes
-        _write(passes["Combined"], combined(picture.rgb, picture.alpha, _behind(scene)))
+        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, _background(scene)))
         if "Depth" in passes:
-            assert picture.depth is not None
-            shown = picture.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, 1 / 255)
-            _write(passes["Depth"], np.where(shown, picture.depth, FAR_AWAY)[..., None])
+            assert image.depth is not None
+            covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
+            _write_pass(passes["Depth"], np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None])
         self.end_result(result)
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
-        self._seen().update(depsgraph)
+        self._get_viewport().update(depsgraph)
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
-        seen, region = self._seen(), context.region
-        seen.draw(context, depsgraph)
-        self.update_stats("", seen.sketcher.error)
-        if seen.sketcher.picture is not None:
+        viewport, region = self._get_viewport(), context.region
+        renderer = viewport.renderer
+        if viewport.request_image(context, depsgraph):
+            redraw.redraw_when_rendered(renderer, self)
+        self.update_stats("", renderer.error)
+        if renderer.image is not None:
             self.bind_display_space_shader(depsgraph.scene)
-            seen.screen.draw(seen.sketcher.picture, region.width, region.height)
+            viewport.image.draw(renderer.image, region.width, region.height)
             self.unbind_display_space_shader()
 
-    def _seen(self) -> "Viewport":
+    def _get_viewport(self) -> "Viewport":
         if self._viewport is None:
-            self._viewport = Viewport(self)
+            self._viewport = Viewport()
         return self._viewport
 
 
 class Viewport:
-    """What one viewport of the engine remembers."""
+    """What one viewport of the engine keeps between redraws.
 
-    def __init__(self, engine: SplatsEngine) -> None:
-        # Weakly, or what is on the GPU would be freed by the garbage collector, in whatever thread that runs.
-        self.sketcher = Sketcher(partial(painted, _painter, combined), partial(_redraw, ref(engine)))
-        self.screen = Screen()
-        self._stock = SplatCache()
+    Owned by its engine alone, so that the texture is freed with it, by the main thread.
+    """
+
+    def __init__(self) -> None:
+        self.renderer = ViewportRenderer(partial(_render_request, _client))
+        self.image = ViewportImage()
+        self._cache = SplatCache()
         self._layers: list[Any] | None = None
 
     def update(self, depsgraph: Any) -> None:
-        """Something in the scene has changed: pose again, and read again what was edited itself."""
+        """The scene has changed: pose the splats again, and read meshes again that were edited themselves."""
         self._layers = None
-        meshes = {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Mesh)}
-        self._stock.forget(meshes)
+        self._cache.discard(
+            {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Mesh)}
+        )
 
-    def draw(self, context: Any, depsgraph: Any) -> None:
-        """Ask for a picture of the view as it is now."""
+    def request_image(self, context: Any, depsgraph: Any) -> bool:
+        """Request an image of the current view; whether it differs from the last one requested."""
         region, space = context.region, context.space_data
         if self._layers is None:
             try:
-                self._layers = visible_layers(depsgraph, self._stock, space)
+                self._layers = visible_layers(depsgraph, self._cache, space)
             except StgaError as error:
-                self.sketcher.error, self.sketcher.picture = str(error), None
-                return
+                self.renderer.error, self.renderer.image = str(error), None
+                return False
         camera = viewport_camera(context.region_data, region.width, region.height)
-        self.sketcher.ask(Wish(self._layers, camera, _behind(depsgraph.scene)))
+        if not self.renderer.is_busy():
+            _interpreter.update()
+        return self.renderer.request(RenderRequest(self._layers, camera, _background(depsgraph.scene)))
 
 
-def _redraw(engine: "ref[SplatsEngine]") -> None:
-    living = engine()
-    if living is not None:
-        with suppress(ReferenceError):  # the viewport was closed meanwhile
-            living.tag_redraw()
+def _render_request(client: RenderClient, request: RenderRequest, scale: float) -> np.ndarray:
+    """(H, W, 4) float32 scene-linear RGBA, bottom row first; runs in the viewport's render thread."""
+    image = client.compose(request.layers, request.camera.scaled(scale))
+    return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])
 
 
-def combined(rgb: np.ndarray, alpha: np.ndarray, world: tuple[float, ...] | None) -> np.ndarray:
-    """(H, W, 4) scene-linear RGBA, premultiplied, of display values `rgb` (3, H, W) on nothing and alpha (H, W).
+def combined(rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None) -> np.ndarray:
+    """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W), alpha (H, W).
 
-    Splats are blended in display values. So what lies behind them is added before the conversion: `world`, scene-linear
-    (3,). Where it is None the picture stays transparent, and the colour is converted as if it covered its pixel.
+    Splats are blended in sRGB. So `background`, scene-linear (3,), is added in sRGB, before the conversion. Where it is
+    None the image stays transparent, and the color is converted as if it covered its pixel.
     """
-    picture = np.empty((*alpha.shape, 4), np.float32)
-    if world is None:
+    image = np.empty((*alpha.shape, 4), np.float32)
+    if background is None:
         straight = rgb.transpose(1, 2, 0) / np.maximum(alpha, np.finfo(np.float32).tiny)[..., None]
-        picture[..., :3], picture[..., 3] = srgb_to_linear(straight) * alpha[..., None], alpha
+        image[..., :3], image[..., 3] = srgb_to_linear(straight) * alpha[..., None], alpha
     else:
-        behind = linear_to_srgb(np.clip(np.array(world, np.float32), 0, 1))
+        behind = linear_to_srgb(np.clip(np.array(background, np.float32), 0, 1))
         color = rgb.transpose(1, 2, 0) + (1 - alpha)[..., None] * behind
-        picture[..., :3], picture[..., 3] = srgb_to_linear(np.clip(color, 0, 1)), 1
-    return picture
+        image[..., :3], image[..., 3] = srgb_to_linear(np.clip(color, 0, 1)), 1
+    return image
 
 
-def _behind(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear colour behind the splats, None where the film is transparent.
+def _background(scene: Any) -> tuple[float, ...] | None:
+    """Scene-linear color behind the splats, None where the film is transparent.
 
-    That of the world's Background node where it is plain, the world's own elsewhere, black without a world.
+    From the world's Background node if its inputs are constants, else its viewport color; black without a world.
     """
     world = scene.world
     if scene.render.film_transparent:
@@ -159,7 +190,7 @@ def _behind(scene: Any) -> tuple[float, ...] | None:
 
 
 def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
-    """x, y, width and height in pixels of what is rendered, from the bottom left, cut as Blender cuts it."""
+    """x, y, width and height in pixels of the render region, from the bottom left, rounded as Blender does."""
     if not render.use_border:
         return 0, 0, width, height
     left, right = (int(np.float32(edge) * np.float32(width)) for edge in (render.border_min_x, render.border_max_x))
@@ -167,27 +198,37 @@ def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
     return left, low, right - left, high - low
 
 
-def _write(target: Any, values: np.ndarray) -> None:
-    """Fill a render pass with (H, W, channels), top row first; Blender counts rows from the bottom."""
-    target.rect.foreach_set(np.ascontiguousarray(values[::-1], np.float32).ravel())
+def _write_pass(render_pass: Any, values: np.ndarray) -> None:
+    """Fill a render pass with (H, W, channels), top row first; Blender's rows start at the bottom."""
+    render_pass.rect.foreach_set(np.ascontiguousarray(values[::-1], np.float32).ravel())
 
 
 def register(find_python: Callable[[], str]) -> None:
-    """find_python as in `raster.painter.RenderClient`."""
-    global _painter
-    _painter = RenderClient(find_python)
+    """find_python as in `raster.render_client.RenderClient`."""
+    global _interpreter, _client
+    _interpreter = Interpreter(find_python)
+    _client = RenderClient(_interpreter.path)
     bpy.utils.register_class(SplatsEngine)
     for panel in _shared_panels():
         panel.COMPAT_ENGINES.add(ENGINE)
 
 
 def unregister() -> None:
-    for panel in bpy.types.Panel.__subclasses__():
-        getattr(panel, "COMPAT_ENGINES", set()).discard(ENGINE)
+    for panel in _panels_by_engine():
+        panel.COMPAT_ENGINES.discard(ENGINE)
     bpy.utils.unregister_class(SplatsEngine)
-    _painter.close()
+    redraw.stop()
+    _client.close()
+
+
+def _panels_by_engine() -> list[Any]:
+    """The panels that list the engines they are for."""
+    return [panel for panel in bpy.types.Panel.__subclasses__() if hasattr(panel, "COMPAT_ENGINES")]
 
 
 def _shared_panels() -> list[Any]:
-    panels = [panel for panel in bpy.types.Panel.__subclasses__() if hasattr(panel, "COMPAT_ENGINES")]
-    return [panel for panel in panels if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in PANELS]
+    return [
+        panel
+        for panel in _panels_by_engine()
+        if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS
+    ]

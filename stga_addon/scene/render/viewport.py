@@ -1,7 +1,4 @@
-"""Pictures for a viewport that is orbited: coarse ones while it moves, a full one when it rests, none on the UI's time.
-
-Importing this needs no GPU: `gpu` comes with the first picture.
-"""
+"""Viewport images from a background thread: coarse while the view moves, at full resolution once it rests."""
 
 import threading
 import time
@@ -14,103 +11,134 @@ import numpy as np
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import PosedSplats
-from ...raster.render_client import RenderClient
 
-PATIENCE_S = 0.05
-"""A picture of a moving view may take this long; it gets coarser until it does."""
-COARSEST = 1 / 8
+MAX_RENDER_TIME_S = 0.05
+"""Time an image of a moving view may take; its resolution is adapted to that."""
+INITIAL_SCALE = 0.5
+MIN_SCALE = 1 / 8
+"""Fractions of the viewport's width and height in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
-class Wish:
-    """What a viewport wants to see: layers, the camera at full size, and the world's colour behind, or None."""
+class RenderRequest:
+    """What one viewport image shows.
+
+    layers: the scene's splats; camera: at the viewport's full size; background: scene-linear RGB, None if transparent.
+    """
 
     layers: Sequence[PosedSplats]
     camera: Camera
-    world: tuple[float, ...] | None
+    background: tuple[float, ...] | None
 
-    def is_same(self, other: "Wish | None") -> bool:
-        return other is not None and self.layers is other.layers and self._numbers() == other._numbers()
+    def is_same(self, other: "RenderRequest | None") -> bool:
+        """Whether both show the same layers (by identity) from the same camera."""
+        return other is not None and self.layers is other.layers and self._view() == other._view()
 
-    def _numbers(self) -> tuple[Any, ...]:
+    def _view(self) -> tuple[Any, ...]:
         camera = self.camera
-        lens = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
-        return *lens, camera.world_to_camera.tobytes(), self.world
+        intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
+        return *intrinsics, camera.world_to_camera.tobytes(), self.background
 
 
-class Sketcher:
-    """Draws the newest wish in a thread of its own, which lives until nothing is left to refine.
+class ViewportRenderer:
+    """Renders the latest request in a thread, which ends once that request has its full-resolution image.
 
-    paint: (wish, share of the full size) -> picture (H, W, 4); shown: called in the thread when there is news.
+    render: (request, scale) -> image (H, W, 4) float32, scale being a fraction of the camera's size.
+    The thread touches nothing of Blender; the main thread polls `is_busy` and `take_update`.
+
+    image  the last image rendered, or None
+    error  why the last request failed, else empty
     """
 
-    def __init__(self, paint: Callable[[Wish, float], np.ndarray], shown: Callable[[], None]) -> None:
-        self._paint, self._shown = paint, shown
+    def __init__(self, render: Callable[[RenderRequest, float], np.ndarray]) -> None:
+        self._render = render
         self._lock = threading.Lock()
-        self._wish: Wish | None = None
-        self._busy = False
-        self._share = 0.5
-        self.picture: np.ndarray | None = None
+        self._thread: threading.Thread | None = None
+        self._request: RenderRequest | None = None
+        self._moving_scale = INITIAL_SCALE
+        self._has_update = False
+        self.image: np.ndarray | None = None
         self.error = ""
 
-    def ask(self, wish: Wish) -> None:
-        """Have this drawn next; a wish that is already being drawn changes nothing."""
+    def request(self, request: RenderRequest) -> bool:
+        """Render this next, instead of what was requested before; returns False if it is the same."""
         with self._lock:
-            if wish.is_same(self._wish):
-                return
-            self._wish = wish
-            if not self._busy:
-                self._busy = True
-                threading.Thread(target=self._draw, daemon=True).start()
+            if request.is_same(self._request):
+                return False
+            self._request = request
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, daemon=True)
+                self._thread.start()
+            return True
 
-    def _draw(self) -> None:
-        done: Wish | None = None
-        share = 0.0
-        while True:
-            with self._lock:
-                wish = self._wish
-                if wish is None or (wish is done and share == 1):
-                    self._busy = False
-                    return
-                # A view that still moves gets a coarse picture, one that rests the full one.
-                share = 1.0 if wish is done else self._share
+    def cancel(self) -> None:
+        """Render nothing more than the image in progress."""
+        with self._lock:
+            self._request = None
+
+    def join(self) -> None:
+        """Wait for the end of the thread, if it runs."""
+        thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def is_busy(self) -> bool:
+        return self._thread is not None
+
+    def take_update(self) -> bool:
+        """Whether `image` or `error` has changed since the last call."""
+        with self._lock:
+            had_update, self._has_update = self._has_update, False
+        return had_update
+
+    def _run(self) -> None:
+        request: RenderRequest | None = None
+        scale = 0.0
+        while (next_step := self._next_step(request, scale)) is not None:
+            request, scale = next_step
             begin = time.perf_counter()
             try:
-                self.picture, self.error = self._paint(wish, share), ""
+                self.image, self.error = self._render(request, scale), ""
             except StgaError as error:
-                self.error, share = str(error), 1.0
-            except Exception as error:  # a thread that dies silently would leave the viewport waiting for ever
-                self.error, share = f"{type(error).__name__}: {error}", 1.0
-            took = time.perf_counter() - begin
-            if share < 1 or took < PATIENCE_S:
-                self._share = float(np.clip(self._share * np.sqrt(PATIENCE_S / max(took, 1e-3)), COARSEST, 1.0))
-            done = wish
-            self._shown()
+                self.error, scale = str(error), 1.0
+            except Exception as error:  # shown in the viewport: an exception would end the thread unseen
+                self.error, scale = f"{type(error).__name__}: {error}", 1.0
+            self._adapt_scale(scale, time.perf_counter() - begin)
+            with self._lock:
+                self._has_update = True
+
+    def _next_step(self, last: RenderRequest | None, scale: float) -> tuple[RenderRequest, float] | None:
+        """The request to render now and its scale; None ends the thread. last, scale: the image just rendered."""
+        with self._lock:
+            latest = self._request
+            if latest is None or (latest is last and scale == 1):
+                self._thread = None
+                return None
+            return latest, 1.0 if latest is last else self._moving_scale
+
+    def _adapt_scale(self, scale: float, elapsed_s: float) -> None:
+        if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
+            factor = np.sqrt(MAX_RENDER_TIME_S / max(elapsed_s, 1e-3))
+            self._moving_scale = float(np.clip(self._moving_scale * factor, MIN_SCALE, 1.0))
 
 
-def painted(painter: RenderClient, combine: Callable[..., np.ndarray], wish: Wish, share: float) -> np.ndarray:
-    """(H, W, 4) float32 for the GPU, bottom row first."""
-    picture = painter.compose(wish.layers, wish.camera.scaled(share))
-    return np.ascontiguousarray(combine(picture.rgb, picture.alpha, wish.world)[::-1])
-
-
-class Screen:
-    """A picture on the GPU."""
+class ViewportImage:
+    """An image as a GPU texture."""
 
     def __init__(self) -> None:
-        self._shown: np.ndarray | None = None
+        self._uploaded: np.ndarray | None = None
         self._texture: Any = None
 
-    def draw(self, picture: np.ndarray, width: int, height: int) -> None:
-        """Draw a picture (H, W, 4) over a region of that size."""
+    def draw(self, image: np.ndarray, width: int, height: int) -> None:
+        """Draw an image (H, W, 4), bottom row first, over a region of width × height pixels."""
         import gpu
         from gpu_extras.presets import draw_texture_2d
 
-        if picture is not self._shown:
-            rows, columns, _ = picture.shape
-            pixels = gpu.types.Buffer("FLOAT", picture.size, picture.ravel())
+        if image is not self._uploaded:
+            rows, columns, _ = image.shape
+            pixels = gpu.types.Buffer("FLOAT", image.size, image.ravel())
             self._texture = gpu.types.GPUTexture((columns, rows), format="RGBA16F", data=pixels)
-            self._shown = picture
+            self._uploaded = image
         gpu.state.blend_set("ALPHA_PREMULT")
         draw_texture_2d(self._texture, (0, 0), width, height)
         gpu.state.blend_set("NONE")

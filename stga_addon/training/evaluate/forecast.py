@@ -107,10 +107,10 @@ def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
 
 
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
-    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times."""
+    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times or values not finite."""
     curve: list[tuple[float, float]] = []
     for line in lines:
-        if key in line and (not curve or line["seconds"] > curve[-1][0]):
+        if key in line and np.isfinite(line[key]) and (not curve or line["seconds"] > curve[-1][0]):
             curve.append((line["seconds"], line[key]))
     return curve
 

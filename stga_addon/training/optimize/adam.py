@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import adam_rows
-from ...raster.cpu.rasterize import Parameters
 from .state import TrainState
 
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)

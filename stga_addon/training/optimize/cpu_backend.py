@@ -5,15 +5,9 @@ import numpy as np
 from ...avatar.embedding import frame_backward
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
+from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import distance_limit, scale_limit
-from ...raster.cpu.rasterize import (
-    BufferPool,
-    Parameters,
-    RenderOutput,
-    frames_in_camera,
-    render_backward,
-    render_forward,
-)
+from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..settings import TrainingSettings
 from . import adam
 from .backend import Batch

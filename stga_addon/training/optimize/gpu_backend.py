@@ -14,7 +14,7 @@ import warp as wp
 from ...capture.model import View
 from ...errors import StgaError
 from ...raster.cpu.image_loss import LOSS_REACH_PX
-from ...raster.cpu.rasterize import Parameters
+from ...raster.cpu.layout import Parameters
 from ...raster.gpu import optimizer
 from ...raster.gpu.embed import Embedding
 from ...raster.gpu.image_loss import change_background, image_loss_gradient

@@ -12,10 +12,10 @@ from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
-from ...raster.cpu.layout import PROJECTED
+from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
 from ...raster.cpu.optimizer import distance_limit, scale_limit
 from ...raster.cpu.project import project_backward
-from ...raster.cpu.rasterize import Parameters, frames_in_camera, render_backward, render_forward, with_strain_color
+from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
 from ...worker.launch import same_interpreter_environment
 from . import adam
 from .losses import image_gradient, whole_image
@@ -98,12 +98,13 @@ def _second_half() -> None:
 def _project_backward() -> None:
     """Two splats that no tile contains."""
     state = _pair()
-    seen, none = frames_in_camera(WORLD, CAMERA), np.zeros(2, np.int32)
+    frames, none = frames_in_camera(WORLD, CAMERA), np.zeros(2, np.int32)
     gradients = Parameters(*(g.numpy() for g in state.gradients))
+    lists = TileLists(none, none, none, none, np.zeros(2, np.int64), none)
+    table = np.ones((2, PROJECTED), np.float32)
     project_backward(
-        none, *with_strain_color(state.arrays()), 3, state.face.numpy(), seen.origin, seen.matrix, seen.strain,
-        seen.to_world, seen.intrinsics, seen.size, False, False, np.ones((2, PROJECTED), np.float32), none, none, none,
-        np.zeros((2, PROJECTED), np.float32), *with_strain_color(gradients), np.zeros(2, np.float32),
+        none, with_strain_color(state.arrays()), state.face.numpy(), frames, 3, False, False, table, lists,
+        table, with_strain_color(gradients), np.zeros(2, np.float32),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ...avatar.splats import Splats
-from ...raster.cpu.rasterize import Parameters
+from ...raster.cpu.layout import Parameters
 
 
 @dataclass

@@ -16,7 +16,7 @@ from ...files import read_npz, write_npz
 from ...flame.forward import FlameFrame
 from ...flame.forward_torch import flame_forward, flame_tensors
 from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion, sequence_mesh, with_identity
-from ...raster.cpu.rasterize import Parameters
+from ...raster.cpu.layout import Parameters
 from ..effect_plan import TRACKING
 
 REFINEMENT_START_SHARE = 0.15

@@ -1,4 +1,4 @@
-"""The made capture: Blender's pictures against the geometry and cameras that the files claim."""
+"""Synthetic capture: Blender's pictures against the geometry and cameras in the files."""
 
 import json
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_pictures_show_the_mesh_where_the_cameras_say(capture: Path) -> None:
 
 
 def test_the_head_is_a_face_not_a_shade(capture: Path) -> None:
-    # Catches black renders, lost colours and missing texture.
+    # Catches black renders, lost colors and missing texture.
     image = np.asarray(Image.open(capture / "images/00000_01.png")).astype(float)
     mask = np.asarray(Image.open(capture / "fg_masks/00000_01.png")) > 250
     assert 0.2 < mask.mean() < 0.6

@@ -7,20 +7,11 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from stga_addon.development.demo.head import (
-    EXPRESSIONS,
-    EYE,
-    EYE_RADIUS,
-    IDENTITY,
-    JOINTS_AT,
-    PARTS,
-    Head,
-    hair_offset,
-    synthetic_flame,
-    synthetic_head,
-    write_flame,
-)
+from stga_addon.development.demo.blend_shapes import EXPRESSIONS, IDENTITY
+from stga_addon.development.demo.head import JOINT_POSITIONS, Head, synthetic_flame, synthetic_head, write_flame
+from stga_addon.development.demo.head_mesh import PARTS
 from stga_addon.development.demo.paint import paint
+from stga_addon.development.demo.skin import EYE, EYE_RADIUS, hair_offset
 from stga_addon.flame.forward import FlameFrame, flame_forward, neutral_frame
 from stga_addon.flame.masks import key_regions
 from stga_addon.flame.model import FlameModel, read_flame
@@ -117,7 +108,7 @@ def test_skinning_is_a_partition(head: Head) -> None:
     assert model.weights.min() >= 0
     np.testing.assert_allclose(model.weights.sum(1), 1, atol=1e-12)
     np.testing.assert_allclose(model.j_regressor.sum(1), 1, atol=1e-9)
-    np.testing.assert_allclose(model.j_regressor @ head.rest, JOINTS_AT, atol=1e-9)
+    np.testing.assert_allclose(model.j_regressor @ head.rest, JOINT_POSITIONS, atol=1e-9)
     np.testing.assert_array_equal(model.weights[model.masks["left_eyeball"], 3], 1)
     np.testing.assert_array_equal(model.weights[model.masks["right_eyeball"], 4], 1)
 
@@ -226,7 +217,7 @@ def test_seeds_are_people() -> None:
 
 
 def test_paint(dense: Head) -> None:
-    # Catches colours out of range, and features painted where they do not belong.
+    # Catches colors out of range, and features painted where they do not belong.
     tint, roughness, grain = paint(dense, 3)
     assert tint.shape == dense.rest.shape
     assert tint.min() >= 0

@@ -1,4 +1,4 @@
-"""The whole chain, small: capture → Blender scene → selection → training → splats that follow the mesh."""
+"""Demo at a small size: capture, Blender scene, selection, training, splats that follow the mesh."""
 
 import json
 
@@ -16,20 +16,20 @@ SMALL = CaptureOptions(train=2, test=1, cameras=6, width=72, height=100, samples
 
 
 @pytest.mark.slow
-def test_the_demo_leaves_what_it_promises(tmp_path):
-    """Catches a broken joint anywhere along the chain that the README's first command shows."""
+def test_demo_writes_its_files(tmp_path):
+    """Catches a break anywhere in the chain of the README's first command."""
     run_demo(tmp_path, 6.0, SMALL)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
-    # Far above what the untrained grey lattice reaches on these images (about 15 dB).
+    # Far above what the untrained gray lattice reaches on these images (about 15 dB).
     assert metrics["val"]["psnr"] > 20
     assert len(read_avatar(tmp_path / "avatar.npz").splats) == metrics["splats"]
     assert Image.open(tmp_path / "comparison.png").size == (4 * 72 + 3 * 6, 100)
     selection = np.asarray(Image.open(tmp_path / "selection.png")).astype(int)
-    coloured = np.ptp(selection, axis=2) > 25
-    grey = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
-    assert coloured.sum() > 50, "no selected splat is shown in colour"
-    assert grey.sum() > 50, "no frozen splat is shown grey"
+    colored = np.ptp(selection, axis=2) > 25
+    gray = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
+    assert colored.sum() > 50, "no selected splat is shown in color"
+    assert gray.sum() > 50, "no frozen splat is shown gray"
 
 
 @pytest.mark.slow

@@ -1,0 +1,91 @@
+"""Files dropped into the 3D viewport: a capture, an avatar or FLAME motion, Gaussian splats."""
+
+import zipfile
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.flame.sequence import ALIASES, FRAME_FIELDS
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from . import ids
+from .apply_motion import ApplyMotion
+from .common import file_path, is_head, reporting, scene_settings
+
+MOTION_FIELDS = {*FRAME_FIELDS, *ALIASES, "pose"}
+
+
+class OpenNpz(bpy.types.Operator):
+    """Open an .npz file by its content: show an avatar, apply a FLAME motion to the head, or import it as a new one"""
+
+    bl_idname = ids.OPEN_NPZ
+    bl_label = "Open Avatar or Motion"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO", "INTERNAL"}
+
+    filepath: bpy.props.StringProperty(
+        name="File",
+        description="Avatar file or FLAME parameters (.npz)",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    )
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        path = file_path(self.filepath, "avatar or motion")
+        if npz_kind(path) == "avatar":
+            if not is_head(scene_settings(context).head):
+                raise StgaError(f"{path}: is an avatar, which needs a head; import a capture first")
+            operator = bpy.ops.stga.show_avatar
+        else:
+            operator = bpy.ops.stga.apply_motion if ApplyMotion.poll(context) else bpy.ops.stga.import_motion
+        try:
+            result: set[str] = operator(filepath=str(path))
+        except RuntimeError as error:
+            raise StgaError(str(error).strip().removeprefix("Error: ")) from error
+        return result
+
+
+def npz_kind(path: Path) -> str:
+    """ "avatar" or "motion". Raises StgaError for any other file."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {name.removesuffix(".npy") for name in archive.namelist()}
+    except (OSError, zipfile.BadZipFile) as error:
+        raise StgaError(
+            f"{path}: cannot be read as an .npz file ({getattr(error, 'strerror', None) or error})"
+        ) from error
+    if {"header", "xyz"} <= names:
+        return "avatar"
+    if names & MOTION_FIELDS:
+        return "motion"
+    raise StgaError(f"{path}: is neither an avatar (no header) nor a FLAME motion (none of {', '.join(FRAME_FIELDS)})")
+
+
+class _ViewportDrop:
+    """Mixin of file handlers: files are accepted by the 3D viewport."""
+
+    @classmethod
+    def poll_drop(cls, context: Any) -> bool:
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+class CaptureDrop(_ViewportDrop, bpy.types.FileHandler):
+    bl_idname = "STGA_FH_capture"
+    bl_label = "Head Capture (STGA)"
+    bl_import_operator = ids.IMPORT_CAPTURE
+    bl_file_extensions = ".json"
+
+
+class AvatarDrop(_ViewportDrop, bpy.types.FileHandler):
+    bl_idname = "STGA_FH_npz"
+    bl_label = "Avatar or FLAME Motion (STGA)"
+    bl_import_operator = ids.OPEN_NPZ
+    bl_file_extensions = ".npz"
+
+
+class PlyDrop(_ViewportDrop, bpy.types.FileHandler):
+    bl_idname = "STGA_FH_ply"
+    bl_label = "Gaussian Splats (STGA)"
+    bl_import_operator = ids.IMPORT_PLY
+    bl_file_extensions = ".ply"

@@ -1,0 +1,128 @@
+"""Node groups that compute triangle frames of the head (`avatar.embedding.face_frames`) and place splats by them."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import bpy
+
+from ...avatar.embedding import SLIVER, UPRIGHT
+from .display_modes import WORLD_ROTATION, WORLD_SCALE
+from .node_builder import NodeGroup, Nodes
+from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, XYZ
+
+# Temporary attributes on the head's faces.
+_FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = "stga_frame_origin", "stga_frame_rotation", "stga_frame_size"
+
+
+def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
+    """The mesh with each triangle's frame stored on its faces."""
+    # Sampling a stored attribute is fast; sampling a field would evaluate it once per splat.
+    origin, rotation, size = _FRAMES[convention](nodes, *nodes.triangle_corners())
+    mesh = nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
+    mesh = nodes.store(mesh, _FRAME_ROTATION, rotation, "QUATERNION", "FACE")
+    return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
+
+
+def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
+    """The splats at their positions in object space, with rotation and scale stored; mesh: from `_stored_frames`."""
+    xyz = nodes.attribute(XYZ, "FLOAT_VECTOR")
+    rotation = nodes.attribute(ROTATION, "QUATERNION")
+    scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
+    if convention is not None:
+        origin, frame_rotation, size = _sampled_frames(nodes, mesh, convention)
+        xyz = nodes.out("FunctionNodeRotateVector", {"Vector": nodes.scale(xyz, size), "Rotation": frame_rotation})
+        xyz = nodes.vector("ADD", xyz, origin)
+        rotations = {"Rotation": rotation, "Rotate By": frame_rotation}
+        rotation = nodes.out("FunctionNodeRotateRotation", rotations, rotation_space="GLOBAL")
+        scale = nodes.scale(scale, size)
+    splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
+    splats = nodes.store(splats, WORLD_ROTATION, rotation, "QUATERNION")
+    return nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
+
+
+def _sampled_frames(nodes: Nodes, mesh: Any, convention: str) -> tuple[Any, Any, Any]:
+    """Origin, rotation and scale of each splat's triangle."""
+    face = nodes.attribute(FACE, "INT")
+
+    def sample(name: str, data_type: str) -> Any:
+        return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
+
+    size = sample(_FRAME_SIZE, "FLOAT")
+    if convention == "stga":
+        neutral = nodes.attribute(NEUTRAL_AREA, "FLOAT")
+        ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
+        # A neutral triangle without area gives no ratio: its splats keep their size.
+        size = nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
+    return sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION"), size
+
+
+def _stga_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
+    """Centroid; axes [n(p0−o), ·, normal]; the triangle's area (its ratio to the neutral area is the square of k)."""
+    origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
+    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    # p0 − origin from the edges: exactly zero where the corners coincide, which a difference to a rounded mean is not.
+    first = nodes.scale(nodes.vector("ADD", edge, side), -1 / 3)
+    rotation, normal, _ = _axes_to_rotation(nodes, first, edge, side, "Z")
+    return origin, rotation, nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
+
+
+def _gaussian_avatars_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
+    """Centroid; axes [n(p1−p0), normal, ·]; mean of the first edge's length and the height over it."""
+    origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
+    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    rotation, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
+    # Height over the edge = |edge × side| / |edge|, or the side where the edge has no length.
+    length = nodes.vector("LENGTH", edge)
+    height = nodes.math("DIVIDE", nodes.vector("LENGTH", normal), length)
+    height = nodes.switch("FLOAT", no_edge, height, nodes.vector("LENGTH", side))
+    return origin, rotation, nodes.math("MULTIPLY", nodes.math("ADD", length, height), 0.5)
+
+
+_FRAMES: dict[str, Callable[..., tuple[Any, Any, Any]]] = {
+    "stga": _stga_frame,
+    "gaussian_avatars": _gaussian_avatars_frame,
+}
+
+
+def _axes_to_rotation(
+    nodes: Nodes, first: Any, edge: Any, side: Any, normal_axis: str
+) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """Rotation whose x axis is `first` exactly, of a triangle with two edges from its first corner.
+
+    Where `first` or the normal is degenerate, it takes the substitutes of `avatar.embedding`; the node's own differ.
+    Returns the rotation, the normal (its length twice the area) and whether `first` is degenerate.
+    """
+    normal = nodes.vector("CROSS_PRODUCT", edge, side)
+    lengths = [nodes.vector("LENGTH", v) for v in (edge, side, nodes.vector("SUBTRACT", edge, side))]
+    longest = nodes.math("MAXIMUM", nodes.math("MAXIMUM", lengths[0], lengths[1]), lengths[2])
+    no_first = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", first), nodes.math("MULTIPLY", longest, SLIVER))
+    limit = nodes.math("MULTIPLY", nodes.math("MULTIPLY", longest, longest), 2 * SLIVER)
+    no_normal = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", normal), limit)
+    first = nodes.switch("VECTOR", no_first, nodes.vector("NORMALIZE", first), (1, 0, 0))
+    z = nodes.math("ABSOLUTE", nodes.vector("DOT_PRODUCT", first, (0, 0, 1)))
+    helper = nodes.switch("VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT), (0, 0, 1), (1, 0, 0))
+    second = nodes.vector("CROSS_PRODUCT", first, helper)
+    second = nodes.switch("VECTOR", no_normal, nodes.vector("NORMALIZE", normal), second)
+    axes = {"Primary Axis": first, "Secondary Axis": second}
+    rotation = nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="X", secondary_axis=normal_axis)
+    return rotation, normal, no_first
+
+
+FRAMES = {
+    convention: NodeGroup(
+        f"STGA Triangle Frames ({convention})", {"Mesh": "Geometry"}, "Geometry", partial(_stored_frames, convention)
+    )
+    for convention in _FRAMES
+}
+"""Head mesh -> the mesh with frames, by convention."""
+PLACED: dict[str | None, NodeGroup] = {
+    convention: NodeGroup(
+        f"STGA Place Splats ({convention or 'world'})",
+        {"Splats": "Geometry"} | ({"Frames": "Geometry"} if convention else {}),
+        "Geometry",
+        partial(_placed_splats, convention),
+    )
+    for convention in (None, *_FRAMES)
+}
+"""Splats (and the mesh with frames) -> splats in object space, by convention; None for world space."""

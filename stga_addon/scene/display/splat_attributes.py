@@ -1,0 +1,132 @@
+"""Splats as attributes of a Blender mesh: their names, how they are written, how they are read back."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...avatar.embedding import face_areas
+from ...avatar.file import Avatar
+from ...avatar.splats import SH_C0, Splats
+from ...avatar.strain import STRAINS, StrainBasis, strain_basis
+from ..arrays import flat_floats, read_values
+from .colors import srgb_to_linear
+
+# On the vertices of a splat object.
+XYZ = "stga_xyz"
+ROTATION = "stga_rotation"
+SCALE = "stga_scale"  # standard deviations, linear
+OPACITY = "stga_opacity"  # 0 to 1
+COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
+SH = "stga_sh_{}"  # sRGB coefficients, by index
+STRAIN_COLOR = "stga_strain_color_{}"
+FACE = "stga_face"
+NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²
+
+# On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz and xy yz zx.
+TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
+GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
+
+Attributes = dict[str, tuple[str, str, np.ndarray]]
+"""Name -> (data type, name of the element's field, flat values)."""
+
+
+@dataclass(frozen=True)
+class SplatAttributes:
+    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh."""
+
+    splats: Attributes
+    neutral: Attributes
+
+
+def avatar_attributes(avatar: Avatar) -> SplatAttributes:
+    """What displaying an avatar writes into Blender; uses no bpy, so that a thread can compute it."""
+    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
+    splats = {
+        **splat_attributes(avatar.splats),
+        FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
+        NEUTRAL_AREA: ("FLOAT", "value", flat_floats(area)),
+    }
+    neutral: Attributes = {}
+    if avatar.splats.strain_color.shape[1]:
+        vectors = _strain_vectors(strain_basis(avatar.neutral, avatar.faces))
+        neutral = {name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors}
+    return SplatAttributes(splats, neutral)
+
+
+def splat_attributes(splats: Splats) -> Attributes:
+    """The splats' activated values: unit rotations, linear scales, opacities of 0 to 1."""
+    norm = np.linalg.norm(splats.rotation, axis=-1, keepdims=True)
+    rotation = np.where(norm > 0, splats.rotation / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
+    attributes = {
+        XYZ: ("FLOAT_VECTOR", "vector", flat_floats(splats.xyz)),
+        ROTATION: ("QUATERNION", "value", flat_floats(rotation)),
+        SCALE: ("FLOAT_VECTOR", "vector", flat_floats(np.exp(splats.log_scale.astype(np.float64)))),
+        OPACITY: ("FLOAT", "value", flat_floats(1 / (1 + np.exp(-splats.opacity.astype(np.float64))))),
+        COLOR: ("FLOAT_COLOR", "color", flat_floats(_base_color(splats.sh[:, 0]))),
+    }
+    for name, coefficients in ((SH, splats.sh), (STRAIN_COLOR, splats.strain_color)):
+        for index in range(coefficients.shape[1]):
+            attributes[name.format(index)] = ("FLOAT_VECTOR", "vector", flat_floats(coefficients[:, index]))
+    return attributes
+
+
+def write_splats(mesh: Any, attributes: Attributes) -> None:
+    """Give the mesh one vertex per splat, with these attributes; overwrites what there is in place."""
+    positions = attributes[XYZ][2]
+    if len(mesh.vertices) != len(positions) // 3:
+        mesh.clear_geometry()
+        mesh.vertices.add(len(positions) // 3)
+    # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
+    write_attributes(mesh, {"position": ("FLOAT_VECTOR", "vector", positions), **attributes}, "POINT")
+    mesh.update()
+
+
+def write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
+    """Set attributes of a mesh on one domain ("POINT", "FACE"); makes those that it lacks."""
+    for name, (data_type, field, values) in attributes.items():
+        attribute = mesh.attributes.get(name) or mesh.attributes.new(name, data_type, domain)
+        attribute.data.foreach_set(field, values)
+
+
+def read_splats(mesh: Any) -> Splats:
+    """The splats stored in a splat object's mesh, with unit rotations; all count as bound to their triangles."""
+    attributes = mesh.attributes
+    count = len(mesh.vertices)
+
+    def coefficients(name: str) -> np.ndarray:
+        found: list[np.ndarray] = []
+        while name.format(len(found)) in attributes:
+            found.append(read_values(attributes[name.format(len(found))].data, "vector", 3))
+        return np.stack(found, 1) if found else np.zeros((count, 0, 3), np.float32)
+
+    opacity = read_values(attributes[OPACITY].data, "value", 1)[:, 0].astype(np.float64)
+    scale = read_values(attributes[SCALE].data, "vector", 3).astype(np.float64)
+    face = read_values(attributes[FACE].data, "value", 1, np.int32)[:, 0] if FACE in attributes else None
+    with np.errstate(divide="ignore"):  # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels accept
+        return Splats(
+            xyz=read_values(attributes[XYZ].data, "vector", 3),
+            rotation=read_values(attributes[ROTATION].data, "value", 4),
+            log_scale=np.log(scale).astype(np.float32),
+            opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
+            sh=coefficients(SH),
+            face=np.zeros(count, np.int32) if face is None else face,
+            unbound=np.zeros(count, bool),
+            strain_color=coefficients(STRAIN_COLOR),
+        )
+
+
+def _base_color(dc: np.ndarray) -> np.ndarray:
+    """(N, 4) scene-linear RGBA, as color attributes are stored; the SH coefficients (N, 3) give sRGB."""
+    linear = srgb_to_linear(np.clip(0.5 + SH_C0 * np.asarray(dc, np.float64), 0.0, 1.0))
+    return np.concatenate([linear, np.ones((len(dc), 1))], axis=-1)
+
+
+def _strain_vectors(basis: StrainBasis) -> Iterator[tuple[str, np.ndarray]]:
+    """What the color nodes need to compute strain: name and vector (F, 3)."""
+    yield GRAM, basis.gram
+    for name, tensors in ((TENSOR, basis.to_tensor), (PLANE, basis.to_plane)):
+        for index in range(STRAINS):
+            for start, half in zip((0, 3), TENSOR_HALVES, strict=True):
+                yield name.format(index, half), tensors[:, index, start : start + 3]

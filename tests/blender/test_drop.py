@@ -1,0 +1,102 @@
+"""Files dropped into the viewport: which operator a handler calls, and what that makes of the file."""
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
+
+from .test_import_operators import ball_avatar, write_motion  # noqa: E402
+
+HANDLERS = {
+    "STGA_FH_capture": (".json", "stga.import_capture"),
+    "STGA_FH_npz": (".npz", "stga.open_npz"),
+    "STGA_FH_ply": (".ply", "stga.import_ply"),
+}
+
+
+@pytest.fixture(autouse=True)
+def _empty_scene(extension):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture
+def head(tmp_path):
+    """A rigged head."""
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    return bpy.context.scene.stga.head
+
+
+@pytest.mark.parametrize("name", HANDLERS)
+def test_handlers_call_operators_that_take_a_file(name):
+    """Catches a handler whose operator does not exist, or has no property for the path that Blender passes."""
+    handler = getattr(bpy.types, name)
+    extensions, operator = HANDLERS[name]
+    assert (handler.bl_file_extensions, handler.bl_import_operator) == (extensions, operator)
+    group, _, function = operator.partition(".")
+    properties = getattr(getattr(bpy.ops, group), function).get_rna_type().properties
+    assert properties["filepath"].subtype == "FILE_PATH"
+    assert properties["filepath"].is_skip_save
+
+
+def test_drops_are_accepted_by_the_viewport_only():
+    """Catches a capture that is imported because its JSON was dropped into the text editor."""
+    from types import SimpleNamespace
+
+    for name in HANDLERS:
+        poll = getattr(bpy.types, name).poll_drop
+        assert poll(SimpleNamespace(area=SimpleNamespace(type="VIEW_3D")))
+        assert not poll(SimpleNamespace(area=SimpleNamespace(type="TEXT_EDITOR")))
+        assert not poll(SimpleNamespace(area=None))
+
+
+def test_transforms_file_stands_for_its_capture(tmp_path):
+    """Catches a drop that imports nothing, and one that takes any JSON file for a capture."""
+    folder = write_mesh_capture(tmp_path / "capture")
+    for name in ("notes.json", "regions.json"):
+        (folder / name).write_text("{}")
+        with pytest.raises(RuntimeError, match=rf"{name}: is not a transforms file; choose"):
+            bpy.ops.stga.import_capture(filepath=str(folder / name))
+    assert bpy.ops.stga.import_capture(filepath=str(folder / "transforms_train.json")) == {"FINISHED"}
+    assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
+
+
+def test_avatar_is_shown(head, tmp_path):
+    """Catches an avatar that is taken for a motion: both are .npz files with an array `rotation`."""
+    assert bpy.ops.stga.open_npz(filepath=str(ball_avatar(tmp_path / "a.npz"))) == {"FINISHED"}
+    assert bpy.context.scene.stga.splats is not None
+
+
+def test_motion_is_applied_to_the_head(head, tmp_path):
+    """Catches a motion that arrives as a second head."""
+    objects = len(bpy.data.objects)
+    assert bpy.ops.stga.open_npz(filepath=str(write_motion(tmp_path / "smile.npz"))) == {"FINISHED"}
+    assert len(bpy.data.objects) == objects
+    assert [action for action in bpy.data.actions if "smile" in action.name]
+
+
+def test_motion_without_a_head_needs_a_model(tmp_path):
+    """Catches a motion that cannot be dropped into an empty scene, and a traceback where the model is missing."""
+    with pytest.raises(RuntimeError, match=r"^Error: .*smile\.npz: .* choose your FLAME model"):
+        bpy.ops.stga.open_npz(filepath=str(write_motion(tmp_path / "smile.npz")))
+
+
+def test_avatar_without_a_head_is_a_sentence(tmp_path):
+    """Catches a poll that fails with the name of a Python function."""
+    with pytest.raises(RuntimeError, match=r"^Error: .*a\.npz: .*import a capture first"):
+        bpy.ops.stga.open_npz(filepath=str(ball_avatar(tmp_path / "a.npz")))
+
+
+def test_other_files_are_refused(tmp_path):
+    """Catches a traceback, or an error about FLAME, for a file that is neither avatar nor motion."""
+    np.savez(tmp_path / "other.npz", values=np.zeros(3))
+    (tmp_path / "noise.npz").write_bytes(b"no archive")
+    for name, sentence in (
+        ("other.npz", "is neither an avatar .* nor a FLAME motion"),
+        ("noise.npz", "cannot be read as an .npz file"),
+        ("gone.npz", "cannot be read as an .npz file"),
+    ):
+        with pytest.raises(RuntimeError, match=f"^Error: .*{name}: {sentence}"):
+            bpy.ops.stga.open_npz(filepath=str(tmp_path / name))
