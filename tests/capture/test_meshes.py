@@ -125,16 +125,18 @@ def test_topology_must_not_change(tmp_path: Path) -> None:
     vertices, faces = factory.ball()
     swapped = faces.copy()
     swapped[[7, 8]] = swapped[[8, 7]]
-    files = {0: tmp_path / "0.obj", 1: tmp_path / "1.obj", 2: tmp_path / "2.obj"}
-    for path, triangles in zip(files.values(), (faces, faces[:-1], swapped), strict=True):
-        factory.write_mesh(path, vertices, triangles)
-    mesh = tracked_meshes(files, faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh)
+    files = {number: tmp_path / f"{number}.obj" for number in range(4)}
+    for path, triangles in zip(files.values(), (faces, faces[:-1], swapped, faces), strict=True):
+        factory.write_mesh(path, vertices if path != files[3] else np.vstack([vertices, [0, 0, 0]]), triangles)
+    mesh = tracked_meshes(files, len(vertices), faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh)
     np.testing.assert_allclose(mesh(0), vertices, atol=1e-9)
     with pytest.raises(StgaError, match=r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"):
         mesh(1)
     with pytest.raises(StgaError, match=r"2\.obj: triangle 7 joins vertices"):
         mesh(2)
-    with pytest.raises(StgaError, match="timestep 9 has no tracked mesh; the capture has 0 to 2"):
+    with pytest.raises(StgaError, match=r"3\.obj: has 163 vertices, but .*neutral\.obj has 162"):
+        mesh(3)
+    with pytest.raises(StgaError, match="timestep 9 has no tracked mesh; the capture has 0 to 3"):
         mesh(9)
 
 

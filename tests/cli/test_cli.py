@@ -21,7 +21,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli import info
 from stga_addon.cli.main import main, make_parser
 from stga_addon.errors import StgaError
-from stga_addon.training.run.folder import read_checkpoint, read_run
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import read_run
 
 TIMESTEPS, CAMERAS = (0, 1, 3), range(3)
 
@@ -279,12 +280,13 @@ def test_a_second_run_into_the_same_folder(trained: Path, root: Path, capsys: py
 def test_resuming_what_is_not_there(
     trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a new run started by a mistyped folder, and one continued with another capture."""
+    """Catches a new run started by a mistyped folder, and one resumed on another capture."""
     message = refused(capsys, "train", root, "--out", tmp_path / "none", "--resume")
     assert "holds no run" in message
     assert not (tmp_path / "none").exists()
-    other = factory.write_mesh_capture(tmp_path / "other", TIMESTEPS, CAMERAS)
-    assert f"this run trains {root.resolve()}, not" in refused(capsys, "train", other, "--out", trained, "--resume")
+    other = factory.write_mesh_capture(tmp_path / "other", TIMESTEPS, range(5))
+    message = refused(capsys, "train", other, "--out", trained, "--resume")
+    assert f"was trained on {root.resolve()} (4 cameras, 4 timesteps), but {other} (5 cameras" in message
 
 
 @pytest.mark.parametrize("option", [["--stop-when-flat"], ["--target-psnr", 30], ["--preset", "final"], ["--seed", 5]])
@@ -429,7 +431,7 @@ def test_splits_that_are_not_there(
     moved.mkdir()
     (moved / "run.json").write_text(json.dumps({**run, "capture": str(bare)}))
     (moved / "avatar.npz").write_bytes((trained / "avatar.npz").read_bytes())
-    assert "has no views in the split 'test'" in refused(capsys, "eval", moved, "--split", "test")
+    assert "has other images" in refused(capsys, "eval", moved, "--split", "test")
 
 
 # The entry point

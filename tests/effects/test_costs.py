@@ -14,7 +14,8 @@ from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.run import loop
-from stga_addon.training.run.folder import Run, read_checkpoint
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
 
 from .test_rules import unlike_cameras

@@ -84,7 +84,7 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
         again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
         assert main([*again, "--effect", "strain-color=on"]) == 2
-        assert "--effect: " in capsys.readouterr().err
+        assert "--effect cannot be combined with" in capsys.readouterr().err
 
 
 def test_settings_that_ask_for_nothing(root):

@@ -398,10 +398,10 @@ def mutate_bytes(rng: random.Random, path: Path) -> str:
 
 def mutate_json(rng: random.Random, path: Path) -> str:
     """Replace, delete, add or copy one value, at any depth."""
-    lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
     try:
-        document = [json.loads(line) for line in lines]
-    except ValueError:  # an earlier damage
+        text = path.read_text(encoding="utf-8")
+        document = [json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])]
+    except (ValueError, RecursionError):  # an earlier damage
         return mutate_bytes(rng, path)
     node: Any = document
     trail: list[Any] = []

@@ -39,7 +39,9 @@ from stga_addon.errors import StgaError
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
+from stga_addon.training.run import metrics_log
 
 from .conftest import SECONDS
 
@@ -122,7 +124,8 @@ def seen(path: Path) -> None:
 
 def metrics(path: Path) -> None:
     for n in range(3):
-        run_folder.append_metrics(path.parent, {"iteration": n, "psnr": 20.5})
+        times = {"seconds": float(n), "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
+        metrics_log.append_metrics(path.parent, {"iteration": n, **times, "psnr": 20.5, "ssim": 0.9})
 
 
 TARGETS = {
@@ -149,15 +152,15 @@ TARGETS = {
     ),
     "checkpoint": Target(
         "checkpoint.npz",
-        lambda path: run_folder.write_checkpoint(path.parent, make_checkpoint()),
-        lambda path: run_folder.read_checkpoint(path.parent),
+        lambda path: checkpoints.write_checkpoint(path.parent, make_checkpoint()),
+        lambda path: checkpoints.read_checkpoint(path.parent),
     ),
     "selection": Target(
         "selection.npz",
-        lambda path: run_folder.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}),
-        lambda path: run_folder.read_selection(path.parent, 5),
+        lambda path: checkpoints.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}, "a"),
+        lambda path: checkpoints.read_selection(path.parent, 5),
     ),
-    "metrics": Target("metrics.jsonl", metrics, lambda path: run_folder.read_metrics(path.parent)),
+    "metrics": Target("metrics.jsonl", metrics, lambda path: metrics_log.read_metrics(path.parent)),
 }
 
 INTERESTING = [b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\0" * 8, b"-1", b"1e999", b"99999999999", b"NaN", b"[", b"]"]

@@ -1,6 +1,7 @@
 """The iteration on a Warp device, which here is Warp's CPU device, against the CPU's: states, freezing, whole runs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
-from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
@@ -190,7 +193,8 @@ def runs(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Callable[[st
     """Folders of the same run, from start to end, by device."""
     folder = tmp_path_factory.mktemp("runs")
     for device in ("cpu", "warp-cpu"):
-        train(toy, folder / device, make_run(toy, "selective", iterations=40, strain_color=True), device=device)
+        run = make_run(toy, "selective", iterations=40, strain_color=True)
+        train(toy, folder / device, replace(run, device=device))
     return lambda device: folder / device
 
 
@@ -207,8 +211,8 @@ def test_a_run_reaches_the_cpus_quality(runs: Callable[[str], Path]) -> None:
 @pytest.mark.slow
 def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, runs: Callable[[str], Path], tmp_path: Path) -> None:
     """Catches anything queued that a checkpoint misses, and sums that depend on chance: every bit must agree."""
-    run: Run = make_run(toy, "selective", iterations=40, strain_color=True)
-    train(toy, tmp_path, run, report=stop_at(17), device="warp-cpu")
+    run: Run = replace(make_run(toy, "selective", iterations=40, strain_color=True), device="warp-cpu")
+    train(toy, tmp_path, run, report=stop_at(17))
     assert read_checkpoint(tmp_path).iteration == 17
-    train(toy, tmp_path, run, resume=True, device="warp-cpu")
+    train(toy, tmp_path, run, resume=True)
     assert_same_state(tmp_path, runs("warp-cpu"))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...capture.model import Capture, View
-from ..run.folder import Checkpoint
+from ..run.checkpoint import Checkpoint
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .backend import Batch
