@@ -70,7 +70,7 @@ def _mesh_capture(
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
         warnings.append(f"{regions_file}: no triangle lies in {', '.join(empty)}")
-    mesh = tracked_meshes(files, faces, canonical, read_mesh)
+    mesh = tracked_meshes(files, len(neutral), faces, canonical, read_mesh)
     return Capture(
         root=root,
         layout="mesh",

@@ -70,11 +70,15 @@ def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
 
 
 def tracked_meshes(
-    files: Mapping[int, Path], faces: np.ndarray, canonical: Path, read: Callable[[Path], tuple[np.ndarray, np.ndarray]]
+    files: Mapping[int, Path],
+    count: int,
+    faces: np.ndarray,
+    canonical: Path,
+    read: Callable[[Path], tuple[np.ndarray, np.ndarray]],
 ) -> Callable[[int], np.ndarray]:
     """timestep -> its vertices (V, 3), parsed when called and cached.
 
-    Raises StgaError where a file's triangles are not exactly `faces`, those of the file `canonical`.
+    Raises StgaError where a file has not exactly the `count` vertices and the `faces` of the file `canonical`.
     """
 
     def mesh(timestep: int) -> np.ndarray:
@@ -90,9 +94,13 @@ def tracked_meshes(
                 f"{path}: triangle {different} joins vertices {own[different].tolist()}, "
                 f"but {faces[different].tolist()} in {canonical}; the topology must not change"
             )
+        if len(vertices) != count:
+            raise StgaError(
+                f"{path}: has {len(vertices)} vertices, but {canonical} has {count}; the topology must not change"
+            )
         return vertices
 
-    return cached_meshes(mesh, int(faces.max()) + 1)
+    return cached_meshes(mesh, count)
 
 
 def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:

@@ -28,7 +28,7 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
         raise StgaError(f"{root}: its transforms hold no frame; expected a keyframe for each mesh in {root / 'meshes'}")
     canonical = files[timesteps[0]]
     neutral, faces = read_soup(canonical)
-    mesh = tracked_meshes(files, faces, canonical, read_soup)
+    mesh = tracked_meshes(files, len(neutral), faces, canonical, read_soup)
     chosen = {timestep: root / "training_faces" / f"{timestep:04d}.npy" for timestep in timesteps}
     return Capture(
         root=root,
@@ -48,7 +48,7 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
 
 
 def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, metres.
+    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, meters.
 
     The layout has no shared vertices. Raises StgaError naming the file and the field.
     """
