@@ -1,4 +1,4 @@
-"""Auto decides right: scenes of which it is known what their colours depend on."""
+"""Auto decides right: scenes of which it is known what their colors depend on."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -32,13 +32,13 @@ def on(plan):
 
 
 def test_plain(painted):
-    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colours is there."""
+    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there."""
     plan, settings = planned(painted())
     assert on(plan) == {"antialiasing", "background", "density"}
     assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
 
 
-def test_colour_that_follows_strain(painted):
+def test_color_that_follows_strain(painted):
     """Catches wrinkles that are not seen, or are taken for the cameras' doing."""
     plan, settings = planned(painted(paint=wrinkles))
     assert on(plan) == {"antialiasing", "background", "density", "strain-color"}
@@ -46,7 +46,7 @@ def test_colour_that_follows_strain(painted):
     assert float(plan["strain-color"].reason.split("by ")[1].split()[0]) > 5
 
 
-def test_colour_that_follows_the_view(painted):
+def test_color_that_follows_the_view(painted):
     """Catches gloss that is not seen, or is taken for the cameras' exposure."""
     plan, settings = planned(painted(paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density", "view-color"}
@@ -66,7 +66,7 @@ def test_cameras_of_different_exposure(painted):
     assert on(plan) == {"antialiasing", "background", "density", "exposure"}
     rows = np.array(settings.exposure)
     assert rows[:, 0].tolist() == list(range(8))
-    for level in (80, 120, 160):  # what the ball's colours are
+    for level in (80, 120, 160):  # what the ball's colors are
         truth, found = gain * level + offset, rows[:, 1:4] * level + rows[:, 4:]
         assert abs(found - truth).max() < 2.0
     assert abs(gain * 120 + offset - 120).max() > 8.0
@@ -93,7 +93,7 @@ def test_one_frame(painted):
 
 
 def test_background(painted):
-    """Catches a background that is guessed without masks, and a wrong colour that splats are trained against."""
+    """Catches a background that is guessed without masks, and a wrong color that splats are trained against."""
     plan, settings = planned(painted(background=(0, 0, 0)))
     assert plan["background"].on
     assert settings.background == (0.0, 0.0, 0.0)
@@ -105,7 +105,7 @@ def test_background(painted):
 
 
 def test_a_room_behind_the_head(painted):
-    """Catches a background of many colours that is exchanged as if it had one."""
+    """Catches a background of many colors that is exchanged as if it had one."""
     facts = CaptureFacts(painted(), make_settings(iterations=1))
     facts.samples = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
     verdict = rules.background(facts)
@@ -195,9 +195,9 @@ def test_dynamic_offsets():
     assert (found.on, found.only) == (True, True)
 
 
-def off_track(capture, metres, device="cpu"):
+def off_track(capture, meters, device="cpu"):
     """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
-    meshes = {timestep: capture.mesh(timestep) + np.array([metres, 0, 0]) for timestep in capture.timesteps}
+    meshes = {timestep: capture.mesh(timestep) + np.array([meters, 0, 0]) for timestep in capture.timesteps}
     facts = CaptureFacts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
     facts.frames = [frame()]
     return facts
@@ -247,7 +247,7 @@ def test_names():
 
 
 def test_samples(painted):
-    """Catches colours that are taken beside their triangle or from one that another hides."""
+    """Catches colors that are taken beside their triangle or from one that another hides."""
     capture = painted()
     samples = take_samples(capture)
     assert samples.seen.any(0).mean() > 0.5
@@ -262,7 +262,7 @@ def test_samples(painted):
 
 
 def test_hidden_triangles(painted):
-    """Catches colours of whatever stands in front, a hand or the nose, that are taken for the triangle's own."""
+    """Catches colors of whatever stands in front, a hand or the nose, that are taken for the triangle's own."""
     capture = painted()
     plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])  # above the ball's equator
     corners = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(capture.neutral)

@@ -42,7 +42,7 @@ def test_torch_equals_numpy_over_a_batch(tiny_flame: FlameModel) -> None:
     np.testing.assert_allclose(batch, single, atol=1e-12)
 
 
-def test_float32_torch_within_a_micrometre(tiny_flame: FlameModel) -> None:
+def test_float32_torch_within_a_micrometer(tiny_flame: FlameModel) -> None:
     # Catches a loss of precision in the trainer's float32 path (the promise is 1e-6 m).
     frame, shape = random_frame(3, 4), np.random.default_rng(4).normal(size=8)
     vertices = torch_forward(
