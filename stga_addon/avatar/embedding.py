@@ -9,22 +9,22 @@ from .splats import SH_C0, Splats, no_strain_color
 from .strain import StrainBasis, face_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
-TINY = 1e-30
-SLIVER = 1e-4
+MIN_DIVISOR = 1e-30
+MIN_AREA_RATIO = 1e-4
 """A triangle whose area is below this share of its longest edge's square counts as a line.
 
 Vertices on a line, rounded to float32, still span 1e-6 to 1e-5; what such a triangle says of its normal, or of how
 much it grew, is the rounding's.
 """
-UPRIGHT = 0.8  # a unit vector with a larger z counts as upright when a perpendicular to it is sought
+UPRIGHT_COSINE = 0.8  # a unit vector with a larger z counts as upright when a perpendicular to it is sought
 
 
 @dataclass(frozen=True)
 class FaceFrames:
     """Per triangle: world = scale · rotation @ local + origin.
 
-    origin (F, 3) metres, rotation (F, 3, 3) proper, scale (F,).
-    strain (F, S) float32: what colours follow (`avatar.strain`), S = 3, or 0 where nobody asked for it.
+    origin (F, 3) meters, rotation (F, 3, 3) proper, scale (F,).
+    strain (F, S) float32: what colors follow (`avatar.strain`), S = 3, or 0 where nobody asked for it.
     """
 
     origin: np.ndarray
@@ -52,12 +52,12 @@ def face_frames(
 ) -> FaceFrames:
     """Local frame of every triangle of a posed mesh.
 
-    vertices, neutral (V, 3) metres; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
-    basis where colours follow strain.
-    "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit metres of the neutral mesh
+    vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
+    basis where colors follow strain.
+    "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit meters of the neutral mesh
     (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
     unit the triangle (GaussianAvatars' released code).
-    A triangle without area (see SLIVER) keeps a proper rotation and a finite scale.
+    A triangle without area (see MIN_AREA_RATIO) keeps a proper rotation and a finite scale.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     p0, p1, p2 = corners[:, 0], corners[:, 1], corners[:, 2]
@@ -67,13 +67,13 @@ def face_frames(
         first, normal = _orthonormal(((p0 - p1) + (p0 - p2)) / 3, corners)
         rotation = np.stack([first, np.cross(normal, first), normal], axis=-1)
         before = face_areas(neutral, faces)
-        # A triangle that had no area in the neutral mesh has no meaningful ratio: keep the local metres as they are.
-        scale = np.where(before > 0, np.sqrt(_length(_normal(corners)) / 2 / np.maximum(before, TINY)), 1.0)
+        # A triangle that had no area in the neutral mesh has no meaningful ratio: keep the local meters as they are.
+        scale = np.where(before > 0, np.sqrt(_length(_normal(corners)) / 2 / np.maximum(before, MIN_DIVISOR)), 1.0)
     elif convention == "gaussian_avatars":
         edge, side = _length(p1 - p0), _length(p2 - p0)
         first, normal = _orthonormal(p1 - p0, corners)
         rotation = np.stack([first, normal, np.cross(first, normal)], axis=-1)
-        no_edge = edge <= SLIVER * np.sqrt(_longest_squared(corners))
+        no_edge = edge <= MIN_AREA_RATIO * np.sqrt(_longest_squared(corners))
         scale = (edge + np.where(no_edge, side, _length(_normal(corners)) / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
@@ -93,12 +93,12 @@ def frame_backward(
 
     The reverse of `face_frames`, with all vectors in the frame's own axes: force (F, 3) is the gradient with respect to
     the origin, torque (F, 3) to a small rotation of the frame, growth (F,) to the logarithm of its scale. Strain hands
-    nothing on, and a line (see SLIVER) only its force.
+    nothing on, and a line (see MIN_AREA_RATIO) only its force.
     """
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    flat = twice <= np.maximum(2 * SLIVER * _longest_squared(corners), TINY)
+    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _longest_squared(corners), MIN_DIVISOR)
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
     # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left, over twice the area.
     slope_x, slope_y = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area, (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
@@ -113,21 +113,21 @@ def frame_backward(
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area (F,) in square metres of every triangle; exactly 0 where it counts as a line (see SLIVER)."""
+    """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see MIN_AREA_RATIO)."""
     corners = np.asarray(vertices, np.float64)[faces]
     area = _length(_normal(corners)) / 2
-    return np.where(area > np.maximum(SLIVER * _longest_squared(corners), TINY), area, 0.0)
+    return np.where(area > np.maximum(MIN_AREA_RATIO * _longest_squared(corners), MIN_DIVISOR), area, 0.0)
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
     """Bake local splats into world space. SH keep their coefficients: their directions are world directions.
 
-    Colour that follows strain becomes part of the constant coefficient; without strain in `frames` it is left out.
+    Color that follows strain becomes part of the constant coefficient; without strain in `frames` it is left out.
     """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
     rotation = quaternion_multiply(frames.quaternion[face], _unit_quaternion(splats.rotation))
-    log_scale = splats.log_scale + np.log(np.maximum(scale, TINY))[:, None]
+    log_scale = splats.log_scale + np.log(np.maximum(scale, MIN_DIVISOR))[:, None]
     return replace(
         splats,
         xyz=xyz.astype(np.float32),
@@ -140,7 +140,7 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
 
 
 def _strained(splats: Splats, frames: FaceFrames) -> np.ndarray:
-    """The splats' `sh` with the colour of their triangles' strain added."""
+    """The splats' `sh` with the color of their triangles' strain added."""
     if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
         return splats.sh
     sh = splats.sh.copy()
@@ -150,7 +150,7 @@ def _strained(splats: Splats, frames: FaceFrames) -> np.ndarray:
 
 def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
     """Express world-space splats in the frames of the triangles `face` (N,): the inverse of `to_world`."""
-    scale = np.maximum(frames.scale[face], TINY)
+    scale = np.maximum(frames.scale[face], MIN_DIVISOR)
     xyz = np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face]) / scale[:, None]
     inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
     rotation = quaternion_multiply(inverse, _unit_quaternion(world.rotation))
@@ -233,11 +233,11 @@ def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
     """
     longest = _longest_squared(corners)[:, None]
     length = _length(first)[:, None]
-    no_first = length <= SLIVER * np.sqrt(longest)
+    no_first = length <= MIN_AREA_RATIO * np.sqrt(longest)
     first = np.where(no_first, np.array([1.0, 0.0, 0.0]), first / np.where(no_first, 1.0, length))
     normal = _normal(corners)
-    no_normal = _length(normal)[:, None] <= 2 * SLIVER * longest
-    upright = np.abs(first[:, 2:]) > UPRIGHT
+    no_normal = _length(normal)[:, None] <= 2 * MIN_AREA_RATIO * longest
+    upright = np.abs(first[:, 2:]) > UPRIGHT_COSINE
     substitute = np.cross(first, np.where(upright, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
     normal = np.where(no_normal, substitute, normal)
     normal = normal - _dot(normal, first)[:, None] * first

@@ -12,10 +12,10 @@ from ..files import file_size, replacing
 from .splats import MAX_SH_DEGREE, Splats
 
 MAX_HEADER_BYTES = 1 << 16
-REST = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
+REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{i}" for i in range(REST)),
+    *(f"f_rest_{i}" for i in range(REST_COEFFICIENTS)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _DTYPES = {
@@ -59,9 +59,9 @@ def splat_columns(splats: Splats) -> np.ndarray:
     columns = np.zeros((count, len(PROPERTIES)), "<f4")
     columns[:, 0:3] = splats.xyz
     columns[:, 6:9] = splats.sh[:, 0]
-    rest = columns[:, 9 : 9 + REST].reshape(count, 3, REST // 3)
+    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
     rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
-    columns[:, 9 : 9 + REST] = rest.reshape(count, REST)
+    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
     columns[:, 54] = splats.opacity
     columns[:, 55:58] = splats.log_scale
     columns[:, 58:62] = splats.rotation

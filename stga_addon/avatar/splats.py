@@ -7,22 +7,22 @@ import numpy as np
 
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2·sqrt(π)): what a degree-0 coefficient adds to the colour."""
+"""The constant spherical harmonic, 1 / (2·sqrt(π)): what a degree-0 coefficient adds to the color."""
 
 
 @dataclass(frozen=True)
 class Splats:
     """N Gaussians, raw (before activation), float32 unless said.
 
-    xyz        (N, 3) position in the local frame of its face; world metres for a world-space set
-    rotation   (N, 4) quaternion wxyz, not necessarily normalised
+    xyz        (N, 3) position in the local frame of its face; world meters for a world-space set
+    rotation   (N, 4) quaternion wxyz, not necessarily normalized
     log_scale  (N, 3) natural logarithm of the standard deviations
     opacity    (N,) logit
-    sh         (N, K, 3) spherical harmonics, K = (degree + 1)²; colour = 0.5 + Y·sh, clamped at 0
+    sh         (N, K, 3) spherical harmonics, K = (degree + 1)²; color = 0.5 + Y·sh, clamped at 0
     face       (N,) int32 triangle that the splat is bound to; 0 for a world-space set
     unbound      (N,) bool: stands for something outside the mesh (hair, shoulders), so limits that tie a splat
                to its triangle do not apply
-    strain_color  (N, S, 3) colour per unit of its triangle's strain (`avatar.strain`), S = 3, or 0 where colours do
+    strain_color  (N, S, 3) color per unit of its triangle's strain (`avatar.strain`), S = 3, or 0 where colors do
                not depend on deformation; nothing given means 0
     """
 
@@ -52,5 +52,5 @@ class Splats:
 
 
 def no_strain_color(count: int) -> np.ndarray:
-    """The `strain_color` of `count` splats whose colours do not depend on deformation."""
+    """The `strain_color` of `count` splats whose colors do not depend on deformation."""
     return np.zeros((count, 0, 3), np.float32)

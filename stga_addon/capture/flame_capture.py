@@ -36,7 +36,7 @@ def open_flame_capture(
 
     A model of FLAME's published 5023 vertices always gets teeth, because VHAP and GaussianAvatars track and train
     with them; a model of any other size is taken as it is. Shape and static offset come from the first timestep.
-    Raises StgaError, also where the model file is not given: FLAME's licence forbids passing it on.
+    Raises StgaError, also where the model file is not given: FLAME's license forbids passing it on.
     """
     model = _model_for(root, model_file)
     files = parameter_files(root, transforms)

@@ -27,7 +27,7 @@ class Capture:
     """A multi-view recording with a tracked mesh of constant topology per timestep.
 
     faces      (F, 3) int32, shared by all timesteps
-    neutral    (V, 3) float64 metres: the canonical mesh (expression and pose zero)
+    neutral    (V, 3) float64 meters: the canonical mesh (expression and pose zero)
     views      split name ("train", "val", "test") -> its views; empty for a bare mesh sequence
     timesteps  all timesteps that have a mesh, ascending
     regions    key region name -> (F,) bool

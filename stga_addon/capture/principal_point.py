@@ -8,8 +8,8 @@ import numpy as np
 from .camera import Camera
 from .transforms import PRINCIPAL_POINTS, Frame, with_principal_point
 
-VIEWS = 4
-NOTABLY = 0.01  # share of the vertices
+MAX_VIEWS = 4
+MIN_SHARE_DIFFERENCE = 0.01  # share of the vertices
 
 
 def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
@@ -22,14 +22,14 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
     if find_spec("PIL") is None:
         return None
     apart = [frame for frame in frames if _conventions_differ(frame)]
-    spread = np.linspace(0, len(apart) - 1, min(VIEWS, len(apart))).astype(int)
+    spread = np.linspace(0, len(apart) - 1, min(MAX_VIEWS, len(apart))).astype(int)
     outside = [_shares_outside(apart[index], mesh) for index in dict.fromkeys(spread.tolist())]
     known = [shares for shares in outside if shares is not None]
     if not known:
         return None
     share = dict(zip(PRINCIPAL_POINTS, np.mean(known, axis=0).tolist(), strict=True))
     best = min(share, key=lambda convention: share[convention])
-    if share[chosen] < 2 * share[best] + NOTABLY:
+    if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
         return None
     return (
         f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read as {chosen!r}, "

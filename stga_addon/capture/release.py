@@ -48,7 +48,7 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
 
 
 def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, metres.
+    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, meters.
 
     The layout has no shared vertices. Raises StgaError naming the file and the field.
     """

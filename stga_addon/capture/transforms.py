@@ -31,7 +31,7 @@ MATRIX = "a 4x4 matrix of finite numbers"
 class Frame:
     """One entry of a transforms file.
 
-    principal  (cx, cy) in pixels exactly as the file writes them; the image centre where it does not
+    principal  (cx, cy) in pixels exactly as the file writes them; the image center where it does not
     camera_id  the studio's own name of the camera, or None
     mesh, flame  the tracked mesh or FLAME parameters of the frame's timestep, or None
     where      file and entry, to begin messages with

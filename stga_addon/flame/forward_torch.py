@@ -53,7 +53,7 @@ def flame_forward(
     translation: torch.Tensor,
     offset: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Vertices (T, V, 3) in metres of T frames.
+    """Vertices (T, V, 3) in meters of T frames.
 
     shape (I,) or (T, I); expr (T, E); pose (T, 5, 3) axis-angle of root, neck, jaw, left eye, right eye;
     translation (T, 3); offset (V, 3) or (T, V, 3): static plus dynamic offset, or None.

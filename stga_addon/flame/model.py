@@ -22,7 +22,7 @@ MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_tab
 class FlameModel:
     """FLAME's parameters as float64 arrays; V vertices, F triangles, K shape components, joints as in `JOINTS`.
 
-    v_template   (V, 3) metres
+    v_template   (V, 3) meters
     shapedirs    (V, 3, K): the first `n_identity` are identity, the others expression
     posedirs     (V, 3, 36): correctives, linear in the entries of the rotations of joints 1 to 4 minus identity
     j_regressor  (5, V): shaped vertices to joint positions

@@ -19,7 +19,7 @@ PARTS = {
 }
 LINEAR = ("expr", "translation")
 ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
-ROUNDING = 1e-6  # of a timestep: a last frame that arithmetic puts just behind the end still counts
+TIME_TOLERANCE = 1e-6  # of a timestep: a last frame that arithmetic puts just behind the end still counts
 
 
 def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
@@ -29,8 +29,8 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     person's own dynamic offsets are left out.
     """
     times = np.asarray(sequence.timesteps, np.float64)
-    wanted = np.arange(times[0], times[-1] + ROUNDING, step)
-    row = np.clip(np.searchsorted(times, wanted + ROUNDING, side="right") - 1, 0, max(len(times) - 2, 0))
+    wanted = np.arange(times[0], times[-1] + TIME_TOLERANCE, step)
+    row = np.clip(np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1, 0, max(len(times) - 2, 0))
     after = np.minimum(row + 1, len(times) - 1)
     share = (wanted - times[row]) / np.maximum(times[after] - times[row], 1.0)
     tracked = {name: _stacked(sequence, name) for name in (*LINEAR, *ROTATIONS)}
@@ -65,7 +65,7 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
     return changed
 
 
-def driven(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
+def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
     """The motion on the person whose neutral mesh is `neutral` (V, 3), of the same model.
 
     What makes a person, shape and static offset, FLAME adds up before it poses: the difference of the neutral mesh
