@@ -16,8 +16,7 @@ from stga_addon.worker import lock
 from stga_addon.worker.lock import hold_lock, is_locked, lock_owner
 
 HOLD = (
-    "import sys; from pathlib import Path; from stga_addon.worker import lock
-from stga_addon.worker.lock import hold_lock\n"
+    "import sys; from pathlib import Path; from stga_addon.worker.lock import hold_lock\n"
     "with hold_lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
 )
 
