@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stga_addon.report.curve_image import COMING, LINE, MARGIN, SIZE, curve_image
+from stga_addon.report.curve_image import CURVE_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
@@ -28,7 +28,7 @@ def test_the_curve_is_where_the_axes_say():
     pixels, axes = curve_image(lines())
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
     inner = SIZE - 2 * MARGIN
-    for second, color in [(second, LINE) for second in (15, 30, 50, 75)] + [(90, COMING)]:
+    for second, color in [(second, CURVE_COLOR) for second in (15, 30, 50, 75)] + [(90, FORECAST_COLOR)]:
         column = int(MARGIN + second / 100 * inner)
         at = (column + 0.5 - MARGIN) / inner * 100
         like = np.abs(pixels[:, column, :3] - np.array(color)).sum(-1)
