@@ -11,12 +11,14 @@ from stga_addon.report.curve_image import CURVE_COLOR, FORECAST_COLOR, MARGIN, S
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
-AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5}
+AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5, "ahead": 20.0, "gain": 0.8}
+OTHERS = {"ssim": 0.9, "splats": 1, "evaluation_s": 1.0, "wall_s": 1.0}
 
 
 def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
     made: list[dict[str, object]] = [
-        {"iteration": 10 * row, "seconds": float(SECONDS[row]), "psnr": float(PSNR[row])} for row in range(count)
+        {"iteration": 10 * row, "seconds": float(SECONDS[row]), "psnr": float(PSNR[row]), **OTHERS}
+        for row in range(count)
     ]
     if forecast:
         made[-1]["forecast"] = AHEAD
