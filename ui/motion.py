@@ -6,7 +6,7 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, scene_settings
-from ..stga_addon.scene.rig.flame_rig import EXPRESSION_KEY, IDENTITY_KEY
+from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY
 from .sidebar import SidebarPanel
 
 MAX_SLIDERS = 10  # the first components vary most

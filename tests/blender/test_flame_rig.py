@@ -235,7 +235,7 @@ def test_coefficients_beyond_the_sliders_are_told(source):
     said = []
     import_head(motion_capture(replace(sequence, frame=frame), source), warn=said.append)
     assert len(said) == 1
-    assert "expr 7" in said[0]
+    assert "expression 7" in said[0]
     assert "frame 5" in said[0]
 
 

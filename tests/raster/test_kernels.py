@@ -157,17 +157,7 @@ def test_each_image_alone_has_the_references_gradient(quantity):
 
 def embed(local: list[torch.Tensor], frames, face: np.ndarray) -> list[torch.Tensor]:
     """World-space splats in torch, so that autograd carries the reference's gradient to the local parameters."""
-    xyz, rotation, log_scale, opacity, sh = local
-    origin, matrix, q, scale = (
-        torch.from_numpy(a[face]) for a in (frames.origin, frames.rotation, frames.quaternion, frames.scale)
-    )
-    w, x, y, z = q.unbind(-1)
-    left = torch.stack(
-        [torch.stack(row, -1) for row in ((w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w))], dim=-2
-    )
-    placed = scale[:, None] * torch.einsum("nij,nj->ni", matrix, xyz) + origin
-    turned = torch.einsum("nij,nj->ni", left, rotation)
-    return [placed, turned, log_scale + scale.log()[:, None], opacity, sh]
+    return [*reference.embed(*local[:3], frames, torch.from_numpy(face).long()), *local[3:]]
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -226,17 +216,12 @@ def test_screen_gradient_is_that_of_the_projected_center():
     """Catches density control fed with pixels, or with the gradient of something else: half images, by both axes."""
     scene = cloud(25, count=40, size=(60, 35))
     xyz, rotation, log_scale, opacity, sh = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
-    view = torch.from_numpy(scene.camera.world_to_camera)
-    points = xyz @ view[:3, :3].T + view[:3, 3]
-    order = torch.argsort(points[:, 2])
-    covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
-    center, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    order = torch.argsort(reference.camera_space(xyz, scene.camera)[:, 2])
+    center, projected, depth, _ = reference.project(xyz[order], rotation[order], log_scale[order], scene.camera)
     center.requires_grad_()
     color = reference.sh_color(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
     opacity = torch.sigmoid(opacity[order])
-    rgb, alpha, _ = reference._composite(
-        reference._alpha(center, projected, opacity, scene.camera), color, points[order, 2]
-    )
+    rgb, alpha, _ = reference.blend(reference.splat_alpha(center, projected, opacity, scene.camera), color, depth)
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
     gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), center)[0]
     expected = np.zeros(40)
