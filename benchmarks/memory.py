@@ -72,7 +72,7 @@ def write_capture(root: Path, timesteps: int, views: int, width: int, height: in
 
 
 def _pose(angle: float) -> list[list[float]]:
-    """Camera to world, OpenGL axes, one metre from the origin and looking at it."""
+    """Camera to world, OpenGL axes, one meter from the origin and looking at it."""
     sine, cosine = math.sin(angle), math.cos(angle)
     return [[cosine, 0, sine, sine], [0, 1, 0, 0], [-sine, 0, cosine, cosine], [0, 0, 0, 1]]
 

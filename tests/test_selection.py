@@ -16,7 +16,7 @@ NEUTRAL = np.random.default_rng(0).normal(size=(3 * COUNT, 3))
 
 
 def moved(offsets: dict[int, float]) -> np.ndarray:
-    """The neutral mesh with some triangles shifted by so many metres, each in its own direction."""
+    """The neutral mesh with some triangles shifted by so many meters, each in its own direction."""
     mesh, rng = NEUTRAL.copy(), np.random.default_rng(1)
     for face, distance in offsets.items():
         direction = rng.normal(size=3)
@@ -58,8 +58,8 @@ def test_mean_is_of_distances_not_of_vectors():
     assert np.flatnonzero(chosen).tolist() == [0, 1]
 
 
-def test_offset_is_that_of_the_centre():
-    """Catches vertex distances: a triangle that turns about its centre has not moved."""
+def test_offset_is_that_of_the_center():
+    """Catches vertex distances: a triangle that turns about its center has not moved."""
     mesh = NEUTRAL.copy()
     corners = mesh[FACES[2]]
     mesh[FACES[2]] = np.roll(corners, 1, axis=0)

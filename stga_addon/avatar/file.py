@@ -14,7 +14,7 @@ from ..errors import StgaError
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_frames
 from .splats import MAX_SH_DEGREE, Splats
-from .strain import STRAINS, StrainBasis, strain_basis
+from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 
 FORMAT = "stga-avatar"
 VERSION = 2
@@ -27,7 +27,7 @@ class Avatar:
 
     splats      in the local frames of `faces`
     convention  of those frames: "stga" or "gaussian_avatars"
-    neutral     (V, 3) float32 metres, the canonical mesh
+    neutral     (V, 3) float32 meters, the canonical mesh
     faces       (F, 3) int32
     settings    how it was trained; anything that JSON holds
     regions     name -> (F,) bool
@@ -47,7 +47,7 @@ class Avatar:
     principal_point: str = "vhap"
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
-        """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colours follow it."""
+        """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colors follow it."""
         return face_frames(mesh, self.faces, self.neutral, self.convention, self._strain)
 
     @cached_property
@@ -160,9 +160,9 @@ def _check(path: Path, avatar: Avatar) -> None:
         _check_array(path, name, getattr(avatar.splats, name), dtype, (count, *tail))
     if avatar.splats.sh.shape[1] not in SH_SIZES:
         raise StgaError(f"{path}: sh has {avatar.splats.sh.shape[1]} coefficients, expected one of {SH_SIZES}")
-    if avatar.splats.strain_color.shape[1] not in (0, STRAINS):
+    if avatar.splats.strain_color.shape[1] not in (0, STRAIN_COMPONENTS):
         size = avatar.splats.strain_color.shape[1]
-        raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAINS}")
+        raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAIN_COMPONENTS}")
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))

@@ -14,7 +14,7 @@ from ..capture.open import open_capture
 from ..capture.transforms import read_transforms
 from ..errors import StgaError
 from ..files import replacing
-from ..flame.motion import driven
+from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
 from ..jobs.delegate import OpenHead
 from .arguments import add_avatar, add_principal_point, color, usable_path
@@ -88,7 +88,7 @@ def _reenactment(options: Namespace, views: list[View]) -> tuple[Callable[[View]
     if motion.flame is None:
         raise StgaError(f"{options.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
     check_topology(motion, avatar)
-    sequence = driven(motion.flame, avatar.neutral)
+    sequence = transferred_motion(motion.flame, avatar.neutral)
     cameras = {view.camera_index: view for view in reversed(views)}
     placed = [
         replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")

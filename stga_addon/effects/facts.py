@@ -5,7 +5,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from ..avatar.strain import GAIN
+from ..avatar.strain import STRAIN_GAIN
 from ..capture.model import Capture
 from ..flame.forward import FlameFrame
 from ..flame.sequence import joint_angles
@@ -120,7 +120,7 @@ class CaptureFacts:
     def strain(self) -> float:
         """Root mean square change of the triangles' stretch over time, as a share of their size."""
         strain = self.samples.strain
-        return float(np.sqrt(((strain - strain.mean(0)) ** 2).mean())) / GAIN
+        return float(np.sqrt(((strain - strain.mean(0)) ** 2).mean())) / STRAIN_GAIN
 
     @cached_property
     def frames(self) -> list[FlameFrame]:

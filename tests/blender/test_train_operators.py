@@ -90,6 +90,36 @@ def test_worker_trains_the_same(head, tmp_path):
     assert not painted["00000"].any()
 
 
+@pytest.mark.slow
+def test_resume_of_another_capture_is_refused(extension, tmp_path):
+    """Catches a run that is continued on another capture, or with another principal point, and so ruined."""
+    pytest.importorskip("torch")
+    one, other = write_mesh_capture(tmp_path / "one"), write_mesh_capture(tmp_path / "other", timesteps=(0, 5))
+    run, folder = tmp_path / "run", str(tmp_path / "run")
+    bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
+    assert bpy.ops.stga.train(directory=folder, iterations=3, device="cpu") == {"FINISHED"}
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    mistakes = (
+        (other, "opencv", rf"^Error: .*run: was trained on {one} .*{other}"),
+        (one, "vhap", "was trained with principal point 'opencv', not 'vhap'"),
+    )
+    for capture, principal_point, sentence in mistakes:
+        bpy.ops.stga.import_capture(directory=str(capture), principal_point=principal_point)
+        with pytest.raises(RuntimeError, match=sentence):
+            bpy.ops.stga.train(directory=folder, resume=True)
+        assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
+    assert bpy.ops.stga.train(directory=folder, resume=True) == {"FINISHED"}
+
+
+def test_device_reaches_the_job(head, tmp_path, monkeypatch, extension):
+    """Catches a choice of device in the panel that training does not get."""
+    monkeypatch.setattr(extension.operators.train, "run_training_job", lambda run, also: run / "avatar.npz")
+    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), device="cpu") == {"FINISHED"}
+    assert extension.stga_addon.jobs.training_job.read_job(tmp_path / "run").device == "cpu"
+
+
 def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
     """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
     monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)

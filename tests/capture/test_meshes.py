@@ -47,7 +47,7 @@ def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
 
 
 def test_obj_dialects(tmp_path: Path) -> None:
-    """Catches what exporters really write: colours, texture corners, several materials and objects, quads,
+    """Catches what exporters really write: colors, texture corners, several materials and objects, quads,
     negative indices, Windows line ends, continued lines. trimesh would regroup the triangles by material.
     """
     lines = ["mtllib x.mtl", "o a", *(f"v {i} {i * i} 0 1 0 0" for i in range(5)), "vt 0 0", "vn 0 0 1", "usemtl b"]
@@ -184,10 +184,10 @@ def test_procrustes_as_scipy_has_it() -> None:
     random = np.random.default_rng(1)
     source, target, weights = random.normal(size=(30, 3)), random.normal(size=(30, 3)), random.random(30)
     rotation, translation = weighted_procrustes(source, target, weights)
-    centres = np.average(source, 0, weights), np.average(target, 0, weights)
-    expected = Rotation.align_vectors(target - centres[1], source - centres[0], weights)[0].as_matrix()
+    centers = np.average(source, 0, weights), np.average(target, 0, weights)
+    expected = Rotation.align_vectors(target - centers[1], source - centers[0], weights)[0].as_matrix()
     np.testing.assert_allclose(rotation, expected, atol=1e-9)
-    np.testing.assert_allclose(rotation @ centres[0] + translation, centres[1], atol=1e-12)
+    np.testing.assert_allclose(rotation @ centers[0] + translation, centers[1], atol=1e-12)
 
 
 def test_moving_jaw_does_not_drag_the_head() -> None:

@@ -32,7 +32,7 @@ from stga_addon.capture.meshes import read_mesh, read_regions
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
 from stga_addon.capture.release import read_face_ids, read_soup
-from stga_addon.capture.summary import describe
+from stga_addon.capture.summary import summarize_capture
 from stga_addon.capture.transforms import read_transforms
 from stga_addon.files import read_json, read_npz
 from stga_addon.flame.model import read_flame
@@ -279,7 +279,7 @@ FRAME_VALUES: dict[str, Any] = {
 def test_frames(tmp_path: Path, name: str) -> None:
     """Catches values that are valid JSON and nonsense: numbers beyond floats, paths beyond names, jumps in time."""
     root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(FRAME_VALUES[name]))
-    behaves(lambda: describe(open_capture(root)), tmp_path)
+    behaves(lambda: summarize_capture(open_capture(root)), tmp_path)
 
 
 @pytest.mark.parametrize("key", ["canonical_mesh_path", "regions_path"])

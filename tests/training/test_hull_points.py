@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.training.optimize.hull_points import CLEARANCE, VOXEL, hull_points
+from stga_addon.training.optimize.hull_points import MIN_MESH_DISTANCE_M, VOXEL_SIZE_M, hull_points
 
 SIZE, FOCAL, FAR = 120, 300.0, 1.0
 CENTRE, RADIUS = np.array([0.06, 0.075, 0.02]), 0.03
@@ -81,17 +81,19 @@ def test_seeds_stand_on_the_balls_surface(beside: Capture, convention: str) -> N
     height = np.linalg.norm(world.xyz - CENTRE, axis=1) - RADIUS
     assert len(world) > 300
     # The hull of twenty views is a little larger than the ball; the grid point lies within a voxel of its surface.
-    assert height.min() > -2 * VOXEL
-    assert height.max() < 2 * VOXEL
+    assert height.min() > -2 * VOXEL_SIZE_M
+    assert height.max() < 2 * VOXEL_SIZE_M
     # Around the mesh's bounding box the grid ends, and near the mesh no seeds are wanted.
     sphere = CENTRE + RADIUS * np.array(trimesh.creation.icosphere(3).vertices)
     low, high = beside.mesh(TIMESTEP).min(0), beside.mesh(TIMESTEP).max(0)
-    margin = 0.25 * np.linalg.norm(high - low) - 2 * VOXEL
+    margin = 0.25 * np.linalg.norm(high - low) - 2 * VOXEL_SIZE_M
     head = np.linalg.norm(sphere - beside.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
-    wanted = ((sphere > low - margin) & (sphere < high + margin)).all(axis=1) & (head > CLEARANCE + 2 * VOXEL)
+    wanted = ((sphere > low - margin) & (sphere < high + margin)).all(axis=1) & (
+        head > MIN_MESH_DISTANCE_M + 2 * VOXEL_SIZE_M
+    )
     assert wanted.mean() > 0.7
     gaps = np.linalg.norm(sphere[wanted][:, None] - world.xyz[None], axis=2).min(axis=1)
-    assert gaps.max() < 2.5 * VOXEL
+    assert gaps.max() < 2.5 * VOXEL_SIZE_M
 
 
 def test_seeds_are_loose_grey_and_bound_to_the_nearest_triangle(beside: Capture) -> None:
@@ -102,7 +104,7 @@ def test_seeds_are_loose_grey_and_bound_to_the_nearest_triangle(beside: Capture)
     assert not seeds.sh.any()
     assert not seeds.opacity.any()
     world = in_world(beside, seeds)
-    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL / 2, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
     centroids = beside.mesh(TIMESTEP)[beside.faces].mean(1)
     some = np.arange(0, len(seeds), 7)
     distances = np.linalg.norm(world.xyz[some, None] - centroids[None], axis=2)
@@ -125,8 +127,8 @@ def test_nothing_near_the_mesh(tmp_path: Path) -> None:
     head = np.linalg.norm(world.xyz - capture.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     assert len(world) > 100
     # The clearance is measured to vertices and centroids, 2 mm from any point of a triangle of this mesh.
-    assert np.abs(head).min() > CLEARANCE - 0.002
-    assert np.abs(head).min() < CLEARANCE + VOXEL
+    assert np.abs(head).min() > MIN_MESH_DISTANCE_M - 0.002
+    assert np.abs(head).min() < MIN_MESH_DISTANCE_M + VOXEL_SIZE_M
 
 
 def test_empty_masks_give_no_seeds(tmp_path: Path) -> None:

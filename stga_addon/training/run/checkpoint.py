@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ...avatar.file import SH_SIZES
-from ...avatar.strain import STRAINS
+from ...avatar.strain import STRAIN_COMPONENTS
 from ...errors import StgaError
 from ...files import read_npz, write_npz
 from ..optimize.state import TrainState, state_of, tensors_of
@@ -138,7 +138,7 @@ def _check_state(path: Path, state: TrainState) -> None:
     n, coefficients = len(state), state.parameters.sh.shape[1]
     if coefficients not in SH_SIZES:
         raise StgaError(f"{path}: parameters/sh has {coefficients} coefficients, expected one of {SH_SIZES}")
-    strains = STRAINS if state.parameters.strain_color.shape[1] else 0
+    strains = STRAIN_COMPONENTS if state.parameters.strain_color.shape[1] else 0
     tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "sh": (coefficients, 3), "strain_color": (strains, 3)}
     whole = {"steps": torch.int32, "face": torch.int32, "unbound": torch.bool}
     for name, tensor in tensors_of(state).items():
