@@ -1,4 +1,4 @@
-"""Where training starts: a regular lattice of splats on every triangle of the neutral mesh."""
+"""Initial splats: a regular lattice on every triangle of the neutral mesh."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from .embedding import face_areas, face_frames
 from .splats import Splats
 
 NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
-MIN_SPACING = 1e-6  # meters; a triangle without area still needs a scale with a logarithm
+MIN_SPACING_M = 1e-6  # the scale of splats on a triangle without area still needs a logarithm
 
 
 def lattice_splats(
@@ -32,11 +32,11 @@ def lattice_splats(
     weights = lattice_weights(order, inset)
     frames = face_frames(neutral, faces, neutral, convention)
     corners = np.asarray(neutral, np.float64)[faces] - frames.origin[:, None]
-    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING)[:, None, None]
+    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING_M)[:, None, None]
     xyz = np.einsum("pc,fci->fpi", weights, local).reshape(-1, 3)
 
     spacing = np.sqrt(2 * face_areas(neutral, faces)) / max(order, 1)
-    sigma = scale_factor * np.maximum(spacing, MIN_SPACING) / np.maximum(frames.scale, MIN_SPACING)
+    sigma = scale_factor * np.maximum(spacing, MIN_SPACING_M) / np.maximum(frames.scale, MIN_SPACING_M)
     stretch = np.ones(3)
     stretch[NORMAL_AXIS[convention]] = flatness
     count = len(xyz)

@@ -1,20 +1,20 @@
-"""How a triangle deforms, as numbers that a splat's color can follow: wrinkles darken where skin is compressed."""
+"""Strain of triangles, on which splat colors may depend: wrinkles darken where skin is compressed."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 STRAIN_COMPONENTS = 3
-"""Numbers per triangle: the stretch along two directions of its plane, and the shear between them."""
+"""Stretch along two directions of the triangle's plane, and the shear between them."""
 STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
-"""A stretch of 18 % (E = 0.2) counts as one; beyond ±2 colors follow no further."""
+"""Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
 MIN_SQUARED_NORMAL = 1e-24
-"""Squared normal (m⁴) of a neutral triangle below which it has no area to be deformed: edges of a micrometer."""
+"""Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
 
 
 @dataclass(frozen=True)
 class StrainBasis:
-    """What strain needs of the neutral mesh, computed once: V vertices, F triangles.
+    """Precomputed terms of a neutral mesh with V vertices and F triangles.
 
     faces (F, 3); gram (F, 3) squared lengths and product of the neutral edges: d1·d1, d1·d2, d2·d2.
     to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
@@ -40,7 +40,7 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray) -> StrainBasis:
     a1, a2 = np.cross(d2, normal) * inverse, np.cross(normal, d1) * inverse
     along = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, _dot(d1, d1))))[:, None] * d1
     across = np.cross(normal, along) * np.sqrt(inverse)
-    twice = np.array([1.0, 1, 1, 2, 2, 2])  # the three mixed components stand for two of a tensor's nine
+    twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
     return StrainBasis(
         faces=faces,
         gram=np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1),

@@ -34,8 +34,8 @@ def open_flame_capture(
 ) -> Capture:
     """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by timestep.
 
-    A model of FLAME's published 5023 vertices always gets teeth, because VHAP and GaussianAvatars track and train
-    with them; a model of any other size is taken as it is. Shape and static offset come from the first timestep.
+    A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use them; a model of any
+    other size is used as it is. Shape and static offset come from the first timestep.
     Raises StgaError, also where the model file is not given: FLAME's license forbids passing it on.
     """
     model = _model_for(root, model_file)
@@ -91,8 +91,8 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
 def _model_for(root: Path, model_file: Path | None) -> FlameModel:
     if model_file is None:
         raise StgaError(
-            f"{root}: is tracked with FLAME; give your FLAME model file (.pkl or .npz) with --flame,"
-            " or in the add-on's preferences"
+            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame"
+            " or in the preferences of the add-on"
         )
     return flame_model(model_file)
 
@@ -113,5 +113,5 @@ def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:
     listed = (root / PARAMETERS).glob("*.npz")
     files = {int(path.stem): path for path in listed if re.fullmatch(r"\d+", path.stem, re.ASCII)}
     if not files:
-        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz a timestep, such as 00000.npz")
+        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz per timestep, such as 00000.npz")
     return dict(sorted(files.items()))

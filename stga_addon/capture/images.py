@@ -30,7 +30,7 @@ def image_size(path: Path) -> tuple[int, int]:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
             width, height = image.size
-    except Exception as error:  # Pillow's decoders raise more than they promise.
+    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if not is_image_size(width, height):
         limits = f"{MAX_IMAGE_PIXELS} pixels and {MAX_IMAGE_SIDE} a side"
@@ -130,7 +130,7 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
             size = image.size
             if size == expected and is_image_size(*size):  # before any pixel is unpacked
                 return _as_uint8(image)
-    except Exception as error:  # Pillow's decoders raise more than they promise.
+    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if size == expected:
         raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, more than are read ({MAX_IMAGE_PIXELS})")

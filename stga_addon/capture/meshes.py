@@ -150,11 +150,11 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
         if file_type == "glb":
             _check_glb(data)
         with np.errstate(all="ignore"):
-            # From memory, so that a mesh cannot name further files (textures, buffers) to be read.
+            # From memory, so that a mesh cannot have other files (textures, buffers) read.
             options = {"skip_materials": True} if file_type == "glb" else {}
             mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False, **options)
             return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    except Exception as error:  # trimesh's parsers fail with whatever they stumble on; all of it means a bad file.
+    except Exception as error:  # trimesh's parsers raise any kind of error for a bad file
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
 
 
@@ -171,7 +171,7 @@ def _check_glb(data: bytes) -> None:
     than the file can hold, and where nodes are no trees."""
     length, kind = struct.unpack("<L4s", data[12:20])
     if kind != GLB_JSON_CHUNK or length > len(data):
-        raise ValueError("no JSON chunk where a GLB has it")
+        raise ValueError("no JSON chunk at its beginning")
     document = json.loads(data[20 : 20 + length])
     nodes, meshes, accessors = (document.get(key, []) for key in ("nodes", "meshes", "accessors"))
     counts = [accessor["count"] for accessor in accessors]
@@ -179,21 +179,21 @@ def _check_glb(data: bytes) -> None:
         raise ValueError("an accessor counts more than the file can hold")
     children = [child for node in nodes for child in node.get("children", [])]
     if len(nodes) > MAX_GLB_NODES or len(set(children)) < len(children):
-        raise ValueError(f"its nodes are no trees of at most {MAX_GLB_NODES}")
+        raise ValueError(f"its nodes are not trees of at most {MAX_GLB_NODES}")
     parts = [part for node in nodes if "mesh" in node for part in meshes[node["mesh"]]["primitives"]]
     named = [index for part in parts for index in (*part["attributes"].values(), part.get("indices"))]
     if sum(counts[index] for index in named if index is not None) > MAX_GLB_CORNERS + len(data):
-        raise ValueError("its nodes repeat their meshes too often")
+        raise ValueError("its nodes repeat meshes too often")
     waiting = [root for scene in document.get("scenes", []) for root in scene.get("nodes", [])]
     for _ in range(len(nodes) + len(waiting)):
         if waiting:
             waiting += nodes[waiting.pop()].get("children", [])
     if waiting:
-        raise ValueError("its nodes form a ring")
+        raise ValueError("its nodes form a cycle")
 
 
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """trimesh cannot keep an OBJ's order once it has several materials or objects: it regroups and splits vertices."""
+    """Own parser, because trimesh regroups and splits the vertices of an OBJ with several materials or objects."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]
     polygons = [n for n, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
@@ -211,7 +211,7 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
-    """(F, 3) of an OBJ's face lines, polygons as fans; kept, because all files of a sequence have the same lines.
+    """(F, 3) of an OBJ's face lines, polygons as fans; cached, because all files of a sequence have the same lines.
 
     OBJ counts vertices from 1 up, or backwards from the latest of the `earlier` ones of each line. Raises ValueError.
     """

@@ -1,4 +1,4 @@
-"""What a studio recorded, independent of how it was stored."""
+"""Data model of a capture, independent of its layout on disk."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -31,11 +31,11 @@ class Capture:
     views      split name ("train", "val", "test") -> its views; empty for a bare mesh sequence
     timesteps  all timesteps that have a mesh, ascending
     regions    key region name -> (F,) bool
-    mesh       timestep -> (V, 3) float64, the tracked mesh in world space; read when called
+    mesh       timestep -> (V, 3) float64, the tracked mesh in world space, read on demand
     expression_mesh  (timestep, zero_pose) -> (V, 3) float64 without rigid head motion (STGA, selective training)
     flame      the parameters and model behind the meshes, for FLAME captures
-    given_selection  timestep -> (F,) bool where the capture came with its own selection
-    warnings   one sentence each, for the person who opened it
+    given_selection  timestep -> (F,) bool where the capture comes with a selection
+    warnings   one sentence each
     """
 
     root: Path

@@ -1,4 +1,4 @@
-"""Does the tracked mesh fall into the masks under the chosen meaning of cx and cy?"""
+"""Check of the principal point convention: does the tracked mesh lie inside the masks?"""
 
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -9,15 +9,15 @@ from .camera import Camera
 from .transforms import PRINCIPAL_POINTS, Frame, with_principal_point
 
 MAX_VIEWS = 4
-MIN_SHARE_DIFFERENCE = 0.01  # share of the vertices
+MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
 
 
 def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
-    """A sentence where another convention puts notably more of the mesh into the masks, else None.
+    """A warning where another convention puts clearly more of the mesh inside the masks, else None.
 
-    Looks at a few views with masks, and at none where the conventions agree. Only what falls outside a mask tells:
-    hair and shoulders lie inside the mask and outside the mesh. Without Pillow, as in a bare Blender, no mask can be
-    looked at. Raises StgaError where one cannot be read.
+    Checks a few views in which the conventions differ. Only vertices outside of a mask count: hair and shoulders lie
+    inside the mask but beside the mesh. Without Pillow, which Blender lacks, nothing is checked.
+    Raises StgaError where a mask cannot be read.
     """
     if find_spec("PIL") is None:
         return None

@@ -1,4 +1,4 @@
-"""The layout in which STGA's authors released their data: triangle soups, and which triangles each frame trains."""
+"""Opening captures in the layout of the STGA authors' release: triangle soups and selected triangles."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,9 +41,7 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
         mesh=mesh,
         expression_mesh=rigid_free(mesh, neutral),
         given_selection={t: read_face_ids(path, len(faces)) for t, path in chosen.items() if path.is_file()},
-        warnings=(
-            f"the layout has no canonical mesh: {canonical.name}, the first timestep, stands for the neutral one",
-        ),
+        warnings=(f"the layout has no canonical mesh: {canonical.name}, the first timestep, is the neutral mesh",),
     )
 
 

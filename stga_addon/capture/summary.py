@@ -1,4 +1,4 @@
-"""A capture in a few lines, for the person who is about to train on it."""
+"""Summary of a capture in a few lines of text."""
 
 from collections.abc import Sequence
 
@@ -8,10 +8,10 @@ from .model import Capture, View
 
 
 def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
-    """(label, value) lines: what was recorded, what was tracked, and the warnings last. Reads no image."""
+    """(label, value) lines: recording, tracking, warnings. Reads no image."""
     views = [view for split in capture.views.values() for view in split]
     lines = [("folder", str(capture.root)), ("layout", capture.layout)]
-    lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained")]
+    lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained on")]
     lines += [
         ("timesteps", format_ranges(capture.timesteps)),
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
@@ -59,7 +59,7 @@ def _regions(capture: Capture) -> str:
 
 
 def _flame(capture: Capture) -> list[tuple[str, str]]:
-    """Offsets as tracked: the dynamic one is looked up in the first timestep."""
+    """Largest offsets; the dynamic one is that of the first timestep."""
     if capture.flame is None:
         return []
     dynamic = capture.flame.frame(capture.flame.timesteps[0]).dynamic_offset

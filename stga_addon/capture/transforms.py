@@ -1,4 +1,4 @@
-"""Cameras and frames of a capture: `transforms_{train,val,test}.json` or `transforms.json`."""
+"""Reading of cameras and frames: `transforms_{train,val,test}.json` or `transforms.json`."""
 
 import itertools
 import math
@@ -19,8 +19,8 @@ from .model import View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
-ROTATION_TOLERANCE = 1e-3  # Exporters write float32 poses, some of them rounded to a few decimals.
-MAX_NUMBER = sys.float_info.max  # JSON's whole numbers know no limit.
+ROTATION_TOLERANCE = 1e-3  # exporters write float32 poses, some rounded to a few decimals
+MAX_NUMBER = sys.float_info.max  # JSON does not limit whole numbers
 INDEX_LIMIT = 1 << 31
 MIN_ANGLE = 1e-9  # radians; half of it still has a tangent
 MAX_PATH_CHARACTERS, MAX_NAME_BYTES = 2000, 255
@@ -31,10 +31,10 @@ MATRIX = "a 4x4 matrix of finite numbers"
 class Frame:
     """One entry of a transforms file.
 
-    principal  (cx, cy) in pixels exactly as the file writes them; the image center where it does not
-    camera_id  the studio's own name of the camera, or None
-    mesh, flame  the tracked mesh or FLAME parameters of the frame's timestep, or None
-    where      file and entry, to begin messages with
+    principal  (cx, cy) in pixels as written in the file; the image center where they are missing
+    camera_id  name of the camera in the file, or None
+    mesh, flame  file of the tracked mesh or FLAME parameters of the frame's timestep, or None
+    where      file and entry, with which messages begin
     """
 
     view: View
@@ -47,7 +47,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and the files that the top level names (None where it names none)."""
+    """All frames of a capture by split, and the files named at the top level (None where they are missing)."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
@@ -66,7 +66,7 @@ def has_transforms(folder: Path) -> bool:
 def read_transforms(path: Path, principal_point: str = "vhap") -> tuple[Frame, ...]:
     """Read the frames of one transforms file; neither images nor tracked files are opened, nor need they exist.
 
-    A frame's own intrinsics win over those of the top level, because real exports carry wrong ones there.
+    A frame's own intrinsics take precedence over the top level's, which are wrong in some exports.
     `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means: "vhap"
     (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center" (cx and cy are
     ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave it only for a
@@ -106,7 +106,7 @@ def with_principal_point(camera: Camera, written: tuple[float, float], conventio
 def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
     """timestep -> its tracked file, ascending; `field` is "mesh" or "flame".
 
-    Raises StgaError where a frame has none, or where two frames of a timestep disagree.
+    Raises StgaError where a frame has none, or where two frames of a timestep name different ones.
     """
     files: dict[int, Path] = {}
     key = "mesh_path" if field == "mesh" else "flame_param_path"
@@ -122,7 +122,7 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
 def inside(root: Path, relative: str, where: str) -> Path:
     """Resolve a path of a capture's file against the folder `root` of that file.
 
-    `..` may lead to a sibling of `root`, not further; links inside the capture are the owner's and are followed.
+    `..` may lead to a sibling of `root`, not further; symbolic links inside the capture are followed.
     Raises StgaError, beginning with `where`, for absolute paths and for those that lead outside.
     """
     text = relative.replace("\\", "/")
@@ -132,15 +132,15 @@ def inside(root: Path, relative: str, where: str) -> Path:
         raise StgaError(f"{where}: {shorten(relative)} is not a path of a file relative to {root}")
     if len(text) > MAX_PATH_CHARACTERS or any(len(part.encode()) > MAX_NAME_BYTES for part in parts):
         raise StgaError(f"{where}: {shorten(relative)} is longer than a path can be")
-    # The first .. leads to the parent, where only a named sibling may follow.
+    # Behind a first "..", only the name of a sibling may follow.
     if parts[:2] == ["..", ".."] or parts == [".."]:
-        raise StgaError(f"{where}: {shorten(relative)} leads outside {root.parent}, where the capture must stay")
+        raise StgaError(f"{where}: {shorten(relative)} leads outside of {root.parent}")
     return root.parent.joinpath(*parts[1:]) if parts[0] == ".." else root.joinpath(*parts)
 
 
 @dataclass(frozen=True)
 class _Record:
-    """A JSON object with the file it comes from, that file's folder without links, and the place in it for messages."""
+    """A JSON object, its file, that file's folder without symbolic links, and its place in the file for messages."""
 
     path: Path
     folder: Path
@@ -216,11 +216,11 @@ def _frame(
     principal_point: str,
     cameras: dict[tuple[bytes | float, ...], Camera],
 ) -> Frame:
-    """cameras: those of earlier frames by what the file says of them; most frames share theirs."""
+    """cameras: those of earlier frames by their numbers in the file, because most frames share theirs."""
     image = record.path_of("file_path")
     if image is None:
         raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
-    if not image.suffix:  # Blender's NeRF exporters leave it out.
+    if not image.suffix:  # as Blender's NeRF exporters write it
         image = image.with_name(image.name + ".png")
     key = _timestep_key(record.values)
     if timed and key is None:
@@ -237,7 +237,7 @@ def _frame(
         timestep=record.natural(key) if key else 0,
         camera_index=record.natural("camera_index") if record.has("camera_index") else -1,
         camera=cameras[key_of_camera],
-        # Forward slashes everywhere: what is named after a view must not become a path on Windows alone.
+        # Forward slashes on every system: files are named after views.
         name=record.values["file_path"].replace("\\", "/"),
         image=image,
         mask=record.path_of("fg_mask_path"),
@@ -248,7 +248,7 @@ def _frame(
 
 
 def _timestep_key(values: dict[str, Any]) -> str | None:
-    """VHAP says timestep_index, the STGA authors' release says keyframe."""
+    """The key of the timestep: VHAP writes timestep_index, the STGA authors' release keyframe."""
     return next((key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None)
 
 
@@ -317,7 +317,7 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
 
 
 def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
-    """Give cameras without an index one: that of the same camera elsewhere, or the next free number."""
+    """Frames whose cameras all have an index: that of the same camera elsewhere, or the next free number."""
     known = {_camera_key(f): f.view.camera_index for f in frames if f.view.camera_index >= 0}
     taken = set(known.values())
     free = (number for number in itertools.count() if number not in taken)
@@ -333,8 +333,8 @@ def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
 
 
 def _camera_key(frame: Frame) -> str | bytes:
-    """What tells cameras apart: their own name, else where they stand (a rig's cameras do not move)."""
-    # Adding zero turns −0 into 0, whose bytes differ.
+    """Identity of a camera: its name, else its pose (the cameras of a rig do not move)."""
+    # Adding zero turns -0 into 0, whose bytes differ.
     return frame.camera_id or (np.round(frame.view.camera.world_to_camera, 6) + 0.0).tobytes()
 
 

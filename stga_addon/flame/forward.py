@@ -1,4 +1,4 @@
-"""FLAME's forward pass in numpy: parameters to vertices."""
+"""FLAME's forward pass in NumPy: parameters to vertices."""
 
 from dataclasses import dataclass
 

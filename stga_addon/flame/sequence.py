@@ -1,4 +1,4 @@
-"""A tracked FLAME sequence: per-timestep parameter files and the meshes they stand for."""
+"""Tracked FLAME sequences: reading of parameter files, and their meshes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,19 +32,19 @@ FIELD_ALIASES = {
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
 MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
-MAX_TIMESTEP = 1 << 20  # Blender's last frame; a motion is played with all frames between its timesteps
-MAX_MOTION_EXPANSION = 256  # dynamic offsets that are all zero, as most are, pack a published FLAME's motion 116 times
+MAX_TIMESTEP = 1 << 20  # Blender's last frame
+MAX_MOTION_EXPANSION = 256  # dynamic offsets, mostly zero, compress a motion of the published FLAME 116 times
 
 
 @dataclass(frozen=True)
 class FlameSequence:
     """One person's motion.
 
-    model          with the teeth already added where they are wanted
+    model          including teeth where they are used
     shape          (I,) identity coefficients
     static_offset  (V, 3) meters or None
     timesteps      ascending
-    frame          timestep -> its parameters; reads the file when called
+    frame          timestep -> its parameters, read on demand
     """
 
     model: FlameModel
@@ -80,8 +80,8 @@ def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:
-    """The same motion with what makes the person, shape and static offset, in the template: FLAME adds it up before it
-    poses, and a mesh then needs a quarter of the components."""
+    """The same motion with shape and static offset baked into the template, so that a mesh needs a quarter of the blend
+    shapes."""
     model = sequence.model
     shapes = model.shapedirs[:, :, model.n_identity :]
     template = shaped_vertices(model, sequence.shape, np.zeros(shapes.shape[2]), sequence.static_offset)
@@ -136,7 +136,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
         if array.ndim < 2 or len(array) != count:
             raise StgaError(f"{path}: {name} has shape {array.shape}, expected {count} timesteps first")
     if "shape" in arrays and arrays["shape"].ndim == 2:
-        arrays["shape"] = arrays["shape"][0]  # one a timestep: whoever is tracked stays the same person
+        arrays["shape"] = arrays["shape"][0]  # one per timestep, all of the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
     timesteps = _timesteps(path, arrays.get("timesteps", np.arange(count)), count)
     row = {timestep: number for number, timestep in enumerate(timesteps)}
@@ -145,7 +145,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
         return _frame(path, {name: array[row[timestep]] for name, array in moving.items()}, model)
 
     for timestep in timesteps:
-        frame(timestep)  # a wrong value in the middle is reported when the file is opened, not minutes later
+        frame(timestep)  # report a wrong value when the file is opened, not minutes later
     return FlameSequence(model, shape, static_offset, timesteps, frame)
 
 
@@ -153,12 +153,12 @@ def _timesteps(path: Path, found: np.ndarray, count: int) -> tuple[int, ...]:
     named = found.dtype.kind in "iu" and found.shape == (count,)
     if not named or found[0] < 0 or (found[1:] <= found[:-1]).any() or found[-1] > MAX_TIMESTEP:
         limits = f"from 0 to {MAX_TIMESTEP}, each more than the one before"
-        raise StgaError(f"{path}: timesteps are no {count} whole numbers {limits}")
+        raise StgaError(f"{path}: timesteps: expected {count} whole numbers {limits}")
     return tuple(found.tolist())
 
 
 def _spelled_out(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays by VHAP's names, with `pose` taken apart."""
+    """The arrays by VHAP's names, with `pose` split into joints."""
     named = {FIELD_ALIASES[name]: array for name, array in arrays.items() if name in FIELD_ALIASES} | dict(arrays)
     pose = named.pop("pose", None)
     if pose is None:

@@ -1,4 +1,4 @@
-"""The two rows of teeth that GaussianAvatars adds to FLAME's mesh."""
+"""Teeth: the two rows that GaussianAvatars adds to FLAME's mesh."""
 
 from dataclasses import replace
 

@@ -335,7 +335,7 @@ def test_numpy_alone_is_enough(tmp_path: Path) -> None:
         "from stga_addon.capture.open import open_capture\n"
         "from stga_addon.capture.summary import summarize_capture\n"
         f"capture = open_capture(Path({str(root)!r}))\n"
-        "describe(capture), capture.mesh(3), capture.expression_mesh(3, 'head')\n"
+        "summarize_capture(capture), capture.mesh(3), capture.expression_mesh(3, 'head')\n"
         "from stga_addon.errors import StgaError\n"
         f"try: open_capture(Path({str(ply)!r}))\n"
         "except StgaError as error: print(error)\n"

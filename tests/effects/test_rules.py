@@ -77,7 +77,7 @@ def test_one_camera(painted):
     plan, settings = planned(painted(cameras=1, paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density"}
     for name in ("view-color", "exposure", "hull-points"):
-        with pytest.raises(StgaError, match=f"--effect {name}=on: cannot be, because a single camera"):
+        with pytest.raises(StgaError, match=f"--effect {name}=on: is not possible, because a single camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
     assert settings.sh_steps == ()
 
@@ -86,9 +86,9 @@ def test_one_frame(painted):
     """Catches strain that is asked of a single frame, and a static capture that is refused as a whole."""
     plan, _ = planned(painted(timesteps=1, deformed=0.0))
     assert on(plan) == {"antialiasing", "background", "density"}
-    with pytest.raises(StgaError, match="strain-color=on: cannot be, because the mesh has the same shape"):
+    with pytest.raises(StgaError, match="strain-color=on: is not possible, because the mesh has the same shape"):
         planned(painted(timesteps=1, deformed=0.0), strain_color="on")
-    with pytest.raises(StgaError, match="selection=on: cannot be, because no triangle moves"):
+    with pytest.raises(StgaError, match="selection=on: is not possible, because no triangle moves"):
         planned(painted(timesteps=1, deformed=0.0), selection="on")
 
 
@@ -100,7 +100,7 @@ def test_background(painted):
     plan, settings = planned(painted(masks=False))
     assert not plan["background"].on
     assert not settings.random_background
-    with pytest.raises(StgaError, match="background=on: cannot be, because not every image has a mask"):
+    with pytest.raises(StgaError, match="background=on: is not possible, because not every image has a mask"):
         planned(painted(masks=False), background="on")
 
 
