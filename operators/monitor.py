@@ -152,8 +152,8 @@ def _check(scene: Any) -> float | None:
 
 def _stored(scene: Any) -> tuple[Path | None, bool]:
     """What the scene stores of its training: the run, and whether its result was shown."""
-    chosen = getattr(scene, ids.SETTINGS)
-    return Path(chosen.training_run) if chosen.training_run else None, chosen.result_shown
+    settings = getattr(scene, ids.SETTINGS)
+    return Path(settings.training_run) if settings.training_run else None, settings.result_shown
 
 
 def _locate(scene: Any, run: Path) -> Path:
@@ -167,12 +167,12 @@ def _inspect(folder: Path) -> WorkerSnapshot:
 
 
 def _read_status(scene: Any, show_result: bool | None = None) -> states.StatusRead:
-    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     assert run is not None
     folder = _locate(scene, run)
     files = RunFiles(_stamp(job_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
-    shown = chosen.show_result if show_result is None else show_result
-    return states.StatusRead(folder, _inspect(job_folder(folder)), files, chosen.live_preview, shown)
+    shown = settings.show_result if show_result is None else show_result
+    return states.StatusRead(folder, _inspect(job_folder(folder)), files, settings.live_preview, shown)
 
 
 def _stamp(path: Path) -> states.Stamp | None:
@@ -192,13 +192,13 @@ def _handle(scene: Any, event: states.Event) -> MonitorState:
 
 
 def _carry_out(scene: Any, effects: Iterable[states.Effect]) -> None:
-    chosen = getattr(scene, ids.SETTINGS)
+    settings = getattr(scene, ids.SETTINGS)
     for effect in effects:
         match effect:
             case states.StoreTraining(run, result_shown):
-                chosen.training_run, chosen.result_shown = "" if run is None else str(run), result_shown
+                settings.training_run, settings.result_shown = "" if run is None else str(run), result_shown
             case states.StoreAvatar(path):
-                chosen.avatar = str(path)
+                settings.avatar = str(path)
             case states.LoadAvatar(path):
                 _loader.load(scene, path)
             case states.ReadCurve(folder):
@@ -219,7 +219,7 @@ def _read_curve(folder: Path) -> Curve | None:
 
 def _show_loaded(scene: Any) -> MonitorState:
     """Show the avatar that was loaded for the scene, in the object that shows this run or in a new one."""
-    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == str(run)), None)
     if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
         return _states[scene.session_uid]  # Blender crashes where a mesh changes during these
@@ -227,7 +227,7 @@ def _show_loaded(scene: Any) -> MonitorState:
         loaded = _loader.result(scene)
         if loaded is None:
             return _states[scene.session_uid]
-        if not is_head(chosen.head):
+        if not is_head(settings.head):
             raise StgaError("No head in the scene to show the avatar on; import the capture")
         event = _present(scene, shown, *loaded)
     except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
@@ -239,8 +239,8 @@ def _show_loaded(scene: Any) -> MonitorState:
 
 def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes) -> states.Event:
     """Show the avatar, or build the next slice of what its object needs."""
-    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
-    check_head(avatar, chosen.head)
+    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    check_head(avatar, settings.head)
     if shown is not None and can_update(shown, avatar):
         update_splats(shown, attributes)
         return states.AvatarShown(created=False)
@@ -249,7 +249,7 @@ def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes
     if shown is not None:
         bpy.data.objects.remove(shown)
     assert run is not None
-    shown = show(scene, avatar, chosen.head, f"{chosen.head.name} {run.name}", attributes=attributes)
+    shown = show(scene, avatar, settings.head, f"{settings.head.name} {run.name}", attributes=attributes)
     shown[tags.RUN] = str(run)
     return states.AvatarShown(created=True)
 
@@ -318,13 +318,13 @@ def _after_load(_: Any) -> None:
 
 def _adopt(scene: Any) -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as `stga demo` does."""
-    chosen = getattr(scene, ids.SETTINGS)
+    settings = getattr(scene, ids.SETTINGS)
     heads = [thing for thing in scene.objects if is_head(thing)]
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
-    if chosen.head is None and len(heads) == 1:
-        chosen.head = heads[0]
-        if chosen.splats is None and len(shown) == 1:
-            chosen.splats = shown[0]
+    if settings.head is None and len(heads) == 1:
+        settings.head = heads[0]
+        if settings.splats is None and len(shown) == 1:
+            settings.splats = shown[0]
 
 
 def register() -> None:

@@ -76,7 +76,8 @@ def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn
     first = views[0].camera
     title = f"{root.name} camera {index:02d}"
     data = bpy.data.cameras.new(title)
-    _set_intrinsics(data, first)
+    set_intrinsics(data, first)
+    data.clip_start, data.display_size = CLIP_START, DISPLAY_SIZE
     camera = place(root, tags.CAMERA, title, data, old)
     camera[tags.CAMERA_INDEX] = index
     camera[tags.IMAGE_SIZE] = [first.width, first.height]
@@ -88,15 +89,16 @@ def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn
     return camera
 
 
-def _set_intrinsics(data: Any, camera: Camera) -> None:
-    """Blender's shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its width."""
+def set_intrinsics(data: Any, camera: Camera) -> None:
+    """Give a Blender camera's data the focal lengths and principal point of `camera`.
+
+    Blender's shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its width.
+    """
     data.sensor_fit = "HORIZONTAL"
     data.sensor_width = SENSOR_WIDTH_MM
     data.lens = camera.fl_x * SENSOR_WIDTH_MM / camera.width
     data.shift_x = (camera.width / 2 - camera.cx) / camera.width
     data.shift_y = (camera.cy - camera.height / 2) / camera.width * camera.fl_x / camera.fl_y
-    data.clip_start = CLIP_START
-    data.display_size = DISPLAY_SIZE
 
 
 def _same_intrinsics(one: Camera, other: Camera) -> bool:

@@ -1,4 +1,4 @@
-"""The curve in the panel: what is painted, and when."""
+"""The accuracy curve in the panel: its image, and when it is updated."""
 
 import json
 import re
@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stga_addon.report.curve_image import COMING, LINE, MARGIN, SIZE, curve_image
+from stga_addon.report.curve_image import CURVE_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
@@ -25,12 +25,12 @@ def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
     return made
 
 
-def test_the_curve_is_where_the_axes_say():
+def test_curve_agrees_with_its_axes():
     """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not after the curve."""
     pixels, axes = curve_image(lines())
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
     inner = SIZE - 2 * MARGIN
-    for second, color in [(second, LINE) for second in (15, 30, 50, 75)] + [(90, COMING)]:
+    for second, color in [(second, CURVE_COLOR) for second in (15, 30, 50, 75)] + [(90, FORECAST_COLOR)]:
         column = int(MARGIN + second / 100 * inner)
         at = (column + 0.5 - MARGIN) / inner * 100
         like = np.abs(pixels[:, column, :3] - np.array(color)).sum(-1)
@@ -39,8 +39,8 @@ def test_the_curve_is_where_the_axes_say():
         assert found == pytest.approx(expected, abs=2 * (high - low) / inner)
 
 
-def test_too_little_is_no_curve():
-    """Catches a division by nothing before the first evaluations, and a flat curve without a height."""
+def test_short_and_constant_curves():
+    """Catches a division by zero before the second evaluation, and for a constant PSNR."""
     assert curve_image([]) is None
     assert curve_image(lines(1, forecast=False)) is None
     flat = [{"iteration": row, "seconds": 1.0 + row, "psnr": 30.0} for row in range(3)]
@@ -50,8 +50,8 @@ def test_too_little_is_no_curve():
 
 
 def test_preview_follows_the_evaluations(extension, tmp_path):
-    """Catches a picture that stays as it was, one for nothing, a panel that fails on a damaged file, and pictures that
-    are saved in the .blend file."""
+    """Catches an image that is not updated, one of an empty curve, a panel that fails on a damaged file, and images
+    that are saved in the .blend file."""
     bpy = pytest.importorskip("bpy")
     curve, monitor = extension.ui.curve, extension.operators.monitor
     drawn = []

@@ -6,11 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from training.heads import write_head
 
 from stga_addon.capture.images import read_view
+from stga_addon.capture.model import View
 from stga_addon.effects.plan import plan_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
+from stga_addon.raster import reference
+from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.run import loop
@@ -128,12 +132,34 @@ def test_no_splats_on_teeth(painted):
         assert len(splats) - on_teeth == 6 * len(capture.faces)
 
 
-def test_antialiasing_reaches_the_kernels(painted, tmp_path):
-    """Catches an effect that is decided, but changes nothing in how splats are rendered and trained."""
-    opacity = {}
+def test_antialiasing_reaches_training_and_evaluation(painted):
+    """Catches an effect that is decided and then forgotten: losses and pixels must be those of the reference."""
+    capture, losses, pictures = painted(), [], []
+    view, image, _ = read_view(capture.views["train"][0], 0.4)
+    target = torch.from_numpy(image.transpose(2, 0, 1) / 255)
     for choice in ("on", "off"):
-        wanted = make_settings(iterations=3, warm_up_share=0.0, effects={"antialiasing": choice, "density": "off"})
-        settings, plan = plan_effects(painted(), wanted)
-        loop.train(painted(), tmp_path / choice, Run(painted().root, None, "vhap", settings, plan))
-        opacity[choice] = read_checkpoint(tmp_path / choice).state.splats().opacity
-    assert abs(opacity["on"] - opacity["off"]).max() > 1e-3
+        settings, _ = plan_effects(capture, make_settings(iterations=1, effects={"antialiasing": choice}))
+        settings = replace(settings, lattice=0, hull_points=False)
+        small = trainer.Trainer(capture, settings, {})
+        for parameters in (small.state.parameters, small.state.average):
+            parameters.log_scale.sub_(1.5)  # narrower than a pixel
+            parameters.sh[:, 0, 0] = 1.0
+        expected = reference_image(small, view, choice == "on")
+        pictures.append(small.render(view, 0.0))
+        np.testing.assert_allclose(pictures[-1], expected, atol=1e-4)
+        difference, ssim = reference.image_loss(expected, target)
+        weight = settings.ssim_weight
+        losses.append(small.step(view, image, 0.0))
+        expected_loss = (1 - weight) * difference.mean() + weight * (1 - ssim.mean())
+        assert losses[-1] == pytest.approx(float(expected_loss), rel=1e-4)
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.05
+    assert abs(losses[0] - losses[1]) > 1e-3
+
+
+def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> torch.Tensor:
+    """The trainer's splats over white, by the reference renderer in float64."""
+    state = small.state
+    p = Parameters(*(tensor.double() for tensor in state.parameters))
+    placed = reference.embed(p.xyz, p.rotation, p.log_scale, small.frames.of(view.timestep), state.face.long())
+    color, alpha, _ = reference.render(*placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased)
+    return color + 1 - alpha
