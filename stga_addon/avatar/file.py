@@ -127,7 +127,8 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
     if header.get("version") != VERSION:
-        raise StgaError(f"{path}: has avatar format version {shorten(header.get('version'))}, this add-on reads {VERSION}")
+        version = shorten(header.get("version"))
+        raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {VERSION}")
     kinds = {
         "convention": str,
         "background": list,
