@@ -97,7 +97,7 @@ def _floats(path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tu
 
 
 def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
+    if array.dtype.kind == "f" and (abs(array) < 2**53).all() and (array == np.round(array)).all():
         array = array.astype(np.int64)
     if array.dtype.kind not in "iu":
         raise StgaError(f"{path}: {key} holds {array.dtype}, expected whole numbers")

@@ -46,7 +46,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """One training run.
+    """Settings of one training run.
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
                    ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training
@@ -58,38 +58,38 @@ class TrainingSettings:
     convention     embedding convention
     views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the paper's batches)
     global_interval, global_unit   a global iteration after every so many local iterations, or "frame" visits
-    warm_up_share        share of the budget trained globally before the first local iteration
+    warm_up_share  share of the budget trained globally before the first local iteration
     selection      which triangles a frame trains
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     distance_weight, distance_limit   the same for the distance from the triangle's origin
-    ema_share      the avatar is made of each splat's running average over its steps, in which the latest has this
-                   share; 1: of the splats as they are
+    ema_share      share of the latest step in each splat's exponential moving average, which the avatar is made of;
+                   1: no averaging
     stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a splat farther than the
                    limit from its triangle's origin is put back to this share of the limit; 0: onto the origin, as in
                    the paper
                    All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
                    for "gaussian_avatars"
-    sh_degree, sh_steps   highest degree, and the shares of the budget at which the degree rises by one
+    sh_degree, sh_steps   highest SH degree, and the shares of the budget at which the degree rises by one
     hull_points    add hull points for what the mesh does not cover
     density_interval  iterations between density control, 0 never; it works during `density_span` of the budget
     growth         most splats that density control may add, as a share of the initial number
-    background     colour behind the head in the capture's images, and behind transparent ones
-    random_background  where there are masks, put another random colour behind the head in every iteration, so that
-                   splats in the background's colour cannot hide in it and alpha becomes right
+    background     color behind the head in the capture's images, and behind transparent ones
+    random_background  where there are masks, put a random color behind the head in every iteration, so that splats
+                   of the background's color cannot hide in it and alpha is learned
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
                    `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
     stop_when_flat  stop when more time no longer helps (`forecast.plateau_start`)
     preset         the preset that these settings began with, or none
-    strain_color   splats carry colour that follows how their triangle deforms (`avatar.strain`)
+    strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
-                   images, which are taken away when they are read
+                   images, which are corrected when they are read
     tracking       refine FLAME's expression, joints and translation of each training timestep (`tracking`)
-    effects        effect -> "on" or "off" where the person has decided, with everything else to be decided from the
-                   capture (`effects.plan`); None: these settings are final
+    effects        effect -> "on" or "off" where the user has decided; the others are decided from the capture
+                   (`effects.plan`). None: these settings are final
     """
 
     strategy: str = setting("global", choices=STRATEGIES)

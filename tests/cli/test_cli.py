@@ -286,7 +286,7 @@ def test_resuming_what_is_not_there(
     assert not (tmp_path / "none").exists()
     other = factory.write_mesh_capture(tmp_path / "other", TIMESTEPS, range(5))
     message = refused(capsys, "train", other, "--out", trained, "--resume")
-    assert f"was trained on {root.resolve()} (4 cameras, 4 timesteps), but {other} (5 cameras" in message
+    assert f"was trained on {root.resolve()} (3 cameras, 3 timesteps), but {other} (5 cameras" in message
 
 
 @pytest.mark.parametrize("option", [["--stop-when-flat"], ["--target-psnr", 30], ["--preset", "final"], ["--seed", 5]])

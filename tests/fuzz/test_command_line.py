@@ -1,6 +1,6 @@
 """The whole command line on generated arguments and damaged inputs: exit code 0, 2 or 130, one bounded sentence.
 
-STGA_FUZZ_CASES sets the number of cases; case n is the same in every run.
+STGA_FUZZ_CASES sets the number of cases and STGA_FUZZ_FIRST the first one; case n is the same in every run.
 """
 
 import copy
@@ -33,6 +33,7 @@ from stga_addon.training.run.folder import read_run
 pytest.importorskip("torch")
 
 CASES = int(os.environ.get("STGA_FUZZ_CASES", 1500))
+FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
 MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
 REPORTED_FAILURES = 20
@@ -162,7 +163,7 @@ def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(folder / "start")  # relative names of outputs end up in FOLDER
     failures: dict[str, list[str]] = {}
-    for number in range(CASES):
+    for number in range(FIRST_CASE, FIRST_CASE + CASES):
         shutil.rmtree(case, ignore_errors=True)
         shutil.rmtree(scratch, ignore_errors=True)
         shutil.copytree(folder / "template", case)

@@ -1,6 +1,7 @@
 """The training job: what is written down, what is refused, and that a worker trains what the same process would."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -213,6 +214,36 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     assert seen.state == WorkerState.FAILED
     assert "00003.obj" in seen.status.error
     assert seen.status.traceback == ""
+
+
+@pytest.mark.slow
+def test_closed_stderr_still_leaves_a_status(tmp_path, capture):
+    """Catches a worker without stderr that ends before it writes its status."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    write_job(run, new_job(capture, iterations=2))
+    shell = f'"{sys.executable}" -m stga_addon job "{run}" 2>&-'
+    done = subprocess.run(["sh", "-c", shell], cwd=Path(__file__).parents[2], timeout=300)
+    assert done.returncode == 0
+    assert inspect_worker(job_folder(run)).state == WorkerState.FINISHED
+
+
+@pytest.mark.slow
+def test_interrupted_job_is_cancelled(tmp_path, capture):
+    """Catches Ctrl-C in a worker that is reported as a failure with a traceback."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    write_job(run, new_job(capture))
+
+    def interrupt(progress):
+        if progress.iteration == 3 and progress.message == "Training":
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training_job(run, also=interrupt)
+    assert inspect_worker(job_folder(run)).state == WorkerState.CANCELLED
+    assert (run / "checkpoint.npz").exists()
 
 
 def test_an_interpreter_without_anything_is_named(tmp_path, capture):

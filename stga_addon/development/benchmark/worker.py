@@ -55,17 +55,16 @@ class Turns:
 def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
     """Train the folder's run in turns and measure its avatar."""
     from ...avatar.file import read_avatar
-    from ...capture.open import open_capture
     from ...report.preset_timing import seconds_per_iteration
     from ...training.evaluate.metrics import evaluate_avatar
     from ...training.optimize.tracking import with_refined_tracking
-    from ...training.run.folder import read_run
     from ...training.run.loop import train
+    from ...training.run.open_run import open_run
 
     turns = Turns(requests, replies)
     try:
-        run = read_run(folder)
-        capture = open_capture(run.capture, run.flame, run.principal_point)
+        opened = open_run(folder)
+        run, capture = opened.run, opened.capture
         seconds_per_iteration(capture, run.settings, WARM_UP_S)
         avatar = read_avatar(train(capture, folder, run, resume=True, report=turns.report))
         if not turns.stopped:
