@@ -138,7 +138,7 @@ def test_mistakes_of_training_are_sentences(head, tmp_path):
         ({"directory": ""}, "run folder: no path given"),
         ({"directory": "//run"}, "relative to the .blend file, which has not been saved yet"),
         ({"directory": str(tmp_path / "file")}, "cannot be written"),
-        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run that could be resumed"),
+        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run"),
         ({"directory": str(tmp_path / "run"), "python": python}, "no_python: cannot be started as a Python"),
     ):
         with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
@@ -256,6 +256,14 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
     tick_until(monitor, lambda: bpy.context.scene.stga.result_shown)
     assert bpy.context.scene.stga.splats is not None
+
+
+def test_cancel_right_after_reopening(extension, worker, tmp_path):
+    """Catches a script that cannot cancel a training of the file it opened: without a window no timer has read it."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    assert bpy.ops.stga.cancel_training() == {"FINISHED"}
+    assert worker.update(0.5, "Training")
 
 
 def test_moved_blend_file(extension, worker, tmp_path):

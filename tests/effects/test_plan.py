@@ -1,4 +1,4 @@
-"""The plan's way: decided once, shown, stored with the run, and kept by a run that is resumed."""
+"""Effect plan: decided once, printed, stored with the run and kept on resume."""
 
 from pathlib import Path
 
