@@ -321,7 +321,7 @@ def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
     """Catches a traceback for a file that was written by something else."""
     arrays = read_npz(run_folder / "tracking.npz")
     for name, value, says in (
-        ("timesteps", np.arange(2), "timesteps are no 5 whole numbers"),
+        ("timesteps", np.arange(2), "timesteps: expected 5 whole numbers"),
         ("tracked", np.zeros((2, 20)), r"tracked has shape \(2, 20\), expected 5 timesteps first"),
     ):
         write_npz(tmp_path / "tracking.npz", {**arrays, name: value})
