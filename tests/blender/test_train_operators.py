@@ -138,7 +138,7 @@ def test_mistakes_of_training_are_sentences(head, tmp_path):
         ({"directory": ""}, "run folder: no path given"),
         ({"directory": "//run"}, "relative to the .blend file, which has not been saved yet"),
         ({"directory": str(tmp_path / "file")}, "cannot be written"),
-        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run that could be resumed"),
+        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run"),
         ({"directory": str(tmp_path / "run"), "python": python}, "no_python: cannot be started as a Python"),
     ):
         with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
