@@ -145,16 +145,16 @@ class Train(bpy.types.Operator):
 
     def _job(self, head: Any) -> TrainingJob:
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-        chosen = None
+        settings = None
         if not self.resume:
             effects = None if self.strategy == "gaussian-avatars" else parse_choices(self.effects.split())
             preset = None if self.preset == "none" else self.preset
-            chosen = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
+            settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
         capture, model = Path(head[tags.CAPTURE]), head.get(tags.FLAME_MODEL)
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
         flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
-        return TrainingJob(capture, flame, principal_point, chosen, self.device)
+        return TrainingJob(capture, flame, principal_point, settings, self.device)
 
 
 class CancelTraining(bpy.types.Operator):

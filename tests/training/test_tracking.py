@@ -268,7 +268,9 @@ def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_fo
     capture, _ = lost
     checkpoint = read_checkpoint(run_folder)
     trainer = Trainer(capture, make_run(capture).settings, {}, checkpoint.state)
-    trainer.continue_from(checkpoint)
+    assert trainer.tracking is not None
+    assert checkpoint.tracking is not None
+    trainer.tracking.state = checkpoint.tracking
     shown = with_refined_tracking(capture, run_folder)
     for timestep in TIMESTEPS[:-1]:
         np.testing.assert_allclose(shown.mesh(timestep), trainer.frames.mesh(timestep), atol=1e-12)

@@ -90,7 +90,7 @@ class Tracking:
         return with_parameters(self._source(timestep), self.parameters()[self._row[timestep]])
 
     def mesh(self, timestep: int) -> np.ndarray:
-        """(V, 3) metres."""
+        """Refined mesh (V, 3) of the timestep, in meters."""
         return sequence_mesh(self._person, timestep)
 
     def step(self, timestep: int, vertex_gradient: np.ndarray, share: float) -> None:

@@ -149,7 +149,10 @@ class _Loop:
         here, there = self.trainer.tracking, checkpoint.tracking
         if (None if here is None else here.tracked.shape) != (None if there is None else there.change.shape):
             raise StgaError(f"{self.out}: its checkpoint's refined tracking does not fit the capture or the settings")
-        self.trainer.continue_from(checkpoint)
+        self.trainer.restore(
+            checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count,
+            checkpoint.tracking,
+        )  # fmt: skip
         self.losses.extend(checkpoint.losses)
         self.elapsed, self.best = checkpoint.elapsed_s, checkpoint.best_psnr
         self.evaluations = checkpoint.evaluations
