@@ -1,4 +1,4 @@
-"""What refining FLAME's parameters brings, and costs where they are right, at the same number of iterations.
+"""Benchmark of refined tracking: quality and time with and without it, at the same number of iterations.
 
     python benchmarks/tracking.py CAPTURE --flame FILE [--iterations 500] [--errors 0 0.5 1]
 

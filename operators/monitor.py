@@ -89,7 +89,7 @@ def dismiss_training(scene: Any) -> None:
 
 def check_now(scene: Any) -> None:
     """Read the status of the scene's training at once, and again as long as something is expected."""
-    if _states[scene.session_uid].run is not None:
+    if _read_scene(scene).run is not None:
         _handle(scene, _read_status(scene))
     _start_timer()
 
@@ -118,10 +118,7 @@ def tick() -> float | None:
     """Check every scene and worker; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
     intervals = [_check_safely(scene) for scene in bpy.data.scenes if scene.library is None]
     for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive]:
-        before, _snapshots[folder] = _snapshots[folder], _inspect(folder)
-        if _snapshots[folder] != before:
-            redraw()
-        intervals.append(CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None)
+        intervals.append(_check_worker_safely(folder))
     return min((interval for interval in intervals if interval is not None), default=None)
 
 
@@ -136,11 +133,28 @@ def _check_safely(scene: Any) -> float | None:
         return None
 
 
-def _check(scene: Any) -> float | None:
+def _check_worker_safely(folder: Path) -> float | None:
+    """Check a worker that belongs to no scene; after an unexpected error, which is printed, it counts as ended."""
+    before = _snapshots[folder]
+    try:
+        _snapshots[folder] = _inspect(folder)
+    except Exception:
+        traceback.print_exc()
+        _snapshots[folder] = WorkerSnapshot()
+    if _snapshots[folder] != before:
+        redraw()
+    return CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None
+
+
+def _read_scene(scene: Any) -> MonitorState:
+    """Compare the scene's state with what is stored in the scene."""
     run, result_shown = _stored(scene)
     is_new = scene.session_uid not in _states
-    _handle(scene, states.FileLoaded(run, result_shown) if is_new else states.SceneRead(run, result_shown))
-    state = _states[scene.session_uid]
+    return _handle(scene, states.FileLoaded(run, result_shown) if is_new else states.SceneRead(run, result_shown))
+
+
+def _check(scene: Any) -> float | None:
+    state = _read_scene(scene)
     if state.run is None or state.stopped:
         return None
     if not state.building:

@@ -83,7 +83,7 @@ def run(options: Namespace) -> None:
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
-        print(f"its meshes: {options.out / 'tracking.npz'}, in Blender with Apply Motion, Own Offsets")
+        print(f"refined meshes: {options.out / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:
@@ -107,7 +107,7 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
     decided = {decision.effect: decision for decision in run.effect_plan}
     for name, choice in parse_choices(options.effect).items():
         if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
-            raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
+            raise StgaError(f"--effect {name}={choice}: differs from what was decided for this run; use another --out")
 
 
 def _new_run(options: Namespace, capture: Capture, device: str) -> Any:

@@ -33,7 +33,7 @@ def open_file(path: Path) -> None:
 def look_through_camera() -> None:
     """Set the 3D viewports to the scene's camera and to Material Preview.
 
-    Blender's default view shows twenty metres of grid, in which a head is a dot.
+    Blender's default view shows twenty meters of grid, in which a head is a dot.
     """
     for screen in bpy.data.screens:
         for area in screen.areas:

@@ -16,8 +16,8 @@ from .animation import write_curve
 from .objects import Warn, log_warning, place, remove
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
-CLIP_START = 0.01  # metres
-DISPLAY_SIZE = 0.1  # metres; Blender's default of one metre would cover the head with cameras
+CLIP_START = 0.01  # meters
+DISPLAY_SIZE = 0.1  # meters; Blender's default of one meter would cover the head with cameras
 POSE_TOLERANCE = 1e-9  # of matrix entries
 INTRINSICS_TOLERANCE = 1e-6  # pixels
 
@@ -64,7 +64,7 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
 
 
 def _views_by_camera(capture: Capture) -> dict[int, list[View]]:
-    """camera index -> its views of all splits, one a timestep, ascending."""
+    """camera index -> its views of all splits, one per timestep, ascending."""
     cameras: dict[int, dict[int, View]] = {}
     for views in capture.views.values():
         for view in views:

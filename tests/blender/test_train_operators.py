@@ -258,6 +258,14 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     assert bpy.context.scene.stga.splats is not None
 
 
+def test_cancel_right_after_reopening(extension, worker, tmp_path):
+    """Catches a script that cannot cancel a training of the file it opened: without a window no timer has read it."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    assert bpy.ops.stga.cancel_training() == {"FINISHED"}
+    assert worker.update(0.5, "Training")
+
+
 def test_moved_blend_file(extension, worker, tmp_path):
     """Catches a training that is lost when file and run move together, and silence when the run is gone."""
     monitor, scene = extension.operators.monitor, bpy.context.scene

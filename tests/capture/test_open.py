@@ -458,7 +458,7 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
     with pytest.raises(StgaError, match="is not a capture; expected transforms_"):
         open_capture(tmp_path)
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
-    with pytest.raises(StgaError, match=r"give your FLAME model file .* with --flame, or in the add-on"):
+    with pytest.raises(StgaError, match=r"give the FLAME model file .* with --flame or in the preferences"):
         open_capture(root)
     with pytest.raises(StgaError, match="'left' is not one of vhap, opencv, center"):
         open_capture(root, model_file, "left")

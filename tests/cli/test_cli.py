@@ -1,4 +1,4 @@
-"""The command line: what each command does, and one sentence with exit code 2 for every mistake."""
+"""Commands of the command line, and their errors: one sentence, exit code 2."""
 
 import argparse
 import json
@@ -471,7 +471,7 @@ def test_bare_blender_python_selects_and_exports(trained: Path, tmp_path: Path) 
 def test_interruption_and_mistakes_have_their_codes(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a traceback after Ctrl-C, and a bug of ours dressed up as the person's mistake."""
+    """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's mistake."""
 
     def fails_with(error: BaseException) -> None:
         def run(options: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""What is off costs nothing: no arrays, no calls."""
+"""Cost of effects: one that is off takes no memory and makes no calls; one that is on reaches the training."""
 
 from collections import Counter
 from dataclasses import replace
@@ -67,7 +67,7 @@ def test_off_calls_nothing(painted, tmp_path, monkeypatch):
 
 
 def test_on_calls_all(painted, tmp_path, monkeypatch):
-    """Catches an effect that is on in name only, and with it a test above that counts in vain."""
+    """Catches an effect that is on but not called, which would also make the test above pass."""
     calls, splats = train(painted(), tmp_path, monkeypatch, "on")
     assert set(calls) == set(CALLS)
     assert calls["background"] == ITERATIONS
@@ -77,7 +77,7 @@ def test_on_calls_all(painted, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("choice", ["on", "off"])
 def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
-    """Catches parameters that are read, differentiated or written where nobody asked for it, or not where one did."""
+    """Catches parameters that are refined or written with the effect off, or not refined with it on."""
     capture, _ = write_head(tmp_path / "head")
     settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
     calls: Counter[str] = Counter()
@@ -95,7 +95,7 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
 
 
 def test_exposure_is_taken_away(painted):
-    """Catches gains and offsets applied the wrong way round, to the background, or to a camera they are not of."""
+    """Catches gains and offsets applied inversely, to the background, or to another camera."""
     gain, offset = unlike_cameras()
     rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
     correct = exposure_correction(make_settings(iterations=1, exposure=rows))
@@ -112,12 +112,12 @@ def test_exposure_is_taken_away(painted):
 
 
 def test_no_exposure_is_no_pass():
-    """Catches images that are copied for nothing."""
+    """Catches images that are copied although nothing is corrected."""
     assert exposure_correction(make_settings(iterations=1)) is None
 
 
 def test_no_splats_on_teeth(painted):
-    """Catches splats that are placed, trained and drawn where nothing will ever be seen."""
+    """Catches splats on teeth that are never visible."""
     capture = painted()
     vertices = len(capture.neutral)
     rows = np.zeros((120, 3)) + capture.neutral[0] + np.random.default_rng(0).normal(0, 0.002, (120, 3))

@@ -1,4 +1,4 @@
-"""The plan's way: decided once, shown, stored with the run, and kept by a run that is resumed."""
+"""Effect plan: decided once, printed, stored with the run and kept on resume."""
 
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     assert read_run(trained) == before
     assert "strain-color  on, as asked" in capsys.readouterr().out
     assert main([*train, "--effect", "strain-color=off"]) == 2
-    assert "this run has decided otherwise" in capsys.readouterr().err
+    assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 def test_info_shows_the_plan(root, capsys):

@@ -1,4 +1,4 @@
-"""Auto decides right: scenes of which it is known what their colors depend on."""
+"""Rules of effects, on scenes whose colors depend on known causes."""
 
 from dataclasses import replace
 from types import SimpleNamespace

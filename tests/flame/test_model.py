@@ -242,6 +242,7 @@ def test_truncated_and_flipped_bytes(tmp_path: Path) -> None:
         ("weights", np.full((40, 5), "x"), "weights"),
         ("f", np.full((3, 3), 40), "f names vertices 40 to 40, expected 0 to 39"),
         ("f", np.full((3, 3), 0.5), "f holds float64, expected whole numbers"),
+        ("f", np.full((3, 3), 1e30), "f holds float64, expected whole numbers"),
         ("kintree_table", np.array([[0, 4, 1, 1, 1], range(5)]), "kintree_table names the parents"),
         ("n_identity", np.array(13), "n_identity is 13, expected one number from 0 to 12"),
         ("masks/nose", np.array([40]), "mask nose"),

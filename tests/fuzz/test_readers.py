@@ -1,7 +1,7 @@
-"""One target a reader: a good file, damaged as hypothesis likes, either loads or raises StgaError.
+"""Fuzzing of every file reader: a file damaged by hypothesis either loads or raises StgaError.
 
-Catches any other exception, a crash, a hang and memory out of proportion, on inputs that nobody thought of. Quick
-in the normal suite; `STGA_FUZZ_SECONDS=600 pytest tests/fuzz` shares that time among the targets.
+Catches any other exception, crashes, hangs and excessive memory. Quick in the normal suite;
+`STGA_FUZZ_SECONDS=600 pytest tests/fuzz` shares that time among the targets.
 """
 
 import json
@@ -45,14 +45,14 @@ from stga_addon.training.run import metrics_log
 
 from .conftest import SECONDS
 
-LONGEST_S, MOST_BYTES = 2.0, 200e6
+MAX_READ_S, MAX_READ_BYTES = 2.0, 200e6
 MODEL = model_of(random_arrays(), 9)
 FACES = np.arange(12).reshape(4, 3)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A file's name, how a good one is written, and its reader."""
+    """File name, writer of a valid file, and reader."""
 
     name: str
     write: Callable[[Path], Any]
@@ -187,7 +187,7 @@ def damaged(draw: Callable[[st.SearchStrategy[Any]], Any], content: bytes) -> by
 
 
 def rewrap(draw: Callable[[st.SearchStrategy[Any]], Any], path: Path) -> bytes:
-    """A good archive around damaged arrays: a checksum would otherwise stop nearly all damage."""
+    """A valid archive with damaged arrays: otherwise its checksums detect nearly all damage."""
     out = path.with_suffix(".wrapped")
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(out, "w") as new:
         victim = draw(st.sampled_from(old.namelist()))
@@ -199,7 +199,7 @@ def rewrap(draw: Callable[[st.SearchStrategy[Any]], Any], path: Path) -> bytes:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_reader(tmp_path: Path, name: str) -> None:
-    """Catches what a reader does besides loading and raising StgaError."""
+    """Catches a reader that neither loads a damaged file nor raises StgaError."""
     target = TARGETS[name]
     path, broken = tmp_path / "good" / target.name, tmp_path / "broken" / target.name
     path.parent.mkdir()
@@ -214,7 +214,7 @@ def test_reader(tmp_path: Path, name: str) -> None:
 
 
 def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) -> None:
-    """One profile's worth of examples; `number` seeds those of the bounded run."""
+    """Run the examples of one profile, seeded with `number`."""
 
     @seed(number)
     @settings(settings.get_profile("stga-fuzz" if SECONDS else "stga-quick"))
@@ -230,8 +230,8 @@ def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) ->
             peak = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
-        assert time.monotonic() - begin < LONGEST_S
-        assert peak < MOST_BYTES
+        assert time.monotonic() - begin < MAX_READ_S
+        assert peak < MAX_READ_BYTES
         assert [entry.name for entry in broken.parent.iterdir()] == [broken.name]
 
     once()

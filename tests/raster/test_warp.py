@@ -33,7 +33,7 @@ from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import adam_rows
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.gpu import blend, embed, image_loss, optimizer, self_test
-from stga_addon.raster.gpu.autograd import shared
+from stga_addon.raster.gpu.autograd import shared_arrays
 from stga_addon.raster.gpu.rasterize import DeviceFrames, Rasterizer, device_camera
 from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
 from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
@@ -66,14 +66,14 @@ class Raw:
 
     def forward(self, focus: np.ndarray | None = None, reach: int = 0, **options):
         marked = None if focus is None else wp.array(focus.astype(np.uint8), dtype=wp.uint8, device=DEVICE)
-        splats = shared(self.tensors)
+        splats = shared_arrays(self.tensors)
         return self.rasterizer.forward(splats, self.face, self.frames, focus=marked, reach=reach, **options)
 
     def gradients(self, rendering, fill: float = 0.0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         """Gradients by name, the rows written, and those rows' screen gradient."""
         gradients = Parameters(*(torch.full_like(t, fill) for t in self.tensors))
         screen = self.rasterizer.backward(
-            rendering, shared(self.tensors), self.face, wp.from_torch(self.v_image), shared(gradients),
+            rendering, shared_arrays(self.tensors), self.face, wp.from_torch(self.v_image), shared_arrays(gradients),
             wp.from_torch(self.v_transmittance),
         )  # fmt: skip
         written = np.flatnonzero(rendering.wanted.numpy())

@@ -1,4 +1,4 @@
-"""Camera-space frames of a posed mesh's triangles, and their strain; what `avatar.embedding` and `avatar.strain` do.
+"""Camera-space frames and strain of a posed mesh's triangles, as `avatar.embedding` and `avatar.strain` compute them.
 
 In float64 like them, because a head may be far from the origin and strain is a difference of squares: for some ten
 thousand triangles that costs a GPU nothing, while the host would need longer for it than the GPU for an iteration.

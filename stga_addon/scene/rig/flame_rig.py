@@ -39,8 +39,8 @@ from .names import (
     sum_property,
 )
 
-BONE_LENGTH = 0.03  # metres; only how long the bones are displayed
-NEGLIGIBLE_DISPLACEMENT = 1e-6  # metres along an axis that a joint may be off when all sliders are at their limits
+BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
+NEGLIGIBLE_DISPLACEMENT = 1e-6  # meters along an axis that a joint may be off when all sliders are at their limits
 QUATERNION = ("w", "x", "y", "z")
 SQUARED_NORM = "(w*w+x*x+y*y+z*z)"  # keyed quaternions are interpolated without normalization
 # (rotation - identity) / 2 as quadratic forms of the quaternion, row by row.

@@ -18,7 +18,7 @@ def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warn
 
     A FLAME capture becomes a rig (see `flame_rig.add_rig`); any other gets one shape key per timestep, `t00012`, with
     value 1 at its own frame, so that the evaluated mesh of that frame is the timestep's mesh; frames between two
-    timesteps blend them. Object coordinates are the capture's (metres, y-up). Regions become boolean face attributes
+    timesteps blend them. Object coordinates are the capture's (meters, y-up). Regions become boolean face attributes
     `stga_region_<name>`. Importing the same folder or file again replaces the last import; vertex groups and materials
     are kept if the triangles are the same. `warn` receives one sentence per problem. correctives: see `add_rig`.
     Raises StgaError where a timestep cannot be read; the scene is then unchanged.
