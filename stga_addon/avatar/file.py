@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_frames
 from .splats import MAX_SH_DEGREE, Splats
@@ -31,8 +31,8 @@ class Avatar:
     faces       (F, 3) int32
     settings    how it was trained; anything that JSON holds
     regions     name -> (F,) bool
-    background  red, green, blue in 0…1 that it was trained against
-    antialiased  whether it was trained with opacity compensation (`render_forward`), and is to be drawn so
+    background  red, green, blue in 0 to 1 that it was trained against
+    antialiased  whether it was trained with opacity compensation (`render_forward`), and is rendered so
     principal_point  convention of the capture that it was trained on (`read_transforms`)
     """
 
@@ -127,7 +127,8 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
     if header.get("version") != VERSION:
-        raise StgaError(f"{path}: has avatar format version {header.get('version')!r}, this add-on reads {VERSION}")
+        version = shorten(header.get("version"))
+        raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {VERSION}")
     kinds = {
         "convention": str,
         "background": list,
@@ -147,7 +148,7 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
     if avatar.convention not in CONVENTIONS:
-        raise StgaError(f"{path}: convention is {avatar.convention!r}, expected one of {', '.join(CONVENTIONS)}")
+        raise StgaError(f"{path}: convention is {shorten(avatar.convention)}, expected one of {', '.join(CONVENTIONS)}")
     if avatar.principal_point not in PRINCIPAL_POINTS:
         raise StgaError(
             f"{path}: principal_point is {avatar.principal_point!r:.40}, expected one of {', '.join(PRINCIPAL_POINTS)}"
@@ -168,7 +169,7 @@ def _check(path: Path, avatar: Avatar) -> None:
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
     numbers = [value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1]
     if len(numbers) != 3 or len(avatar.background) != 3:
-        raise StgaError(f"{path}: background is {avatar.background!r}, expected three numbers between 0 and 1")
+        raise StgaError(f"{path}: background is {shorten(avatar.background)}, expected three numbers between 0 and 1")
 
 
 def _check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
