@@ -11,12 +11,11 @@ def claim_stdout() -> BinaryIO:
     Call it before anything that may print is imported: libraries in C write to descriptor 1, whatever `sys.stdout` is.
     """
     sys.stdout.flush()
-    messages = os.fdopen(os.dup(1), "wb")
     try:
-        os.dup2(2, 1)
+        os.fstat(2)
     except OSError:  # standard error is closed
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 1)
-        os.close(nowhere)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    messages = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
     sys.stdout = sys.stderr
     return messages

@@ -97,15 +97,15 @@ def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
         assert off.mean() < 2e-3 if name.startswith("parameters/") else not off.any(), name
 
 
-def test_losses_are_the_cpus_and_told_two_iterations_late(toy: Capture) -> None:
-    """Catches a loss of another iteration, of a local one, or told twice."""
+def test_losses_are_the_cpus_and_returned_two_iterations_late(toy: Capture) -> None:
+    """Catches a loss of another iteration, of a local one, or returned twice."""
     settings = settings_of()
     cpu, warp = pair(toy, settings)
     parts = [(1, None), (3, None), (1, toy.regions["mouth"]), (3, None), (1, None), (3, None)]
     batches = [batch_of(toy, settings, timestep, selected=part) for timestep, part in parts]
-    expected, told = ([step.step(batch) for batch in batches] for step in (cpu, warp))
-    assert [loss is None for loss in told] == [True, True, False, False, True, False]
-    assert [told[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
+    expected, losses = ([step.step(batch) for batch in batches] for step in (cpu, warp))
+    assert [loss is None for loss in losses] == [True, True, False, False, True, False]
+    assert [losses[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:

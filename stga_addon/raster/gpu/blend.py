@@ -6,7 +6,7 @@ summed over the warp's registers, and each half has a row of its own to write it
 later, in order. So no two threads write one place and no sum depends on chance.
 
 On Warp's CPU device, where threads run one after the other, a warp is a single lane: `_warp_sum` and its like return
-what they are given, every lane counts as the leading one, and rows are added to, in the order of lanes.
+their argument, every lane counts as the leading one, and rows are added to, in the order of lanes.
 """
 
 import warp as wp

@@ -60,7 +60,7 @@ class DeviceRenderOutput:
 class Rasterizer:
     """Renders on one device, forward and backward, into buffers of its own.
 
-    The host never waits for the device in `backward`, and in `forward` only if it is told to.
+    The host never waits for the device in `backward`, and in `forward` only with `wait`.
     """
 
     def __init__(self, device: str) -> None:
@@ -147,7 +147,7 @@ class Rasterizer:
         """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
         v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the rows of `gradients` that the rendering
-        wants and leaves all others as they are. Returns screen (N,): for those rows, the length of the gradient with
+        wants and leaves all others unchanged. Returns screen (N,): for those rows, the length of the gradient with
         respect to the projected center in units of half the image.
         """
         array, lens = self.buffers.get, rendering.frames.lens
