@@ -74,9 +74,7 @@ def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
         return Verdict(False, f"{facts.cameras} cameras are too few to tell how color depends on the view")
     found = facts.view_dependence
-    reason = (
-        f"colors follow the direction of view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
-    )
+    reason = f"colors depend on the view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
     return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
 
 
@@ -99,17 +97,15 @@ def antialiasing(facts: CaptureFacts) -> Verdict:
     if widest > MAX_PIXEL_WIDTH_RATIO:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
     pixels = facts.pixels_per_splat(50)
-    return Verdict(
-        pixels < FINE_SPLAT_PIXELS,
-        f"pixels are alike at the head, and half of the splats have under {pixels:.1f} of them",
-    )
+    reason = f"pixels have the same width at the head, and half of the splats cover less than {pixels:.1f}"
+    return Verdict(pixels < FINE_SPLAT_PIXELS, reason)
 
 
 def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
     backgrounds = samples.background
     if np.isnan(backgrounds).any():
-        return Verdict(False, "not every image has a mask or transparency that reason where the head ends", only=True)
+        return Verdict(False, "not every image has a mask or transparency that shows where the head ends", only=True)
     color, spread = backgrounds.mean(0), float(samples.background_spread.max())
     spread = max(spread, float(abs(backgrounds - color).max()))
     if spread > MAX_BACKGROUND_SPREAD_LEVELS:
