@@ -1,4 +1,4 @@
-"""STGA for Blender: trains and shows selective-training Gaussian head avatars."""
+"""STGA for Blender: trains Gaussian head avatars and shows them in Blender."""
 
 from contextlib import ExitStack
 
@@ -6,7 +6,7 @@ _registered = ExitStack()
 
 
 def register() -> None:
-    """Register everything or nothing. Nothing is imported before Blender asks: this file also lies beside the tests."""
+    """Register everything or nothing. Imports are local because tests import this file without Blender, too."""
     from . import operators
     from .operators import command_line, render_engine
     from .ui import curve, panel, preferences, properties
@@ -19,5 +19,5 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Undo `register`, last first."""
+    """Unregister everything, last first."""
     _registered.close()

@@ -1,4 +1,4 @@
-"""Whether Auto is right: the effects that a capture calls for, against all of them, at the same number of iterations.
+"""Benchmark of effect plans: effects decided automatically against all effects, at the same number of iterations.
 
     python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 500] [--seeds 3] [--only full static one-camera]
     python benchmarks/effects.py CAPTURE … --each
@@ -42,15 +42,15 @@ from stga_addon.training.settings import make_settings
 
 LEFT_TO_AUTO = ("selection",)
 DIFFERING = ("full", "static", "one-camera")
-CLOSE = 0.1
-"""dB that Auto may lose against all effects."""
+MAX_LOSS_DB = 0.1
+"""Of the automatic plan against all effects."""
 
 Choices = dict[str, str]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a variant came to over seeds: PSNR in dB by split, milliseconds of an iteration, effects that were on."""
+    """Result of a variant over seeds: PSNR in dB by split, milliseconds per iteration, effects that were on."""
 
     psnr: Mapping[str, Spread]
     pace: Spread
@@ -72,7 +72,7 @@ def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]
 
 
 def uneven(root: Path, folder: Path) -> Path:
-    """The capture, which has masks, as unlike cameras would have taken it; those held out are as they were."""
+    """The capture, which must have masks, with different color gains for each training camera."""
     derive(root, folder, lambda split, frame: True)
     path = folder / "transforms_train.json"
     document = json.loads(path.read_text("utf-8"))
@@ -80,7 +80,7 @@ def uneven(root: Path, folder: Path) -> Path:
         gain = np.random.default_rng(frame["camera_index"]).uniform(0.9, 1.1, 3)
         image = np.asarray(Image.open(root / frame["file_path"]).convert("RGB"), np.float32)
         cover = np.asarray(Image.open(root / frame["fg_mask_path"]).convert("L"), np.float32)[..., None] / 255
-        image *= 1 + cover * (gain - 1)  # what is behind the head was put there later, by no camera
+        image *= 1 + cover * (gain - 1)  # the background was replaced after recording
         frame["file_path"] = f"uneven_{number:05d}.png"
         Image.fromarray(np.clip(image + 0.5, 0, 255).astype(np.uint8)).save(folder / frame["file_path"])
     path.write_text(json.dumps(document), "utf-8")
@@ -127,7 +127,7 @@ def trained(
 def compare(
     capture: Capture, flame: Path | None, iterations: int, seeds: int, variants: Mapping[str, Choices]
 ) -> dict[str, Outcome]:
-    """Variant -> what came of it."""
+    """Variant -> its result."""
     found: dict[str, list[tuple[dict[str, float], float, str]]] = {name: [] for name in variants}
     for seed in range(seeds):
         for name in random.Random(seed).sample(list(variants), len(variants)):
@@ -173,7 +173,7 @@ def main() -> None:
 
 
 def auto_and_all(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
-    """One row a capture: is Auto right?"""
+    """One row per capture: is the automatic plan as good as all effects?"""
     row("capture", "Auto, val", "all on, val", "Δ", "Auto, ms", "all on, ms", "Auto is right", "only by all on")
     row(*["---"] * 8)
     for name, capture in opened.items():
@@ -182,7 +182,7 @@ def auto_and_all(opened: Mapping[str, Capture], options: argparse.Namespace) -> 
         auto, every = compare(capture, options.flame, options.iterations, options.seeds, variants).values()
         difference = auto.psnr["val"].mean - every.psnr["val"].mean
         more = [effect for effect in every.on.split(", ") if effect not in auto.on.split(", ")]
-        right = not more or (difference > -CLOSE and auto.pace.mean < every.pace.mean)
+        right = not more or (difference > -MAX_LOSS_DB and auto.pace.mean < every.pace.mean)
         row(
             name, cell(auto.psnr["val"], 2), cell(every.psnr["val"], 2), f"{difference:+.2f}", cell(auto.pace, 1),
             cell(every.pace, 1), "yes" if right else "no", ", ".join(more) or "nothing",
@@ -190,7 +190,7 @@ def auto_and_all(opened: Mapping[str, Capture], options: argparse.Namespace) -> 
 
 
 def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
-    """One row an effect: what is saved without it?"""
+    """One row per effect: quality and time without it."""
     for name, capture in opened.items():
         everything = dict.fromkeys(possible(capture, options.iterations), "on")
         variants = {effect: {**everything, effect: "off"} for effect in everything if changes(effect)}
@@ -208,12 +208,12 @@ def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
 
 
 def changes(effect: str) -> bool:
-    """Whether training differs by the effect: the joints of Blender's rig cost it nothing."""
+    """Whether the effect changes training; those of Blender's rig do not."""
     return next(known for known in EFFECTS if known.name == effect).off != {} or effect == "exposure"
 
 
 def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
-    """One row an effect and capture: what does it bring?"""
+    """One row per effect and capture: quality with the effect against without."""
     row("capture", "effect", "decided", "on against off, val", "test", "ms")
     row(*["---"] * 6)
     for name, capture in opened.items():

@@ -31,7 +31,7 @@ from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.project import project_backward, project_forward
 from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_forward, tile_grid, with_strain_color
 from stga_addon.raster.cpu.threads import threads
-from stga_addon.raster.cpu.tiles import PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
+from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.device import choose_device, make_backend
@@ -116,7 +116,7 @@ def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str
     first_pair, pairs, rows = lists.first_pair, lists.pairs, lists.visible
     everything, everywhere = np.arange(n), np.ones((tiles_y, tiles_x), bool)
     order, count = depth_order(depth, rows), len(lists.pair_splat)
-    counts = np.empty((PARTS, tiles_x * tiles_y), np.int32)
+    counts = np.empty((SORT_PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts, pairs)
     places = counts.copy()
     compute_offsets(rows, pairs, places, first_pair)

@@ -1,9 +1,9 @@
-"""How much memory a training run holds at its peak, for a short sequence and a long one.
+"""Benchmark of memory: peak of a training run, for a short sequence and a long one.
 
     python benchmarks/memory.py [--timesteps 12 1200] [--views 15] [--width 802] [--height 550] [--iterations 400]
 
 A mesh capture of a head-shaped ellipsoid is written to a temporary folder; all timesteps share a few image and mesh
-files on disk, which are read and decoded for each as any others would be. Every run is a process of its own, whose peak
+files on disk, which are read and decoded for each timestep. Every run is a process of its own, whose peak
 (VmHWM) is read at its end.
 """
 
@@ -72,7 +72,7 @@ def write_capture(root: Path, timesteps: int, views: int, width: int, height: in
 
 
 def _pose(angle: float) -> list[list[float]]:
-    """Camera to world, OpenGL axes, one metre from the origin and looking at it."""
+    """Camera to world, OpenGL axes, one meter from the origin and looking at it."""
     sine, cosine = math.sin(angle), math.cos(angle)
     return [[cosine, 0, sine, sine], [0, 1, 0, 0], [-sine, 0, cosine, cosine], [0, 0, 0, 1]]
 

@@ -1,4 +1,4 @@
-"""What refining FLAME's parameters brings, and costs where they are right, at the same number of iterations.
+"""Benchmark of refined tracking: quality and time with and without it, at the same number of iterations.
 
     python benchmarks/tracking.py CAPTURE --flame FILE [--iterations 500] [--errors 0 0.5 1]
 
@@ -58,7 +58,7 @@ def lose_track(capture: Capture, error: float) -> Capture:
     return with_sequence(capture, replace(sequence, frame=frame))
 
 
-def millimetres(capture: Capture, true: Capture) -> float:
+def millimeters(capture: Capture, true: Capture) -> float:
     """Mean distance of vertices between two captures' training timesteps."""
     timesteps = {view.timestep for view in true.views["train"]}
     return 1000 * float(np.mean([np.linalg.norm(capture.mesh(t) - true.mesh(t), axis=1).mean() for t in timesteps]))
@@ -92,7 +92,7 @@ def main() -> None:
         for choice in ("off", "on"):
             shown, psnr, pace = trained(capture, options.flame, options.iterations, choice)
             print(
-                f"| {error:g} | {facts.outside:.2%} | {auto} | {choice} | {millimetres(shown, true):.2f} "
+                f"| {error:g} | {facts.outside:.2%} | {auto} | {choice} | {millimeters(shown, true):.2f} "
                 f"| {psnr['val']:.2f} | {psnr['test']:.2f} | {1000 * pace:.1f} |",
                 flush=True,
             )

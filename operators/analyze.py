@@ -122,9 +122,9 @@ def stop() -> None:
     _analyses.clear()
 
 
-def chosen_effects(chosen: Any) -> list[str]:
+def chosen_effects(settings: Any) -> list[str]:
     """The user's choices of effects, as NAME=on or NAME=off."""
-    return [f"{row.name}={row.choice}" for row in chosen.effects if row.choice != "auto"]
+    return [f"{row.name}={row.choice}" for row in settings.effects if row.choice != "auto"]
 
 
 def tick() -> float | None:
@@ -138,34 +138,34 @@ def tick() -> float | None:
     return CHECK_INTERVAL_S if _analyses else None
 
 
-def _arguments(head: Any, chosen: Any) -> list[str]:
+def _arguments(head: Any, settings: Any) -> list[str]:
     point = head.get(tags.PRINCIPAL_POINT, "vhap")
     arguments = ["info", head[tags.CAPTURE], "--json", "--presets", "--principal-point", point]
-    arguments += ["--device", chosen.device]
+    arguments += ["--device", settings.device]
     if head.get(tags.FLAME_MODEL):
         arguments += ["--flame", head[tags.FLAME_MODEL]]
-    return arguments + [part for effect in chosen_effects(chosen) for part in ("--effect", effect)]
+    return arguments + [part for effect in chosen_effects(settings) for part in ("--effect", effect)]
 
 
 def _show(scene: Any, analysis: _Analysis) -> None:
     """Fill the scene's table of effects, or say what failed; earlier results stay then."""
-    chosen = getattr(scene, ids.SETTINGS)
+    settings = getattr(scene, ids.SETTINGS)
     try:
-        _fill(chosen, analysis.result())
-        chosen.analysis_error = ""
+        _fill(settings, analysis.result())
+        settings.analysis_error = ""
     except StgaError as error:
-        chosen.analysis_error = str(error)
+        settings.analysis_error = str(error)
     except Exception as error:  # it must not end the timer
         traceback.print_exc()
-        chosen.analysis_error = f"Unexpected error ({type(error).__name__}: {error}); see the console"
+        settings.analysis_error = f"Unexpected error ({type(error).__name__}: {error}); see the console"
 
 
-def _fill(chosen: Any, found: dict[str, Any]) -> None:
+def _fill(settings: Any, found: dict[str, Any]) -> None:
     decisions = found["plan"]
-    chosen.preset_timing = json.dumps({row["preset"]: row["seconds"] for row in found.get("presets", ())})
-    chosen.effects.clear()
+    settings.preset_timing = json.dumps({row["preset"]: row["seconds"] for row in found.get("presets", ())})
+    settings.effects.clear()
     for decision in decisions:
-        row = chosen.effects.add()
+        row = settings.effects.add()
         row.name = decision["effect"]
         for name in ("choice", "on", "reason", "cost"):
             setattr(row, name, decision[name])

@@ -124,13 +124,13 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         head = head_of(context)
         parts = [part for part in PARTS if getattr(self, part)]
         if not parts:
-            raise StgaError("apply motion: no part is chosen; choose expression, jaw, eyes, neck or head")
+            raise StgaError("Apply Motion: no part is chosen; choose expression, jaw, eyes, neck or head")
         name, motion = self._motion(context, head)
         step = self._step(context.scene)
         frames = retimed(motion, step)
         end = self.start + len(frames) - 1
         if end > LAST_FRAME:
-            raise StgaError(f"apply motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}")
+            raise StgaError(f"Apply Motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}")
         if self.strength != 1.0:
             frames = strengthened(frames, self.strength)
         tracked = self._tracked(head, step) if self.own_offsets else None

@@ -1,4 +1,4 @@
-"""`blender --command stga …`: the same parser as `python -m stga_addon`, about the head of the file that is open."""
+"""`blender --command stga …`: the commands of `python -m stga_addon`, by default about the open file's head."""
 
 import os
 import sys
@@ -24,7 +24,7 @@ from .common import file_path, is_head, scene_settings
 from .environment import environment_folder, preferred_python, training_python
 
 IN_BLENDER = ("select", "export", "demo", "environment")
-"""Commands that need none of the packages which Blender's Python may lack, or need Blender itself."""
+"""Commands that need none of the packages that Blender's Python may lack, or need Blender itself."""
 
 if TYPE_CHECKING:
     from ..stga_addon.jobs.delegate import OpenHead
@@ -43,7 +43,7 @@ def _run(arguments: list[str]) -> int:
             _prepare_environment_command(options)
         if command in IN_BLENDER or not missing_packages():
             return main(arguments, head)
-        return _hand_over(arguments, head, played=command == "render")
+        return _delegate(arguments, head, played=command == "render")
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2
@@ -77,7 +77,7 @@ def _open_head() -> "OpenHead | None":
     )
 
 
-def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
+def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
     """Run the command in the training environment; returns its exit code. Raises StgaError where there is none."""
     from ..stga_addon.jobs.delegate import FOLDER, write_head
 
@@ -92,7 +92,7 @@ def _hand_over(arguments: list[str], head: "OpenHead | None", played: bool) -> i
 
 
 def _played(head: Any, capture: Capture) -> Capture:
-    """The capture with the meshes of the scene's frames, whatever animates the head there."""
+    """The capture with the meshes that the head has in the scene's frames, however it is animated."""
     scene = bpy.context.scene
     frames = range(scene.frame_start, scene.frame_end + 1)
 

@@ -42,15 +42,15 @@ def preferences(context: Any) -> Any:
 
 
 def package() -> str:
-    """The name by which Blender knows the extension."""
+    """The extension's module name in Blender."""
     return str(__package__).rpartition(".")[0]
 
 
 def head_of(context: Any) -> Any:
-    """The head the steps work on. Raises StgaError where the scene has none."""
+    """The scene's head. Raises StgaError where it has none."""
     head = scene_settings(context).head
     if not is_head(head):
-        raise StgaError("no head in the scene: import a capture first")
+        raise StgaError("No head in the scene; import a capture first")
     return head
 
 
@@ -105,25 +105,25 @@ class FileImport(ImportHelper):
 
 
 def flame_property() -> Any:
-    """The model file that an import reads parameters with."""
+    """FLAME model of an import operator."""
     return bpy.props.StringProperty(
         name="FLAME Model",
-        description="Your own FLAME model file (.pkl or .npz), for what was tracked with FLAME; "
-        "empty: the one in the preferences",
+        description="FLAME model file (.pkl or .npz), for captures and motions tracked with FLAME; "
+        "empty: that of the preferences",
         subtype="FILE_PATH",
-        options=PATH_OPTIONS,
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
 
 
 def flame_model_path(context: Any, given: str = "") -> Path | None:
-    """The model file `given`, else the one in the preferences, else None."""
+    """The FLAME model file `given`, else that of the preferences, else None."""
     preferred = preferences(context)
     path = given or (preferred.flame_model if preferred else "")
     return file_path(path, "FLAME model") if path else None
 
 
 def capture_of(head: Any) -> Capture:
-    """Open the capture that a head was imported from again. Raises StgaError where it has moved or changed."""
+    """Open the capture that a head was imported from. Raises StgaError where it has moved or changed."""
     model = head.get(tags.FLAME_MODEL)
     return open_capture(
         Path(head[tags.CAPTURE]),

@@ -7,13 +7,13 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.flame.sequence import ALIASES, FRAME_FIELDS
+from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
 from .apply_motion import ApplyMotion
 from .common import file_path, is_head, reporting, scene_settings
 
-MOTION_FIELDS = {*FRAME_FIELDS, *ALIASES, "pose"}
+MOTION_FIELDS = {*FRAME_FIELDS, *FIELD_ALIASES, "pose"}
 
 
 class OpenNpz(bpy.types.Operator):

@@ -18,7 +18,7 @@ from .common import FileImport, file_path, flame_model_path, flame_property, rep
 
 
 class ImportCapture(bpy.types.Operator, FileImport):
-    """Import a multi-view capture: the tracked head, animated over its frames, and the cameras with their images"""
+    """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with images"""
 
     bl_idname = ids.IMPORT_CAPTURE
     bl_label = "Import Capture"
@@ -39,25 +39,26 @@ class ImportCapture(bpy.types.Operator, FileImport):
     flame: flame_property()
     principal_point: bpy.props.EnumProperty(
         name="Principal Point",
-        description="What cx and cy in the transforms files mean",
+        description="Meaning of cx and cy in the transforms files",
         items=(
             ("vhap", "VHAP", "cy is counted from the bottom of the image, as VHAP's exporter writes it"),
             ("opencv", "OpenCV", "cx and cy are counted from the top left corner of the image"),
             ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
         ),
+        options={"SKIP_SAVE"},
     )
     correctives: bpy.props.EnumProperty(
         name="Correctives",
-        description="Which of FLAME's joints get pose correctives: shape keys and drivers that correct the mesh",
+        description="FLAME joints that get pose correctives: shape keys, with drivers, that correct the mesh",
         items=(
-            ("all", "Every Joint", "Any bone posed by hand gives FLAME's own mesh"),
-            ("moving", "Joints That Move", "Only what this capture turns: fewer shape keys and drivers"),
+            ("all", "All Joints", "Every bone can be posed by hand and gives FLAME's exact mesh"),
+            ("moving", "Moving Joints", "Joints that move in this capture only: fewer shape keys and drivers"),
         ),
     )
     set_up_scene: bpy.props.BoolProperty(
         name="Set Up Scene",
-        description="Give the scene the capture's resolution, its first camera and the Standard view "
-        "transform, in which the splats' colours are trained",
+        description="Set the scene's resolution and camera to those of the capture, and its view transform to "
+        "Standard, which the splats' colors are trained for",
         default=True,
     )
     filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})

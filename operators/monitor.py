@@ -89,7 +89,7 @@ def dismiss_training(scene: Any) -> None:
 
 def check_now(scene: Any) -> None:
     """Read the status of the scene's training at once, and again as long as something is expected."""
-    if _states[scene.session_uid].run is not None:
+    if _read_scene(scene).run is not None:
         _handle(scene, _read_status(scene))
     _start_timer()
 
@@ -118,10 +118,7 @@ def tick() -> float | None:
     """Check every scene and worker; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
     intervals = [_check_safely(scene) for scene in bpy.data.scenes if scene.library is None]
     for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive]:
-        before, _snapshots[folder] = _snapshots[folder], _inspect(folder)
-        if _snapshots[folder] != before:
-            redraw()
-        intervals.append(CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None)
+        intervals.append(_check_worker_safely(folder))
     return min((interval for interval in intervals if interval is not None), default=None)
 
 
@@ -136,11 +133,28 @@ def _check_safely(scene: Any) -> float | None:
         return None
 
 
-def _check(scene: Any) -> float | None:
+def _check_worker_safely(folder: Path) -> float | None:
+    """Check a worker that belongs to no scene; after an unexpected error, which is printed, it counts as ended."""
+    before = _snapshots[folder]
+    try:
+        _snapshots[folder] = _inspect(folder)
+    except Exception:
+        traceback.print_exc()
+        _snapshots[folder] = WorkerSnapshot()
+    if _snapshots[folder] != before:
+        redraw()
+    return CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None
+
+
+def _read_scene(scene: Any) -> MonitorState:
+    """Compare the scene's state with what is stored in the scene."""
     run, result_shown = _stored(scene)
     is_new = scene.session_uid not in _states
-    _handle(scene, states.FileLoaded(run, result_shown) if is_new else states.SceneRead(run, result_shown))
-    state = _states[scene.session_uid]
+    return _handle(scene, states.FileLoaded(run, result_shown) if is_new else states.SceneRead(run, result_shown))
+
+
+def _check(scene: Any) -> float | None:
+    state = _read_scene(scene)
     if state.run is None or state.stopped:
         return None
     if not state.building:
@@ -152,8 +166,8 @@ def _check(scene: Any) -> float | None:
 
 def _stored(scene: Any) -> tuple[Path | None, bool]:
     """What the scene stores of its training: the run, and whether its result was shown."""
-    chosen = getattr(scene, ids.SETTINGS)
-    return Path(chosen.training_run) if chosen.training_run else None, chosen.result_shown
+    settings = getattr(scene, ids.SETTINGS)
+    return Path(settings.training_run) if settings.training_run else None, settings.result_shown
 
 
 def _locate(scene: Any, run: Path) -> Path:
@@ -167,12 +181,12 @@ def _inspect(folder: Path) -> WorkerSnapshot:
 
 
 def _read_status(scene: Any, show_result: bool | None = None) -> states.StatusRead:
-    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     assert run is not None
     folder = _locate(scene, run)
     files = RunFiles(_stamp(job_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
-    shown = chosen.show_result if show_result is None else show_result
-    return states.StatusRead(folder, _inspect(job_folder(folder)), files, chosen.live_preview, shown)
+    shown = settings.show_result if show_result is None else show_result
+    return states.StatusRead(folder, _inspect(job_folder(folder)), files, settings.live_preview, shown)
 
 
 def _stamp(path: Path) -> states.Stamp | None:
@@ -192,13 +206,13 @@ def _handle(scene: Any, event: states.Event) -> MonitorState:
 
 
 def _carry_out(scene: Any, effects: Iterable[states.Effect]) -> None:
-    chosen = getattr(scene, ids.SETTINGS)
+    settings = getattr(scene, ids.SETTINGS)
     for effect in effects:
         match effect:
             case states.StoreTraining(run, result_shown):
-                chosen.training_run, chosen.result_shown = "" if run is None else str(run), result_shown
+                settings.training_run, settings.result_shown = "" if run is None else str(run), result_shown
             case states.StoreAvatar(path):
-                chosen.avatar = str(path)
+                settings.avatar = str(path)
             case states.LoadAvatar(path):
                 _loader.load(scene, path)
             case states.ReadCurve(folder):
@@ -219,7 +233,7 @@ def _read_curve(folder: Path) -> Curve | None:
 
 def _show_loaded(scene: Any) -> MonitorState:
     """Show the avatar that was loaded for the scene, in the object that shows this run or in a new one."""
-    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == str(run)), None)
     if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
         return _states[scene.session_uid]  # Blender crashes where a mesh changes during these
@@ -227,17 +241,20 @@ def _show_loaded(scene: Any) -> MonitorState:
         loaded = _loader.result(scene)
         if loaded is None:
             return _states[scene.session_uid]
-        if not is_head(chosen.head):
+        if not is_head(settings.head):
             raise StgaError("No head in the scene to show the avatar on; import the capture")
-        return _handle(scene, _present(scene, shown, *loaded))
+        event = _present(scene, shown, *loaded)
     except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
-        return _handle(scene, states.AvatarFailed(str(error)))
+        event = states.AvatarFailed(str(error))
+    if not isinstance(event, states.SliceBuilt):
+        _loader.discard(scene)
+    return _handle(scene, event)
 
 
 def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes) -> states.Event:
     """Show the avatar, or build the next slice of what its object needs."""
-    chosen, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
-    check_head(avatar, chosen.head)
+    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
+    check_head(avatar, settings.head)
     if shown is not None and can_update(shown, avatar):
         update_splats(shown, attributes)
         return states.AvatarShown(created=False)
@@ -246,7 +263,7 @@ def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes
     if shown is not None:
         bpy.data.objects.remove(shown)
     assert run is not None
-    shown = show(scene, avatar, chosen.head, f"{chosen.head.name} {run.name}", attributes=attributes)
+    shown = show(scene, avatar, settings.head, f"{settings.head.name} {run.name}", attributes=attributes)
     shown[tags.RUN] = str(run)
     return states.AvatarShown(created=True)
 
@@ -272,9 +289,12 @@ class _Loader:
         future = self._loading[scene.session_uid]
         return future.result() if future.done() else None
 
+    def discard(self, scene: Any) -> None:
+        self._loading.pop(scene.session_uid, None)
+
     def close(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown()
+            self._pool.shutdown(wait=False, cancel_futures=True)
         self._pool, self._loading = None, {}
 
 
@@ -302,7 +322,8 @@ def redraw() -> None:
 
 @persistent
 def _after_load(_: Any) -> None:
-    _states.clear()  # session ids of the file before
+    _loader.close()
+    _states.clear()  # of scenes of the file before
     for scene in bpy.data.scenes:
         if scene.library is None:
             _adopt(scene)
@@ -311,13 +332,13 @@ def _after_load(_: Any) -> None:
 
 def _adopt(scene: Any) -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as `stga demo` does."""
-    chosen = getattr(scene, ids.SETTINGS)
+    settings = getattr(scene, ids.SETTINGS)
     heads = [thing for thing in scene.objects if is_head(thing)]
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
-    if chosen.head is None and len(heads) == 1:
-        chosen.head = heads[0]
-        if chosen.splats is None and len(shown) == 1:
-            chosen.splats = shown[0]
+    if settings.head is None and len(heads) == 1:
+        settings.head = heads[0]
+        if settings.splats is None and len(shown) == 1:
+            settings.splats = shown[0]
 
 
 def register() -> None:

@@ -1,4 +1,4 @@
-"""Registers the render engine and tells it which Python draws where Blender's own cannot."""
+"""Registers the render engine, with the Python that renders where Blender's own cannot."""
 
 import bpy
 

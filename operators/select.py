@@ -58,16 +58,16 @@ class Select(bpy.types.Operator):
         head = head_of(context)
         names = [name.strip() for name in self.regions.split(",") if name.strip()] or key_regions(head)
         capture = _with_painted(capture_of(head), head, names)
-        chosen = select_capture(capture, SelectionOptions(self.threshold, self.zero_pose, tuple(names)))
-        write_selection(head, chosen)
+        selection = select_capture(capture, SelectionOptions(self.threshold, self.zero_pose, tuple(names)))
+        write_selection(head, selection)
         head[tags.KEY_REGIONS] = "\n".join(names)
         _count(context, head)
         if has_heat_map(head):
             show_heat_map(head, _shares(head))
-        moving = [faces.mean() for faces in chosen.values() if faces.any()]
+        moving = [faces.mean() for faces in selection.values() if faces.any()]
         share = 100 * sum(moving) / len(moving) if moving else 0.0
         self.report(
-            {"INFO"}, f"{len(moving)} of {len(chosen)} frames select triangles, {share:.0f} % of the head on average"
+            {"INFO"}, f"{len(moving)} of {len(selection)} frames select triangles, {share:.0f} % of the head on average"
         )
         return {"FINISHED"}
 
@@ -178,12 +178,12 @@ def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
 
 def _count(context: Any, head: Any) -> None:
     """Fill the panel's table of selected triangles."""
-    chosen, splats = scene_settings(context), scene_settings(context).splats
+    settings, splats = scene_settings(context), scene_settings(context).splats
     per_face = splats_per_face(splats, head)
     every = (TrainingSettings.lattice + 1) * (TrainingSettings.lattice + 2) // 2  # at the start of a training
-    chosen.selected_frames.clear()
+    settings.selected_frames.clear()
     for timestep, selected in read_selection(head).items():
-        row = chosen.selected_frames.add()
+        row = settings.selected_frames.add()
         row.frame, row.triangles = timestep, int(selected.sum())
         row.splats = int(selected.sum()) * every if per_face is None else int(per_face[selected].sum())
 

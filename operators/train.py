@@ -57,11 +57,11 @@ def device_property() -> Any:
     """Training device: of the operator, and of the panel that calls it."""
     return bpy.props.EnumProperty(
         name="Device",
-        description="What trains; a resumed run keeps its own",
+        description="Device that trains. Auto resumes a run on the device that it was trained on",
         items=(
-            ("auto", "Auto", "An NVIDIA GPU where one works, else the CPU"),
+            ("auto", "Auto", "An NVIDIA GPU if one works, else the CPU"),
             ("cpu", "CPU", "The processor"),
-            ("cuda", "GPU", "An NVIDIA GPU; training fails where none works"),
+            ("cuda", "GPU", "An NVIDIA GPU; training fails if none works"),
         ),
     )
 
@@ -97,7 +97,7 @@ class Train(bpy.types.Operator):
     )
     resume: bpy.props.BoolProperty(
         name="Resume",
-        description="Continue the run in the folder, with the settings, budget and device it was started with",
+        description="Continue the run in the folder with the settings and budget that it was started with",
         options={"SKIP_SAVE"},
     )
     python: bpy.props.StringProperty(
@@ -145,15 +145,16 @@ class Train(bpy.types.Operator):
 
     def _job(self, head: Any) -> TrainingJob:
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-        chosen = None
+        settings = None
         if not self.resume:
             effects = None if self.strategy == "gaussian-avatars" else parse_choices(self.effects.split())
             preset = None if self.preset == "none" else self.preset
-            chosen = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
+            settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
         capture, model = Path(head[tags.CAPTURE]), head.get(tags.FLAME_MODEL)
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
-        return TrainingJob(capture, Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap"), chosen)
+        flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
+        return TrainingJob(capture, flame, principal_point, settings, self.device)
 
 
 class CancelTraining(bpy.types.Operator):

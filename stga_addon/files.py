@@ -38,8 +38,10 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield an empty temporary file beside `path`; rename it over `path` when the block succeeds, else delete it.
 
     The first call for a folder also removes what killed processes left there (`remove_leftovers`).
-    Raises StgaError where the folder cannot be written.
+    Raises StgaError where the folder cannot be written, or `path` is a folder or a device.
     """
+    if not path.name or (os.path.exists(path) and not os.path.isfile(path)):
+        raise StgaError(f"{path}: cannot be written (is not a regular file)")
     partial = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         _create(partial)

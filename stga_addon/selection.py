@@ -1,22 +1,37 @@
-"""Which triangles really moved, and so which splats a frame trains (STGA, selective training)."""
+"""Selection of the triangles that move in a timestep, whose splats it trains (STGA, selective training)."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from .capture.model import Capture
+from .errors import StgaError, shorten
+from .flame.sequence import ZERO_POSES
 
 KEY_REGIONS = ("left_eye", "right_eye", "mouth", "nose")
 
 
 @dataclass(frozen=True)
 class SelectionOptions:
-    """threshold in metres; zero_pose "head" (rotation, translation and neck; jaw and eyes are expression) or "all"."""
+    """How triangles are selected.
+
+    threshold  meters that a triangle must move; finite, at least 0
+    zero_pose  "head": rotation, translation and neck do not count as motion; "all": nor do jaw and eyes
+    regions    names of key regions, each selected as a whole
+    Raises StgaError for other values.
+    """
 
     threshold: float = 0.002
     zero_pose: str = "head"
     regions: tuple[str, ...] = KEY_REGIONS
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.threshold, int | float) and 0 <= self.threshold < math.inf):
+            raise StgaError(f"selection threshold must be a distance in meters, got {shorten(self.threshold)}")
+        if self.zero_pose not in ZERO_POSES:
+            raise StgaError(f"zero_pose is {shorten(self.zero_pose)}, expected one of {', '.join(ZERO_POSES)}")
 
 
 def select_faces(
@@ -28,9 +43,9 @@ def select_faces(
 ) -> np.ndarray:
     """(F,) bool: the triangles whose splats this frame trains.
 
-    mesh, neutral (V, 3) metres without rigid head motion; faces (F, 3); regions name -> (F,) bool.
-    A region whose mean centre offset exceeds the threshold is selected whole; any other triangle is selected
-    by its own offset (STGA, selective training).
+    mesh, neutral (V, 3) meters without rigid head motion; faces (F, 3); regions name -> (F,) bool.
+    A region whose mean offset of triangle centers exceeds the threshold is selected as a whole; a triangle outside of
+    the regions is selected by its own offset (STGA, selective training).
     """
     offset = np.linalg.norm((mesh[faces] - neutral[faces]).mean(1), axis=-1)
     in_region = np.zeros(len(faces), bool)
@@ -43,7 +58,7 @@ def select_faces(
 
 
 def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool for every timestep; a selection that came with the capture wins over the rule."""
+    """timestep -> (F,) bool for every timestep; a selection that comes with the capture takes precedence."""
     regions = {name: capture.regions[name] for name in options.regions if name in capture.regions}
     chosen = {}
     for timestep in capture.timesteps:

@@ -1,6 +1,7 @@
 """Fixtures that several test folders share."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,3 +15,16 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("shared data (studio_head, raster_reference, …) not present")
     return folder
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The kernels that a test's `render_differentiable` runs: Numba's, and Warp's on Warp's CPU device."""
+    if request.param == "gpu":
+        pytest.importorskip("warp")
+        from stga_addon.raster.gpu.autograd import render_differentiable
+
+        for module in (request.module, sys.modules["raster.test_kernels"]):
+            if hasattr(module, "render_differentiable"):
+                monkeypatch.setattr(module, "render_differentiable", render_differentiable)
+    return str(request.param)

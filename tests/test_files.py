@@ -41,8 +41,8 @@ def test_replacing_is_all_or_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["file/a.json", "folder"])
-def test_what_cannot_be_written(tmp_path: Path, name: str) -> None:
-    """Catches a traceback where a folder is a file, or the file a folder, and litter beside it."""
+def test_unwritable_paths(tmp_path: Path, name: str) -> None:
+    """Catches a traceback where a folder is a file or the file is a folder, and temporary files left beside it."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder" / "inner").mkdir(parents=True)
     with pytest.raises(StgaError, match=rf"{tmp_path / name}: cannot be written"):
@@ -51,7 +51,7 @@ def test_what_cannot_be_written(tmp_path: Path, name: str) -> None:
 
 
 def test_json_round_trip(tmp_path: Path) -> None:
-    """Catches another encoding than UTF-8, whatever the system's is."""
+    """Catches an encoding that depends on the system."""
     value = {"name": "Grüße", "list": [1, 2.5, None, True], "nested": {"a": "b"}}
     write_json(tmp_path / "a.json", value)
     assert read_json(tmp_path / "a.json") == value
@@ -68,7 +68,7 @@ def test_malformed_json(tmp_path: Path, content: bytes) -> None:
 
 
 def test_missing_files(tmp_path: Path) -> None:
-    """Catches a traceback for a name mistyped."""
+    """Catches a traceback for a mistyped name."""
     for read in (read_json, read_npz):
         for path in (tmp_path / "none", tmp_path):
             with pytest.raises(StgaError, match=rf"{path}: cannot be read"):
@@ -77,7 +77,7 @@ def test_missing_files(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
-    """Catches a suffix that numpy adds, and arrays that change their kind."""
+    """Catches a suffix that numpy adds, and arrays that change their type or shape."""
     arrays = {"a": np.arange(6, dtype=np.int32).reshape(2, 3), "b/c": np.array([True, False]), "d": np.float64(3)}
     write_npz(tmp_path / "file.part", arrays, compressed)
     again = read_npz(tmp_path / "file.part")
@@ -90,7 +90,7 @@ def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
 
 @pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9, 0.99])
 def test_truncated_npz(tmp_path: Path, kept: float) -> None:
-    """Catches a download that broke off."""
+    """Catches a traceback for an incomplete download."""
     path = tmp_path / "a.npz"
     np.savez_compressed(path, a=np.random.default_rng(0).random(1000), b=np.arange(5))
     path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
@@ -99,7 +99,7 @@ def test_truncated_npz(tmp_path: Path, kept: float) -> None:
 
 
 def test_flipped_bits(tmp_path: Path) -> None:
-    """Catches a damaged disk or memory stick: whatever is read must be what was written, or an error."""
+    """Catches damaged content that is read as if it were valid."""
     path = tmp_path / "a.npz"
     expected = np.random.default_rng(0).random(50)
     np.savez_compressed(path, a=expected)
@@ -117,7 +117,7 @@ def test_flipped_bits(tmp_path: Path) -> None:
 
 
 def test_hostile_npz(tmp_path: Path) -> None:
-    """Catches pickled objects, which run code, arrays that unpack to more than is allowed, and headers that lie."""
+    """Catches pickled objects, which run code, oversized arrays, and headers that promise more than follows."""
     path = tmp_path / "a.npz"
     np.savez(path, a=np.array([{"x": 1}], object))
     with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz file"):
@@ -135,8 +135,8 @@ def test_hostile_npz(tmp_path: Path) -> None:
         read_npz(path)
 
 
-def test_an_npz_of_something_else(tmp_path: Path) -> None:
-    """Catches an entry that is no array handed on as bytes, which fails with a traceback far from here."""
+def test_npz_with_other_content(tmp_path: Path) -> None:
+    """Catches an entry that is not an array returned as bytes."""
     path = tmp_path / "a.npz"
     for name in ("a.npy", "notes.txt"):
         with zipfile.ZipFile(path, "w") as archive:
@@ -214,3 +214,14 @@ def test_mode_follows_the_umask(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o640
+
+
+@pytest.mark.parametrize("name", [".", "/", "folder", "pipe"])
+def test_only_regular_files_are_replaced(tmp_path, name):
+    """Catches a device, such as /dev/null, that is replaced by a file, and a traceback for a path without a name."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    path = Path(name) if name in "./" else tmp_path / name
+    with pytest.raises(StgaError, match="is not a regular file"), files.replacing(path):
+        pytest.fail("the block must not run")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["folder", "pipe"]

@@ -62,7 +62,7 @@ def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Pat
 def test_mistakes(parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches tracebacks for what a person gets wrong first."""
     assert render(parts, tmp_path / "out") == 2
-    assert "give your FLAME model file" in capsys.readouterr().err
+    assert "give the FLAME model file" in capsys.readouterr().err
     meshes = factory.write_mesh_capture(tmp_path / "meshes")
     assert render(parts | {"motion": meshes}, tmp_path / "out", "--flame", parts["model"]) == 2
     assert "was not tracked with FLAME" in capsys.readouterr().err

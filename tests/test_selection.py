@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
 from stga_addon.selection import SelectionOptions, select_capture, select_faces
 
 THRESHOLD = 0.01
@@ -15,7 +16,7 @@ NEUTRAL = np.random.default_rng(0).normal(size=(3 * COUNT, 3))
 
 
 def moved(offsets: dict[int, float]) -> np.ndarray:
-    """The neutral mesh with some triangles shifted by so many metres, each in its own direction."""
+    """The neutral mesh with some triangles shifted by so many meters, each in its own direction."""
     mesh, rng = NEUTRAL.copy(), np.random.default_rng(1)
     for face, distance in offsets.items():
         direction = rng.normal(size=3)
@@ -57,8 +58,8 @@ def test_mean_is_of_distances_not_of_vectors():
     assert np.flatnonzero(chosen).tolist() == [0, 1]
 
 
-def test_offset_is_that_of_the_centre():
-    """Catches vertex distances: a triangle that turns about its centre has not moved."""
+def test_offset_is_that_of_the_center():
+    """Catches vertex distances: a triangle that turns about its center has not moved."""
     mesh = NEUTRAL.copy()
     corners = mesh[FACES[2]]
     mesh[FACES[2]] = np.roll(corners, 1, axis=0)
@@ -121,3 +122,16 @@ def test_selection_that_came_with_the_capture_wins():
         6: [],
     }
     assert asked == [(1, "head")]
+
+
+@pytest.mark.parametrize("threshold", [float("nan"), -1.0, float("inf"), "5", None])
+def test_threshold_is_a_distance(threshold: object) -> None:
+    """Catches a threshold that selects nothing, or everything, without saying so."""
+    with pytest.raises(StgaError, match="selection threshold must be a distance"):
+        SelectionOptions(threshold=threshold)  # type: ignore[arg-type]
+
+
+def test_zero_pose_is_known() -> None:
+    """Catches a misspelled option that is found only where the first FLAME mesh is posed, or never."""
+    with pytest.raises(StgaError, match="zero_pose is 'face'"):
+        SelectionOptions(zero_pose="face")

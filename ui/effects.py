@@ -18,16 +18,16 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, scene_settings(context)
+        layout, settings = self.layout, scene_settings(context)
         if is_analyzing(context.scene):
             row = layout.row(align=True)
             row.label(text="Analyzing Capture…", icon="VIEWZOOM")
             row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
         else:
             layout.operator(ids.ANALYZE_CAPTURE, icon="VIEWZOOM")
-        if chosen.analysis_error:
-            draw_text(layout, context, chosen.analysis_error, "ERROR")
-        for row in chosen.effects:
+        if settings.analysis_error:
+            draw_text(layout, context, settings.analysis_error, "ERROR")
+        for row in settings.effects:
             self._draw_effect(context, row)
 
     def _draw_effect(self, context: Any, row: Any) -> None:

@@ -6,7 +6,7 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, scene_settings
-from ..stga_addon.scene.rig.flame_rig import EXPRESSION_KEY, IDENTITY_KEY
+from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY
 from .sidebar import SidebarPanel
 
 MAX_SLIDERS = 10  # the first components vary most
@@ -17,12 +17,12 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "5 Motion"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, scene_settings(context)
+        layout, settings = self.layout, scene_settings(context)
         layout.operator(ids.APPLY_MOTION, text="Apply Motion from File", icon="IMPORT")
         row = layout.row(align=True)
-        row.prop(chosen, "motion_source")
-        if chosen.motion_source is not None:
-            row.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK").source = chosen.motion_source.name
+        row.prop(settings, "motion_source")
+        if settings.motion_source is not None:
+            row.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK").source = settings.motion_source.name
 
 
 class _Sliders(SidebarPanel):

@@ -35,15 +35,15 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
     bl_label = "1 Capture"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, scene_settings(context)
+        layout, settings = self.layout, scene_settings(context)
         layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
         row = layout.row(align=True)
         row.operator(ids.IMPORT_MOTION, text="FLAME Motion", icon="ARMATURE_DATA")
         row.operator(ids.IMPORT_MESHES, text="Meshes", icon="MESH_DATA")
-        layout.prop(chosen, "head")
-        if is_head(chosen.head):
+        layout.prop(settings, "head")
+        if is_head(settings.head):
             layout.label(
-                text=f"{len(chosen.head[tags.TIMESTEPS])} timesteps, {len(chosen.head.data.polygons)} triangles"
+                text=f"{len(settings.head[tags.TIMESTEPS])} timesteps, {len(settings.head.data.polygons)} triangles"
             )
 
 
@@ -52,13 +52,13 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "4 Show"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, scene_settings(context)
-        layout.prop(chosen, "avatar")
-        layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = chosen.avatar
-        layout.operator(ids.EXPORT_AVATAR, icon="EXPORT").avatar = chosen.avatar
-        layout.prop(chosen, "splats")
-        if chosen.splats is not None:
-            self._draw_display(layout, context, chosen.splats)
+        layout, settings = self.layout, scene_settings(context)
+        layout.prop(settings, "avatar")
+        layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = settings.avatar
+        layout.operator(ids.EXPORT_AVATAR, icon="EXPORT").avatar = settings.avatar
+        layout.prop(settings, "splats")
+        if settings.splats is not None:
+            self._draw_display(layout, context, settings.splats)
 
     def _draw_display(self, layout: Any, context: Any, splats: Any) -> None:
         try:
@@ -74,8 +74,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
                 column.prop(owner, prop, text=name)
         if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
             layout.label(text="Solid mode shows no splat colors", icon="INFO")
-            look = layout.operator("wm.context_set_enum", text="Use Material Preview")
-            look.data_path, look.value = "space_data.shading.type", "MATERIAL"
+            preview = layout.operator("wm.context_set_enum", text="Use Material Preview")
+            preview.data_path, preview.value = "space_data.shading.type", "MATERIAL"
         if view_transform_hint(context.scene):
             layout.label(text="View transform changes the colors", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)

@@ -19,21 +19,21 @@ class SelectedFrame(bpy.types.PropertyGroup):
     splats: bpy.props.IntProperty(name="Splats", description="Splats on those triangles")
 
 
-def _forget_rows(chosen: Any, context: Any) -> None:
-    chosen.selected_frames.clear()  # rows of another head
-    chosen.effects.clear()
-    chosen.preset_timing = ""
+def _forget_rows(settings: Any, context: Any) -> None:
+    settings.selected_frames.clear()  # rows of another head
+    settings.effects.clear()
+    settings.preset_timing = ""
 
 
-def preset_times(chosen: Any) -> dict[str, float]:
+def preset_times(settings: Any) -> dict[str, float]:
     """Preset -> seconds of training on this machine; empty before the capture was analyzed."""
-    return dict(json.loads(chosen.preset_timing or "{}"))
+    return dict(json.loads(settings.preset_timing or "{}"))
 
 
-def _take_minutes(chosen: Any, context: Any) -> None:
-    seconds = preset_times(chosen).get(chosen.preset)
+def _take_minutes(settings: Any, context: Any) -> None:
+    seconds = preset_times(settings).get(settings.preset)
     if seconds:
-        chosen.minutes = seconds / 60
+        settings.minutes = seconds / 60
 
 
 class EffectRow(bpy.types.PropertyGroup):

@@ -27,5 +27,5 @@ class RenderPanel(bpy.types.Panel):
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages():
             has_environment = has_training_python(context)
-            drawn_by = "Rendered by the training environment" if has_environment else "Nothing here can render"
-            layout.label(text=f"{drawn_by}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")
+            renderer = "Rendered by the training environment" if has_environment else "No Python here can render"
+            layout.label(text=f"{renderer}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")

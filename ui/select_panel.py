@@ -33,17 +33,17 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "2 Select"
 
     def draw(self, context: Any) -> None:
-        layout, chosen = self.layout, scene_settings(context)
+        layout, settings = self.layout, scene_settings(context)
         layout.operator(ids.SELECT, icon="GROUP_VERTEX")
-        if not is_head(chosen.head):
+        if not is_head(settings.head):
             return
-        _draw_regions(layout, chosen.head)
-        if chosen.selected_frames:
-            _draw_table(layout, chosen)
-        if any(tags.group_timestep(group.name) is not None for group in chosen.head.vertex_groups):
+        _draw_regions(layout, settings.head)
+        if settings.selected_frames:
+            _draw_table(layout, settings)
+        if any(tags.group_timestep(group.name) is not None for group in settings.head.vertex_groups):
             row = layout.row(align=True)
             row.operator(ids.COUNT_SELECTED, icon="FILE_REFRESH")
-            shown = has_heat_map(chosen.head)
+            shown = has_heat_map(settings.head)
             text = "Hide Heat Map" if shown else "Show Heat Map"
             row.operator(ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown).show = not shown
         else:
@@ -61,11 +61,11 @@ def _draw_regions(layout: Any, head: Any) -> None:
         grid.operator(ids.TOGGLE_REGION, text=name.replace("_", " "), icon=icon, depress=name in ticked).name = name
 
 
-def _draw_table(layout: Any, chosen: Any) -> None:
+def _draw_table(layout: Any, settings: Any) -> None:
     heading = layout.row()
     for text in ("Frame", "Triangles", "Splats"):
         heading.label(text=text)
     heading.label(icon="BLANK1")
     layout.template_list(
-        SelectedFrames.bl_idname, "", chosen, "selected_frames", chosen, "selected_row", rows=4, maxrows=5
+        SelectedFrames.bl_idname, "", settings, "selected_frames", settings, "selected_row", rows=4, maxrows=5
     )

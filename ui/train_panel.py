@@ -40,22 +40,22 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_choices(layout: Any, context: Any) -> None:
-    chosen = scene_settings(context)
-    layout.prop(chosen, "run_folder", text="Folder")
-    layout.prop(chosen, "preset")
-    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in preset_times(chosen).items())
+    settings = scene_settings(context)
+    layout.prop(settings, "run_folder", text="Folder")
+    layout.prop(settings, "preset")
+    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in preset_times(settings).items())
     if times:
         draw_text(layout, context, f"On this machine: {times}", "TIME")
-    layout.prop(chosen, "minutes")
-    layout.prop(chosen, "strategy")
-    layout.prop(chosen, "device")
-    layout.prop(chosen, "show_result")
+    layout.prop(settings, "minutes")
+    layout.prop(settings, "strategy")
+    layout.prop(settings, "device")
+    layout.prop(settings, "show_result")
     row = layout.row(align=True)
     for resume, text, icon in ((False, "Train", "PLAY"), (True, "Resume", "FRAME_NEXT")):
         train = row.operator(ids.TRAIN, text=text, icon=icon)
-        train.directory, train.minutes, train.resume = chosen.run_folder, chosen.minutes, resume
-        train.strategy, train.preset, train.device = chosen.strategy, chosen.preset, chosen.device
-        train.effects = " ".join(chosen_effects(chosen))
+        train.directory, train.minutes, train.resume = settings.run_folder, settings.minutes, resume
+        train.strategy, train.preset, train.device = settings.strategy, settings.preset, settings.device
+        train.effects = " ".join(chosen_effects(settings))
     if not has_training_python(context):
         layout.label(text="No training environment yet", icon="INFO")
         layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()

@@ -1,4 +1,4 @@
-"""Where a splat stands when its triangle moves: one local frame per triangle (STGA, embedding)."""
+"""Local frames of triangles, in which splats are stored, and baking to world space (STGA, embedding)."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,22 +9,19 @@ from .splats import SH_C0, Splats, no_strain_color
 from .strain import StrainBasis, face_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
-TINY = 1e-30
-SLIVER = 1e-4
-"""A triangle whose area is below this share of its longest edge's square counts as a line.
-
-Vertices on a line, rounded to float32, still span 1e-6 to 1e-5; what such a triangle says of its normal, or of how
-much it grew, is the rounding's.
-"""
-UPRIGHT = 0.8  # a unit vector with a larger z counts as upright when a perpendicular to it is sought
+MIN_DIVISOR = 1e-30
+MIN_AREA_RATIO = 1e-4
+"""A triangle whose area is below this share of its longest edge's square counts as a line: vertices on a line, rounded
+to float32, have ratios of 1e-6 to 1e-5, and their normal and area are those of the rounding."""
+UPRIGHT_COSINE = 0.8  # from this z on, the perpendicular of a unit vector is sought in the x direction
 
 
 @dataclass(frozen=True)
 class FaceFrames:
     """Per triangle: world = scale · rotation @ local + origin.
 
-    origin (F, 3) metres, rotation (F, 3, 3) proper, scale (F,).
-    strain (F, S) float32: what colours follow (`avatar.strain`), S = 3, or 0 where nobody asked for it.
+    origin (F, 3) meters, rotation (F, 3, 3) proper, scale (F,).
+    strain (F, S) float32 (`avatar.strain`), S = 3, or 0 where it is not needed.
     """
 
     origin: np.ndarray
@@ -34,7 +31,7 @@ class FaceFrames:
 
     @cached_property
     def quaternion(self) -> np.ndarray:
-        """(F, 4) wxyz of the same rotation; what bakes splats needs it, rendering does not."""
+        """(F, 4) wxyz of the same rotation; needed for baking, not for rendering."""
         return quaternion_from_matrix(self.rotation)
 
 
@@ -52,28 +49,28 @@ def face_frames(
 ) -> FaceFrames:
     """Local frame of every triangle of a posed mesh.
 
-    vertices, neutral (V, 3) metres; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
-    basis where colours follow strain.
-    "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit metres of the neutral mesh
+    vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
+    basis where colors follow strain.
+    "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit meters of the neutral mesh
     (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
     unit the triangle (GaussianAvatars' released code).
-    A triangle without area (see SLIVER) keeps a proper rotation and a finite scale.
+    A triangle without area (see MIN_AREA_RATIO) keeps a proper rotation and a finite scale.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     p0, p1, p2 = corners[:, 0], corners[:, 1], corners[:, 2]
     origin = (p0 + p1 + p2) / 3
     if convention == "stga":
-        # p0 − origin without the origin, which rounds: it must vanish where the corners coincide.
+        # p0 - origin without computing the origin, whose rounding would not vanish where the corners coincide.
         first, normal = _orthonormal(((p0 - p1) + (p0 - p2)) / 3, corners)
         rotation = np.stack([first, np.cross(normal, first), normal], axis=-1)
         before = face_areas(neutral, faces)
-        # A triangle that had no area in the neutral mesh has no meaningful ratio: keep the local metres as they are.
-        scale = np.where(before > 0, np.sqrt(_length(_normal(corners)) / 2 / np.maximum(before, TINY)), 1.0)
+        # A triangle without area in the neutral mesh has no meaningful ratio: its scale is 1.
+        scale = np.where(before > 0, np.sqrt(_length(_normal(corners)) / 2 / np.maximum(before, MIN_DIVISOR)), 1.0)
     elif convention == "gaussian_avatars":
         edge, side = _length(p1 - p0), _length(p2 - p0)
         first, normal = _orthonormal(p1 - p0, corners)
         rotation = np.stack([first, normal, np.cross(first, normal)], axis=-1)
-        no_edge = edge <= SLIVER * np.sqrt(_longest_squared(corners))
+        no_edge = edge <= MIN_AREA_RATIO * np.sqrt(_longest_squared(corners))
         scale = (edge + np.where(no_edge, side, _length(_normal(corners)) / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
@@ -92,42 +89,42 @@ def frame_backward(
     """Gradient (V, 3) of a scalar with respect to the vertices, from its gradient with respect to "stga" frames.
 
     The reverse of `face_frames`, with all vectors in the frame's own axes: force (F, 3) is the gradient with respect to
-    the origin, torque (F, 3) to a small rotation of the frame, growth (F,) to the logarithm of its scale. Strain hands
-    nothing on, and a line (see SLIVER) only its force.
+    the origin, torque (F, 3) to a small rotation of the frame, growth (F,) to the logarithm of its scale. Strain passes
+    no gradient on, and a line (see MIN_AREA_RATIO) only its force.
     """
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    flat = twice <= np.maximum(2 * SLIVER * _longest_squared(corners), TINY)
+    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _longest_squared(corners), MIN_DIVISOR)
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
     # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left, over twice the area.
     slope_x, slope_y = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area, (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
-    # The first axis points from the origin to p0, and turns in the plane as that does.
+    # The first axis points from the origin to p0.
     spin = np.where(flat, 0.0, torque[:, 2] / np.where(flat, 1.0, x[:, 0]))
     pull = np.repeat(force[:, None] / 3, 3, axis=1)
     pull[..., 0] += growth[:, None] / 2 * slope_x
     pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * np.array([2 / 3, -1 / 3, -1 / 3])
-    pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x  # a corner that leaves the plane tilts it
+    pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x
     pull = (pull @ frames.rotation.transpose(0, 2, 1)).reshape(-1, 3)
     return np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in pull.T], -1)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area (F,) in square metres of every triangle; exactly 0 where it counts as a line (see SLIVER)."""
+    """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see MIN_AREA_RATIO)."""
     corners = np.asarray(vertices, np.float64)[faces]
     area = _length(_normal(corners)) / 2
-    return np.where(area > np.maximum(SLIVER * _longest_squared(corners), TINY), area, 0.0)
+    return np.where(area > np.maximum(MIN_AREA_RATIO * _longest_squared(corners), MIN_DIVISOR), area, 0.0)
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
     """Bake local splats into world space. SH keep their coefficients: their directions are world directions.
 
-    Colour that follows strain becomes part of the constant coefficient; without strain in `frames` it is left out.
+    Color that depends on strain is added to the constant coefficient, or left out where `frames` have no strain.
     """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
     rotation = quaternion_multiply(frames.quaternion[face], _unit_quaternion(splats.rotation))
-    log_scale = splats.log_scale + np.log(np.maximum(scale, TINY))[:, None]
+    log_scale = splats.log_scale + np.log(np.maximum(scale, MIN_DIVISOR))[:, None]
     return replace(
         splats,
         xyz=xyz.astype(np.float32),
@@ -140,7 +137,7 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
 
 
 def _strained(splats: Splats, frames: FaceFrames) -> np.ndarray:
-    """The splats' `sh` with the colour of their triangles' strain added."""
+    """The splats' `sh` including the color change by strain."""
     if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
         return splats.sh
     sh = splats.sh.copy()
@@ -150,7 +147,7 @@ def _strained(splats: Splats, frames: FaceFrames) -> np.ndarray:
 
 def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
     """Express world-space splats in the frames of the triangles `face` (N,): the inverse of `to_world`."""
-    scale = np.maximum(frames.scale[face], TINY)
+    scale = np.maximum(frames.scale[face], MIN_DIVISOR)
     xyz = np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face]) / scale[:, None]
     inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
     rotation = quaternion_multiply(inverse, _unit_quaternion(world.rotation))
@@ -214,7 +211,7 @@ def _length(v: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    # NumPy sums over a last axis of three many times slower than einsum.
+    # einsum is many times faster than a NumPy sum over a last axis of three.
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
@@ -228,16 +225,16 @@ def _longest_squared(corners: np.ndarray) -> np.ndarray:
 def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors along `first` (F, 3) and the normals of the triangles (F, 3, 3), perpendicular to each other.
 
-    Where the triangle is a line, any perpendicular of `first` stands for the normal; where `first` has no length
-    beside the longest edge, x stands for it. `scene.nodes` follows the same rules.
+    Where the triangle is a line, any perpendicular of `first` is used as the normal; where `first` is negligible beside
+    the longest edge, the x axis is used for it. `scene.display.frame_nodes` follows the same rules.
     """
     longest = _longest_squared(corners)[:, None]
     length = _length(first)[:, None]
-    no_first = length <= SLIVER * np.sqrt(longest)
+    no_first = length <= MIN_AREA_RATIO * np.sqrt(longest)
     first = np.where(no_first, np.array([1.0, 0.0, 0.0]), first / np.where(no_first, 1.0, length))
     normal = _normal(corners)
-    no_normal = _length(normal)[:, None] <= 2 * SLIVER * longest
-    upright = np.abs(first[:, 2:]) > UPRIGHT
+    no_normal = _length(normal)[:, None] <= 2 * MIN_AREA_RATIO * longest
+    upright = np.abs(first[:, 2:]) > UPRIGHT_COSINE
     substitute = np.cross(first, np.where(upright, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
     normal = np.where(no_normal, substitute, normal)
     normal = normal - _dot(normal, first)[:, None] * first

@@ -27,7 +27,7 @@ def export_avatar(
     format   "ply": world-space splats on the first of `meshes`, in the file `path`;
              "ply-sequence": one such file a mesh in the folder `path`, named 00000.ply after the mesh's number;
              "gaussian-avatars": point_cloud.ply and flame_param.npz of `sequence` in the folder `path`
-    meshes   pairs of a number and a posed mesh (V, 3) metres, taken one at a time
+    meshes   pairs of a number and a posed mesh (V, 3) meters, taken one at a time
     sequence the FLAME motion, for "gaussian-avatars"
     Raises StgaError where the format needs what is not given, or a file cannot be written.
     """

@@ -1,4 +1,4 @@
-"""The avatar's own file: one npz that holds everything needed to pose and draw it."""
+"""Reading and writing avatar files: one npz with all that is needed to pose and render an avatar."""
 
 import json
 from collections.abc import Mapping
@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError
+from ..capture.transforms import PRINCIPAL_POINTS
+from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_frames
 from .splats import MAX_SH_DEGREE, Splats
-from .strain import STRAINS, StrainBasis, strain_basis
+from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 
 FORMAT = "stga-avatar"
-VERSION = 1
+VERSION = 2
 SH_SIZES = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
 
 
@@ -26,12 +27,13 @@ class Avatar:
 
     splats      in the local frames of `faces`
     convention  of those frames: "stga" or "gaussian_avatars"
-    neutral     (V, 3) float32 metres, the canonical mesh
+    neutral     (V, 3) float32 meters, the canonical mesh
     faces       (F, 3) int32
     settings    how it was trained; anything that JSON holds
     regions     name -> (F,) bool
-    background  red, green, blue in 0…1 that it was trained against
-    antialiased  whether it was trained with opacity compensation (`render_forward`), and is to be drawn so
+    background  red, green, blue in 0 to 1 that it was trained against
+    antialiased  whether it was trained with opacity compensation (`render_forward`), and is rendered so
+    principal_point  convention of the capture that it was trained on (`read_transforms`)
     """
 
     splats: Splats
@@ -42,9 +44,10 @@ class Avatar:
     regions: Mapping[str, np.ndarray] = field(default_factory=dict)
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     antialiased: bool = False
+    principal_point: str = "vhap"
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
-        """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colours follow it."""
+        """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colors follow it."""
         return face_frames(mesh, self.faces, self.neutral, self.convention, self._strain)
 
     @cached_property
@@ -64,6 +67,7 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
         "convention": avatar.convention,
         "background": list(avatar.background),
         "antialiased": avatar.antialiased,
+        "principal_point": avatar.principal_point,
         "regions": list(avatar.regions),
         "settings": dict(avatar.settings),
     }
@@ -93,7 +97,8 @@ def read_avatar(path: Path) -> Avatar:
         settings=header["settings"],
         regions=dict(zip(names, masks, strict=True)),
         background=tuple(header["background"]),
-        antialiased=header.get("antialiased", False) is True,
+        antialiased=header["antialiased"],
+        principal_point=header["principal_point"],
     )
     _check(path, avatar)
     return avatar
@@ -122,8 +127,16 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
     if header.get("version") != VERSION:
-        raise StgaError(f"{path}: has avatar format version {header.get('version')!r}, this add-on reads {VERSION}")
-    kinds = {"convention": str, "background": list, "regions": list, "settings": dict}
+        version = shorten(header.get("version"))
+        raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {VERSION}")
+    kinds = {
+        "convention": str,
+        "background": list,
+        "antialiased": bool,
+        "principal_point": str,
+        "regions": list,
+        "settings": dict,
+    }
     for name, kind in kinds.items():
         if not isinstance(header.get(name), kind):
             raise StgaError(f"{path}: header field {name!r} is missing or not a {kind.__name__}")
@@ -135,7 +148,11 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
     if avatar.convention not in CONVENTIONS:
-        raise StgaError(f"{path}: convention is {avatar.convention!r}, expected one of {', '.join(CONVENTIONS)}")
+        raise StgaError(f"{path}: convention is {shorten(avatar.convention)}, expected one of {', '.join(CONVENTIONS)}")
+    if avatar.principal_point not in PRINCIPAL_POINTS:
+        raise StgaError(
+            f"{path}: principal_point is {avatar.principal_point!r:.40}, expected one of {', '.join(PRINCIPAL_POINTS)}"
+        )
     _check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
     _check_array(path, "faces", avatar.faces, "int32", (-1, 3))
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
@@ -144,15 +161,15 @@ def _check(path: Path, avatar: Avatar) -> None:
         _check_array(path, name, getattr(avatar.splats, name), dtype, (count, *tail))
     if avatar.splats.sh.shape[1] not in SH_SIZES:
         raise StgaError(f"{path}: sh has {avatar.splats.sh.shape[1]} coefficients, expected one of {SH_SIZES}")
-    if avatar.splats.strain_color.shape[1] not in (0, STRAINS):
+    if avatar.splats.strain_color.shape[1] not in (0, STRAIN_COMPONENTS):
         size = avatar.splats.strain_color.shape[1]
-        raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAINS}")
+        raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAIN_COMPONENTS}")
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
     numbers = [value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1]
     if len(numbers) != 3 or len(avatar.background) != 3:
-        raise StgaError(f"{path}: background is {avatar.background!r}, expected three numbers between 0 and 1")
+        raise StgaError(f"{path}: background is {shorten(avatar.background)}, expected three numbers between 0 and 1")
 
 
 def _check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:

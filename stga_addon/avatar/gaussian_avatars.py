@@ -1,4 +1,4 @@
-"""The pair of files that GaussianAvatars' viewer opens: face-local splats and the FLAME motion that drives them."""
+"""GaussianAvatars' pair of files: splats bound to triangles, and the FLAME motion that drives them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence
 
     Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the triangle as the
     float property binding_0. The motion holds every timestep of `sequence`, its static offset, and the dynamic
-    offset that the viewer insists on. Raises StgaError where the sequence's mesh is not the avatar's.
+    offset that the viewer requires. Raises StgaError where the sequence's mesh is not the avatar's.
     """
     if not np.array_equal(sequence.model.faces, avatar.faces):
         raise StgaError(
@@ -51,10 +51,10 @@ def read_gaussian_avatars(path: Path) -> Splats:
 
 
 def in_convention(avatar: Avatar, convention: str) -> Splats:
-    """The avatar's splats in another convention's frames, standing where they stand on the neutral mesh.
+    """The avatar's splats in the frames of another convention, at the same places on the neutral mesh.
 
-    Both conventions put the origin on the centroid, so it is left out and costs no precision. On a deformed
-    triangle the two conventions stretch differently; there the result is another avatar.
+    Both conventions have their origin at the centroid, which is left out for precision. On deformed triangles the
+    conventions scale differently, and so do the splats.
     """
     if convention == avatar.convention:
         return avatar.splats

@@ -1,4 +1,4 @@
-"""Where training starts: a regular lattice of splats on every triangle of the neutral mesh."""
+"""Initial splats: a regular lattice on every triangle of the neutral mesh."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from .embedding import face_areas, face_frames
 from .splats import Splats
 
 NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
-MIN_SPACING = 1e-6  # metres; a triangle without area still needs a scale with a logarithm
+MIN_SPACING_M = 1e-6  # the scale of splats on a triangle without area still needs a logarithm
 
 
 def lattice_splats(
@@ -22,21 +22,21 @@ def lattice_splats(
 ) -> Splats:
     """(order + 1)(order + 2) / 2 splats on every triangle, triangle by triangle, in its local frame.
 
-    neutral (V, 3) metres, faces (F, 3). Order 0 puts one splat on the centroid, order 2 the corners of the four
-    triangles that the edge midpoints cut, order 4 their midpoints too (STGA, initialisation: 15 a triangle).
+    neutral (V, 3) meters, faces (F, 3). Order 0 puts one splat on the centroid, order 2 the corners of the four
+    triangles that the edge midpoints cut, order 4 their midpoints too (STGA, initialization: 15 a triangle).
     `inset` is the share of the way to the centroid by which every point is pulled inside its triangle, so that
-    neighbouring triangles' points do not coincide. The standard deviation is scale_factor · sqrt(2 · area) / order
+    neighboring triangles' points do not coincide. The standard deviation is scale_factor · sqrt(2 · area) / order
     in the triangle's plane (sqrt(2 · area): the leg of the right isosceles triangle of that area) and
-    `flatness` times that along the normal. Colour starts at raw zero: grey.
+    `flatness` times that along the normal. Color starts at raw zero: gray.
     """
     weights = lattice_weights(order, inset)
     frames = face_frames(neutral, faces, neutral, convention)
     corners = np.asarray(neutral, np.float64)[faces] - frames.origin[:, None]
-    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING)[:, None, None]
+    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING_M)[:, None, None]
     xyz = np.einsum("pc,fci->fpi", weights, local).reshape(-1, 3)
 
     spacing = np.sqrt(2 * face_areas(neutral, faces)) / max(order, 1)
-    sigma = scale_factor * np.maximum(spacing, MIN_SPACING) / np.maximum(frames.scale, MIN_SPACING)
+    sigma = scale_factor * np.maximum(spacing, MIN_SPACING_M) / np.maximum(frames.scale, MIN_SPACING_M)
     stretch = np.ones(3)
     stretch[NORMAL_AXIS[convention]] = flatness
     count = len(xyz)

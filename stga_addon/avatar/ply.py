@@ -1,4 +1,4 @@
-"""World-space splats as the PLY that every 3D Gaussian Splatting viewer opens."""
+"""Reading and writing of world-space splats in 3D Gaussian Splatting's PLY layout."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ from ..files import file_size, replacing
 from .splats import MAX_SH_DEGREE, Splats
 
 MAX_HEADER_BYTES = 1 << 16
-REST = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
+REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{i}" for i in range(REST)),
+    *(f"f_rest_{i}" for i in range(REST_COEFFICIENTS)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _DTYPES = {
@@ -33,7 +33,7 @@ _DTYPES = {
     for name in names
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_Elements = dict[str, tuple[int, dict[str, str]]]  # name -> count, property -> numpy type
+_Elements = dict[str, tuple[int, dict[str, str]]]  # name -> (count, property -> NumPy type)
 
 
 def write_ply(path: Path, world: Splats) -> None:
@@ -48,7 +48,7 @@ def read_ply(path: Path) -> Splats:
     """Read world-space splats from a 3D Gaussian Splatting PLY of SH degree 0 to 3.
 
     Properties may stand in any order; those that are not the layout's are ignored.
-    Raises StgaError naming the file and the property that is missing, not finite or cut off.
+    Raises StgaError naming the file and the property that is missing, not finite or truncated.
     """
     return splats_from_columns(path, read_vertices(path))
 
@@ -59,9 +59,9 @@ def splat_columns(splats: Splats) -> np.ndarray:
     columns = np.zeros((count, len(PROPERTIES)), "<f4")
     columns[:, 0:3] = splats.xyz
     columns[:, 6:9] = splats.sh[:, 0]
-    rest = columns[:, 9 : 9 + REST].reshape(count, 3, REST // 3)
+    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
     rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
-    columns[:, 9 : 9 + REST] = rest.reshape(count, REST)
+    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
     columns[:, 54] = splats.opacity
     columns[:, 55:58] = splats.log_scale
     columns[:, 58:62] = splats.rotation
@@ -185,16 +185,16 @@ def _locate_vertices(path: Path, elements: _Elements, order: str, offset: int) -
 def _read_binary(path: Path, file: BinaryIO, header: _Header, size: int) -> np.ndarray:
     need = header.offset + header.skipped + header.count * header.dtype.itemsize
     if size < need:
-        raise StgaError(f"{path}: is cut off: {size} bytes, its header promises {need}")
+        raise StgaError(f"{path}: is truncated: it has {size} bytes, its header announces {need}")
     file.seek(header.offset + header.skipped)
     return np.fromfile(file, header.dtype, header.count)
 
 
 def _read_ascii(path: Path, file: BinaryIO, header: _Header, size: int) -> np.ndarray:
     names = header.dtype.names or ()
-    # A number takes two bytes with its separator: a header that promises more rows than the file has is refused first.
+    # A number takes at least two bytes with its separator: check before allocating the rows.
     if size < header.offset + 2 * (header.count * len(names) + header.skipped) - 1:
-        raise StgaError(f"{path}: is cut off: {size} bytes cannot hold {header.count} vertices")
+        raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {header.count} vertices")
     if not header.count:
         return np.empty(0, header.dtype)
     try:
@@ -203,7 +203,7 @@ def _read_ascii(path: Path, file: BinaryIO, header: _Header, size: int) -> np.nd
         raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
     expected = (header.count, len(names))
     if table.shape != expected:
-        raise StgaError(f"{path}: has vertices of shape {table.shape}, its header promises {expected}")
+        raise StgaError(f"{path}: has vertices of shape {table.shape}, its header announces {expected}")
     vertices = np.empty(header.count, header.dtype)
     for i, name in enumerate(names):
         vertices[name] = table[:, i]

@@ -1,4 +1,4 @@
-"""The 3D Gaussians themselves, as plain arrays."""
+"""3D Gaussians as plain arrays: shapes, units and activations, which every file format of this package shares."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -7,23 +7,23 @@ import numpy as np
 
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2·sqrt(π)): what a degree-0 coefficient adds to the colour."""
+"""The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0 coefficient."""
 
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians, raw (before activation), float32 unless said.
+    """N Gaussians before activation, float32 unless noted.
 
-    xyz        (N, 3) position in the local frame of its face; world metres for a world-space set
-    rotation   (N, 4) quaternion wxyz, not necessarily normalised
-    log_scale  (N, 3) natural logarithm of the standard deviations
-    opacity    (N,) logit
-    sh         (N, K, 3) spherical harmonics, K = (degree + 1)²; colour = 0.5 + Y·sh, clamped at 0
-    face       (N,) int32 triangle that the splat is bound to; 0 for a world-space set
-    unbound      (N,) bool: stands for something outside the mesh (hair, shoulders), so limits that tie a splat
-               to its triangle do not apply
-    strain_color  (N, S, 3) colour per unit of its triangle's strain (`avatar.strain`), S = 3, or 0 where colours do
-               not depend on deformation; nothing given means 0
+    xyz        (N, 3) position in the local frame of its triangle (`embedding`); meters in world space
+    rotation   (N, 4) quaternion (w, x, y, z); activation: normalized
+    log_scale  (N, 3) natural logarithm of the standard deviations, in the unit of xyz; activation: exp
+    opacity    (N,) activation: sigmoid
+    sh         (N, K, 3) spherical harmonics with directions in world axes, K = (degree + 1)²; activation:
+               color = max(0, 0.5 + Y·sh), sRGB
+    face       (N,) int32 index of the triangle that the splat is bound to; 0 in world space
+    unbound    (N,) bool: splats of hair and shoulders; they follow their triangle without being limited to it
+    strain_color  (N, S, 3) change of the degree-0 coefficient's color per unit of the triangle's strain (`strain`),
+               S = 3, or 0 (default) where colors do not depend on deformation
     """
 
     xyz: np.ndarray
@@ -52,5 +52,5 @@ class Splats:
 
 
 def no_strain_color(count: int) -> np.ndarray:
-    """The `strain_color` of `count` splats whose colours do not depend on deformation."""
+    """An empty `strain_color` for `count` splats."""
     return np.zeros((count, 0, 3), np.float32)

@@ -1,20 +1,20 @@
-"""How a triangle deforms, as numbers that a splat's colour can follow: wrinkles darken where skin is compressed."""
+"""Strain of triangles, on which splat colors may depend: wrinkles darken where skin is compressed."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-STRAINS = 3
-"""Numbers per triangle: the stretch along two directions of its plane, and the shear between them."""
-GAIN, LIMIT = 5.0, 2.0
-"""A stretch of 18 % (E = 0.2) counts as one; beyond ±2 colours follow no further."""
-SMALLEST = 1e-24
-"""Squared normal (m⁴) of a neutral triangle below which it has no area to be deformed: edges of a micrometre."""
+STRAIN_COMPONENTS = 3
+"""Stretch along two directions of the triangle's plane, and the shear between them."""
+STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
+"""Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
+MIN_SQUARED_NORMAL = 1e-24
+"""Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
 
 
 @dataclass(frozen=True)
 class StrainBasis:
-    """What strain needs of the neutral mesh, computed once: V vertices, F triangles.
+    """Precomputed terms of a neutral mesh with V vertices and F triangles.
 
     faces (F, 3); gram (F, 3) squared lengths and product of the neutral edges: d1·d1, d1·d2, d2·d2.
     to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
@@ -30,17 +30,17 @@ class StrainBasis:
 
 
 def strain_basis(neutral: np.ndarray, faces: np.ndarray) -> StrainBasis:
-    """The basis of a neutral mesh: neutral (V, 3) metres, faces (F, 3). A triangle without area stays unstrained."""
+    """The basis of a neutral mesh: neutral (V, 3) meters, faces (F, 3). A triangle without area stays unstrained."""
     d1, d2 = _edges(neutral, faces)
     normal = np.cross(d1, d2)
     square = _dot(normal, normal)
-    flat = square < SMALLEST
+    flat = square < MIN_SQUARED_NORMAL
     inverse = np.where(flat, 0.0, 1 / np.where(flat, 1.0, square))[:, None]
     # The dual edges: a1·d1 = a2·d2 = 1, a1·d2 = a2·d1 = 0, both in the triangle's plane.
     a1, a2 = np.cross(d2, normal) * inverse, np.cross(normal, d1) * inverse
     along = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, _dot(d1, d1))))[:, None] * d1
     across = np.cross(normal, along) * np.sqrt(inverse)
-    twice = np.array([1.0, 1, 1, 2, 2, 2])  # the three mixed components stand for two of a tensor's nine
+    twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
     return StrainBasis(
         faces=faces,
         gram=np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1),
@@ -53,9 +53,9 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray) -> StrainBasis:
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     """Strain (F, 3) float32 of every triangle of a posed mesh: clip(5·E, ±2), zero for the neutral mesh moved rigidly.
 
-    vertices (V, 3) metres. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the posed mesh, averaged
+    vertices (V, 3) meters. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the posed mesh, averaged
     over the triangles that touch a triangle (each vertex's mean over its triangles, then the mean of its three
-    vertices), so that colours do not jump at edges. Columns: along the neutral triangle's first edge, across it, shear.
+    vertices), so that colors do not jump at edges. Columns: along the neutral triangle's first edge, across it, shear.
     """
     e1, e2 = _edges(vertices, basis.faces)
     change = np.stack([_dot(e1, e1), _dot(e1, e2), _dot(e2, e2)], -1) - basis.gram
@@ -64,7 +64,7 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     at_vertex = [np.bincount(corner, np.repeat(column, 3), len(basis.touching)) for column in tensor.T]
     averaged = (np.stack(at_vertex, -1) / basis.touching[:, None])[basis.faces].mean(1)
     strain = np.einsum("fd,fkd->fk", averaged, basis.to_plane)
-    return np.asarray(np.clip(GAIN * strain, -LIMIT, LIMIT), np.float32)
+    return np.asarray(np.clip(STRAIN_GAIN * strain, -MAX_STRAIN, MAX_STRAIN), np.float32)
 
 
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,12 +5,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-MAX_IMAGE_PIXELS = 1 << 27
-"""No studio camera takes larger images; a file that claims more could fill the memory."""
+MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE = 1 << 26, 1 << 15
+"""The largest machine-vision sensors have 65 million pixels; a small file that claims more could fill the memory."""
+MAX_FOCAL_PIXELS = 1e7
+MAX_COORDINATE_M = 1e5
+"""Bound of camera positions and vertices: generous even for a scene in millimeters, and no product of them with focal
+lengths overflows an integer pixel position."""
 MIN_PROJECTION_DEPTH = 1e-6
-"""Metres: points nearer to the camera's plane, or behind it, are projected as if they were at this depth."""
+"""Meters: points nearer to the camera's plane, or behind it, are projected as if they were at this depth."""
 # Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks along +z).
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def is_image_size(width: float, height: float) -> bool:
+    """Whether an image may have this size: whole numbers of at least one pixel, within the limits."""
+    whole = width % 1 == 0 and height % 1 == 0
+    return bool(whole and min(width, height) >= 1 and max(width, height) <= MAX_IMAGE_SIDE) and (
+        width * height <= MAX_IMAGE_PIXELS
+    )
 
 
 @dataclass(frozen=True)
@@ -20,7 +32,7 @@ class Camera:
     width, height  image size
     fl_x, fl_y     focal lengths
     cx, cy         principal point from the top-left corner of the image (OpenCV; pixel centers lie at .5)
-    world_to_camera  (4, 4) float64, metres, OpenCV camera axes
+    world_to_camera  (4, 4) float64, meters, OpenCV camera axes
     """
 
     width: int
@@ -33,7 +45,7 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """Camera center (3,) in world metres."""
+        """Camera center (3,) in world meters."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return np.asarray(-rotation.T @ translation)
 
@@ -43,7 +55,7 @@ class Camera:
         return np.asarray(np.linalg.inv(self.world_to_camera) @ GL_TO_CV)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel positions (N, 2) and depths (N,) in metres of world points (N, 3) metres.
+        """Pixel positions (N, 2) and depths (N,) in meters of world points (N, 3) meters.
 
         Positions count from the top-left corner of the image, pixel centers lie at .5. Depth is the distance along the
         viewing axis, negative behind the camera; positions of such points mean nothing.

@@ -1,9 +1,12 @@
-"""Captures tracked with FLAME, as VHAP exports them and GaussianAvatars reads them."""
+"""Opening captures tracked with FLAME (the layout of VHAP and GaussianAvatars)."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ..errors import StgaError
 from ..flame.masks import key_regions
@@ -18,7 +21,7 @@ from ..flame.sequence import (
     sequence_mesh,
 )
 from ..flame.teeth import TEMPLATE_VERTICES, with_teeth
-from .meshes import file_of, remembered
+from .meshes import cached_meshes, check_extent, file_of
 from .model import Capture, View
 from .transforms import Transforms, tracked_files
 
@@ -31,9 +34,9 @@ def open_flame_capture(
 ) -> Capture:
     """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by timestep.
 
-    A model of FLAME's published 5023 vertices always gets teeth, because VHAP and GaussianAvatars track and train
-    with them; a model of any other size is taken as it is. Shape and static offset come from the first timestep.
-    Raises StgaError, also where the model file is not given: FLAME's licence does not let anyone pass it on.
+    A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use them; a model of any
+    other size is used as it is. Shape and static offset come from the first timestep.
+    Raises StgaError, also where the model file is not given: FLAME's license forbids passing it on.
     """
     model = _model_for(root, model_file)
     files = parameter_files(root, transforms)
@@ -52,12 +55,7 @@ def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
 
 def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
     """The FLAME capture with another motion of the same person, and the meshes that it makes."""
-    return replace(
-        capture,
-        mesh=remembered(lambda timestep: sequence_mesh(sequence, timestep), len(sequence.model.v_template)),
-        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
-        flame=sequence,
-    )
+    return replace(capture, **_posed(capture.root, sequence))
 
 
 def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tuple[View, ...]]) -> Capture:
@@ -68,22 +66,33 @@ def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tupl
         root=root,
         layout="flame",
         faces=model.faces,
-        neutral=neutral_mesh(sequence),
+        neutral=check_extent(f"{root}: neutral mesh", neutral_mesh(sequence)),
         views=views,
         timesteps=sequence.timesteps,
         regions=regions,
-        mesh=remembered(lambda timestep: sequence_mesh(sequence, timestep), len(model.v_template)),
-        expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
-        flame=sequence,
         warnings=() if regions else (missing,),
+        **_posed(root, sequence),
     )
+
+
+def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
+    """The fields of a capture that depend on its motion."""
+
+    def mesh(timestep: int) -> np.ndarray:
+        return check_extent(f"{root}: timestep {timestep}", sequence_mesh(sequence, timestep))
+
+    return {
+        "mesh": cached_meshes(mesh, len(sequence.model.v_template)),
+        "expression_mesh": lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        "flame": sequence,
+    }
 
 
 def _model_for(root: Path, model_file: Path | None) -> FlameModel:
     if model_file is None:
         raise StgaError(
-            f"{root}: is tracked with FLAME; give your FLAME model file (.pkl or .npz) with --flame,"
-            " or in the add-on's preferences"
+            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame"
+            " or in the preferences of the add-on"
         )
     return flame_model(model_file)
 
@@ -104,5 +113,5 @@ def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:
     listed = (root / PARAMETERS).glob("*.npz")
     files = {int(path.stem): path for path in listed if re.fullmatch(r"\d+", path.stem, re.ASCII)}
     if not files:
-        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz a timestep, such as 00000.npz")
+        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz per timestep, such as 00000.npz")
     return dict(sorted(files.items()))

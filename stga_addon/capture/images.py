@@ -1,7 +1,8 @@
-"""Images and masks of a view, decoded with Pillow and checked against the camera."""
+"""Reading of images and masks with Pillow, checked against the camera."""
 
 import stat
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,33 +10,38 @@ import numpy as np
 from PIL import Image
 
 from ..errors import StgaError
-from .camera import MAX_IMAGE_PIXELS
+from .camera import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, is_image_size
 from .model import View
 
 WHITE = (255, 255, 255)
-# Pillow opens far more formats than images come in, some by running other programs.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+"""Pillow opens more than these, some by running other programs."""
+BAND_PIXELS = 1 << 20
+"""Pixels that are converted at a time: wide intermediate numbers of a large image would fill the memory."""
+
+# Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what else Pillow warns
+# about, such as damaged metadata, does not concern the pixels.
+warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the file's header. Raises StgaError where it is no image or has more than 2^27 pixels."""
+    """(width, height) from the file's header. Raises StgaError where it is no image or larger than images may be."""
     try:
         _require_regular(path)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path, formats=FORMATS) as image:
-                width, height = image.size
-    except Exception as error:  # Pillow's decoders raise more than they promise.
+        with Image.open(path, formats=FORMATS) as image:
+            width, height = image.size
+    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
-    if width * height > MAX_IMAGE_PIXELS:
-        raise StgaError(f"{path}: claims {width} x {height} pixels, more than the {MAX_IMAGE_PIXELS} allowed")
+    if not is_image_size(width, height):
+        limits = f"{MAX_IMAGE_PIXELS} pixels and {MAX_IMAGE_SIDE} a side"
+        raise StgaError(f"{path}: claims {width} x {height} pixels; at most {limits} are read")
     return width, height
 
 
 def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarray:
-    """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over `background` (0–255).
+    """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over `background` (0 to 255).
 
-    Grey, palette and 16-bit images are converted. Raises StgaError naming the file where it is missing,
+    Gray, palette and 16-bit images are converted. Raises StgaError naming the file where it is missing,
     truncated or not as large as the camera says.
     """
     return _over(_decode(view.image, view, "image"), background)
@@ -47,7 +53,7 @@ def read_mask(view: View) -> np.ndarray | None:
     None where there is neither. Raises StgaError as `read_image` does.
     """
     if view.mask is not None:
-        return _grey(_decode(view.mask, view, "mask"))
+        return _gray(_decode(view.mask, view, "mask"))
     return _transparency(_decode(view.image, view, "image"))
 
 
@@ -56,7 +62,7 @@ def read_view(
 ) -> tuple[View, np.ndarray, np.ndarray | None]:
     """Image and mask at `scale` in (0, 1]: the view with its camera scaled alike, image and mask as above.
 
-    Every small pixel is the mean over the area it covers, so that coarse training sees no aliasing.
+    Every small pixel is the mean over the area it covers, to avoid aliasing.
     Raises StgaError as `read_image` does.
     """
     if not 0 < scale <= 1:
@@ -69,38 +75,65 @@ def read_view(
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Shrink (H, W) or (H, W, C) uint8 to height x width: exact mean over each new pixel's area, rounded."""
+    """Shrink (H, W) or (H, W, C) uint8 to height x width: exact mean over each new pixel's area, rounded.
+
+    An integral image, read at the new pixels' edges and differenced, down and then across, a band of rows at a time.
+    """
     if pixels.shape[:2] == (height, width):
         return pixels
-    mean = _mean_along(_mean_along(pixels.astype(np.float64), height, 0), width, 1)
-    return (mean + 0.5).astype(np.uint8)
+    small = np.empty((height, width, *pixels.shape[2:]), np.uint8)
+    whole, part = _edges(len(pixels), height)
+    above = np.zeros((1, *pixels.shape[1:]))  # sum of the rows above the band
+    step = max(1, BAND_PIXELS // pixels.shape[1] * height // len(pixels))
+    for start in range(0, height, step):
+        edges = slice(start, min(start + step, height) + 1)
+        rows = whole[edges] - whole[edges][0]
+        lines = pixels[whole[edges][0] : whole[edges][-1] + 1].astype(np.float64)
+        integral = np.concatenate([above, lines]).cumsum(axis=0)
+        mean = _differences(integral, lines, rows, part[edges]) * (height / len(pixels))
+        columns = mean.swapaxes(0, 1)
+        integral_across = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
+        mean = _differences(integral_across, columns, *_edges(len(columns), width)) * (width / len(columns))
+        small[edges.start : edges.stop - 1] = mean.swapaxes(0, 1) + 0.5
+        above = integral[rows[-1]][None]
+    return small
 
 
-def _mean_along(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """Integrate along an axis, read the integral at the new pixels' edges, and take differences."""
-    lines = np.moveaxis(pixels, axis, 0)
-    integral = np.concatenate([np.zeros_like(lines[:1]), np.cumsum(lines, axis=0)])
-    edges = np.linspace(0, len(lines), size + 1)
-    whole = np.minimum(edges.astype(int), len(lines) - 1)
-    part = (edges - whole).reshape(-1, *[1] * (lines.ndim - 1))
-    at_edges = integral[whole] + part * lines[whole]
-    return np.moveaxis(np.diff(at_edges, axis=0) * (size / len(lines)), 0, axis)
+def _edges(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whole and fractional part (new + 1,) of the new pixels' edges, in old pixels."""
+    edges = np.linspace(0, old, new + 1)
+    whole = np.minimum(edges.astype(int), old - 1)
+    return whole, edges - whole
+
+
+def _differences(integral: np.ndarray, lines: np.ndarray, whole: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Sums of `lines` between consecutive edges, from their integral."""
+    at_edges = integral[whole] + part.reshape(-1, *[1] * (lines.ndim - 1)) * lines[whole]
+    return np.diff(at_edges, axis=0)
+
+
+def _in_bands(pixels: np.ndarray, channels: int, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """(H, W, channels) uint8 of `convert` applied to the rows of an image, some at a time."""
+    converted = np.empty((*pixels.shape[:2], channels), np.uint8)
+    step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
+    for start in range(0, len(pixels), step):
+        converted[start : start + step] = convert(pixels[start : start + step])
+    return converted
 
 
 def _decode(path: Path, view: View, kind: str) -> np.ndarray:
-    """Pixels (H, W) grey or (H, W, 2 to 4) uint8, the last of an even number of channels alpha."""
+    """Pixels (H, W) gray or (H, W, 2 to 4) uint8, the last of an even number of channels alpha."""
     expected = view.camera.width, view.camera.height
     try:
         _require_regular(path)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path, formats=FORMATS) as image:
-                # Checked before a single pixel is unpacked: a file cannot claim more memory than its camera does.
-                if image.size == expected:
-                    return _as_uint8(image)
-                size = image.size
-    except Exception as error:  # Pillow's decoders raise more than they promise.
+        with Image.open(path, formats=FORMATS) as image:
+            size = image.size
+            if size == expected and is_image_size(*size):  # before any pixel is unpacked
+                return _as_uint8(image)
+    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
+    if size == expected:
+        raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, more than are read ({MAX_IMAGE_PIXELS})")
     camera = f"the camera of {view.name} has {expected[0]} x {expected[1]}"
     if kind == "mask":
         camera = f"the image {view.image} and its camera have {expected[0]} x {expected[1]}"
@@ -108,15 +141,15 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
 
 
 def _as_uint8(image: Image.Image) -> np.ndarray:
-    if image.mode.startswith("I"):  # 16-bit grey; Pillow itself would cut values off at 255.
-        wide = np.asarray(image).astype(np.int64)
+    if image.mode.startswith("I"):  # 16-bit gray; Pillow would clip it at 255
+        wide = np.asarray(image)
         if wide.min(initial=0) < 0 or wide.max(initial=0) > 65535:
             raise ValueError("has more than 16 bits a pixel")
-        return ((wide * 255 + 32767) // 65535).astype(np.uint8)
+        return _in_bands(wide, 1, lambda band: (band.astype(np.int64)[..., None] * 255 + 32767) // 65535)[..., 0]
     if image.mode == "F":
         raise ValueError("holds floating-point pixels")
     if image.mode in ("L", "LA", "RGB", "RGBA"):
-        # A grey or colour PNG may still name one value as transparent.
+        # A gray or color PNG may still name one value as transparent.
         named = {"L": "LA", "RGB": "RGBA"}.get(image.mode) if "transparency" in image.info else None
         return np.asarray(image.convert(named) if named else image)
     if image.mode == "1":
@@ -130,13 +163,16 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
         return np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 3:
         return pixels
-    alpha = pixels[..., -1:].astype(np.uint32)
-    blend = pixels[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha)
-    return ((blend + 127) // 255).astype(np.uint8)
+
+    def blend(band: np.ndarray) -> np.ndarray:
+        alpha = band[..., -1:].astype(np.uint32)
+        return np.asarray((band[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha) + 127) // 255)
+
+    return _in_bands(pixels, 3, blend)
 
 
-def _grey(pixels: np.ndarray) -> np.ndarray:
-    """A mask drawn in colour is grey in all channels; one drawn in transparency only is its alpha."""
+def _gray(pixels: np.ndarray) -> np.ndarray:
+    """A mask drawn in color is gray in all channels; one drawn in transparency only is its alpha."""
     if pixels.ndim == 2:
         return pixels
     alpha = _transparency(pixels)
@@ -150,7 +186,7 @@ def _transparency(pixels: np.ndarray) -> np.ndarray | None:
 
 
 def _require_regular(path: Path) -> None:
-    """Raise OSError for a pipe or device: reading one need never end."""
+    """Raise OSError for a pipe or device, which may never end."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError("not a regular file")
 

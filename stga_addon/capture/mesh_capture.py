@@ -1,4 +1,4 @@
-"""Captures and bare sequences of tracked meshes, of any one topology."""
+"""Opening captures and bare sequences of tracked meshes of any topology."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ REGIONS_NAME = "regions.json"
 def open_mesh_capture(root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]]) -> Capture:
     """Capture of layout "mesh": `mesh_path` per frame, `canonical_mesh_path` and `regions_path` at the top level.
 
-    Only the canonical mesh is read now; every other one when it is asked for. Raises StgaError.
+    Only the canonical mesh is read now, the others when they are needed. Raises StgaError.
     """
     files = tracked_files(transforms.frames, "mesh")
     return _mesh_capture(root, files, transforms.canonical_mesh, transforms.regions, views)
@@ -28,14 +28,14 @@ def open_mesh_capture(root: Path, transforms: Transforms, views: Mapping[str, tu
 def open_mesh_folder(root: Path) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
 
-    Timesteps are the numbers that all names end in, else the names' alphabetical order. A mesh called `neutral` or
-    `canonical` is the canonical one, and `regions.json` the regions file. Raises StgaError.
+    Timesteps are the numbers at the end of the names, or the alphabetical order where a name has none. A mesh called
+    `neutral` or `canonical` is the canonical one, and `regions.json` the regions file. Raises StgaError.
     """
     meshes = mesh_files(root)
     canonical = next((path for path in meshes if path.stem.lower() in NEUTRAL_NAMES), None)
     tracked = [path for path in meshes if path != canonical]
     if not tracked:
-        raise StgaError(f"{root}: holds no tracked mesh besides {canonical}; expected one file a timestep")
+        raise StgaError(f"{root}: holds no tracked mesh besides {canonical}; expected one file per timestep")
     regions = root / REGIONS_NAME
     return _mesh_capture(root, _by_number(tracked), canonical, regions if regions.is_file() else None, {})
 
@@ -46,7 +46,7 @@ def mesh_files(folder: Path) -> list[Path]:
 
 
 def rigid_free(mesh: Callable[[int], np.ndarray], neutral: np.ndarray) -> Callable[[int, str], np.ndarray]:
-    """`Capture.expression_mesh` for meshes without parameters: the choice of zero pose has no meaning for them."""
+    """`Capture.expression_mesh` for meshes without parameters, which ignores the choice of zero pose."""
     return lambda timestep, zero_pose: without_head_motion(mesh(timestep), neutral)
 
 
@@ -60,17 +60,15 @@ def _mesh_capture(
     warnings = []
     if canonical is None:
         canonical = files[min(files)]
-        warnings.append(f"no canonical mesh is given: {canonical.name}, the first timestep, stands for the neutral one")
+        warnings.append(f"no canonical mesh is given: {canonical.name}, the first timestep, is the neutral mesh")
     neutral, faces = read_mesh(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
-        warnings.append(
-            "STL stores loose triangles: the mesh has no shared vertices, and only its triangle count can be checked"
-        )
+        warnings.append("STL has no shared vertices: of the topology, only the number of triangles can be checked")
     regions = {} if regions_file is None else read_regions(regions_file, faces, len(neutral))
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
         warnings.append(f"{regions_file}: no triangle lies in {', '.join(empty)}")
-    mesh = tracked_meshes(files, faces, canonical, read_mesh)
+    mesh = tracked_meshes(files, len(neutral), faces, canonical, read_mesh)
     return Capture(
         root=root,
         layout="mesh",

@@ -1,10 +1,9 @@
-"""Tracked meshes on disk: OBJ, PLY, GLB and STL with the file's own order of vertices and triangles."""
+"""Reading of tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles."""
 
 import io
 import json
 import re
 import struct
-import warnings
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -15,20 +14,24 @@ import numpy as np
 from ..errors import StgaError
 from ..files import file_size, read_json
 from ..flame.masks import faces_within
+from .camera import MAX_COORDINATE_M
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
-GLB_JSON = b"JSON"
-MAX_NODES, MAX_CORNERS = 1000, 1 << 22
-"""Of a GLB, whose nodes may repeat a mesh: a tracked head has a skeleton's nodes and 10^4 to 10^5 vertices."""
+MIN_EXTENT_M = 1e-9
+"""A mesh smaller than this is a point: it has no shape to train on, and no scale to compare motion with."""
+GLB_JSON_CHUNK = b"JSON"
+MAX_GLB_NODES, MAX_GLB_CORNERS = 1000, 1 << 22
+"""A GLB's nodes may repeat a mesh; a tracked head has a skeleton's nodes and 10^4 to 10^5 vertices."""
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 metres and triangles (F, 3) int32, in the file's order; polygons become fans.
+    """Vertices (V, 3) float64 meters and triangles (F, 3) int32, in the file's order; polygons become fans.
 
     STL stores no shared vertices, so V is 3F there. A GLB's nodes are placed and joined.
-    Raises StgaError naming the file where it is missing, malformed, not finite or without triangles.
+    Raises StgaError naming the file where it is missing, malformed, not finite or without triangles,
+    collapsed to a point or far outside of any scene.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -52,15 +55,30 @@ def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> tuple[n
         raise StgaError(f"{path}: vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise StgaError(f"{path}: a triangle names a vertex outside the {len(vertices)} that the file has")
-    return np.array(vertices, np.float64), np.array(faces, np.int32)
+    vertices = np.array(vertices, np.float64)
+    check_extent(str(path), vertices)
+    return vertices, np.array(faces, np.int32)
+
+
+def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
+    """The same vertices (V, 3). Raises StgaError, beginning with `source`, for a point and for what lies far away."""
+    if not np.abs(vertices).max() <= MAX_COORDINATE_M:  # also where it is not a number
+        raise StgaError(f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin")
+    if np.ptp(vertices, axis=0).max() < MIN_EXTENT_M:
+        raise StgaError(f"{source}: all vertices of the mesh lie in one point; expected a head")
+    return vertices
 
 
 def tracked_meshes(
-    files: Mapping[int, Path], faces: np.ndarray, canonical: Path, read: Callable[[Path], tuple[np.ndarray, np.ndarray]]
+    files: Mapping[int, Path],
+    count: int,
+    faces: np.ndarray,
+    canonical: Path,
+    read: Callable[[Path], tuple[np.ndarray, np.ndarray]],
 ) -> Callable[[int], np.ndarray]:
-    """timestep -> its vertices (V, 3), parsed when called and kept while they fit the cache.
+    """timestep -> its vertices (V, 3), parsed when called and cached.
 
-    Raises StgaError where a file's triangles are not exactly `faces`, those of the file `canonical`.
+    Raises StgaError where a file has not exactly the `count` vertices and the `faces` of the file `canonical`.
     """
 
     def mesh(timestep: int) -> np.ndarray:
@@ -76,12 +94,16 @@ def tracked_meshes(
                 f"{path}: triangle {different} joins vertices {own[different].tolist()}, "
                 f"but {faces[different].tolist()} in {canonical}; the topology must not change"
             )
+        if len(vertices) != count:
+            raise StgaError(
+                f"{path}: has {len(vertices)} vertices, but {canonical} has {count}; the topology must not change"
+            )
         return vertices
 
-    return remembered(mesh, int(faces.max()) + 1)
+    return cached_meshes(mesh, count)
 
 
-def remembered(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
+def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
     """The same function with its latest results kept, read-only, within 8 MiB; `vertices` says how large one is."""
 
     @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
@@ -127,13 +149,12 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
             _check_ply(data)
         if file_type == "glb":
             _check_glb(data)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            # From memory, so that a mesh cannot name further files (textures, buffers) to be read.
+        with np.errstate(all="ignore"):
+            # From memory, so that a mesh cannot have other files (textures, buffers) read.
             options = {"skip_materials": True} if file_type == "glb" else {}
             mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False, **options)
             return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    except Exception as error:  # trimesh's parsers fail with whatever they stumble on; all of it means a bad file.
+    except Exception as error:  # trimesh's parsers raise any kind of error for a bad file
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
 
 
@@ -149,30 +170,30 @@ def _check_glb(data: bytes) -> None:
     """trimesh allocates what accessors promise and copies a mesh for each node. Raises ValueError where that is more
     than the file can hold, and where nodes are no trees."""
     length, kind = struct.unpack("<L4s", data[12:20])
-    if kind != GLB_JSON or length > len(data):
-        raise ValueError("no JSON chunk where a GLB has it")
+    if kind != GLB_JSON_CHUNK or length > len(data):
+        raise ValueError("no JSON chunk at its beginning")
     document = json.loads(data[20 : 20 + length])
     nodes, meshes, accessors = (document.get(key, []) for key in ("nodes", "meshes", "accessors"))
     counts = [accessor["count"] for accessor in accessors]
     if any(type(count) is not int or not 0 <= count <= len(data) for count in counts):
         raise ValueError("an accessor counts more than the file can hold")
     children = [child for node in nodes for child in node.get("children", [])]
-    if len(nodes) > MAX_NODES or len(set(children)) < len(children):
-        raise ValueError(f"its nodes are no trees of at most {MAX_NODES}")
+    if len(nodes) > MAX_GLB_NODES or len(set(children)) < len(children):
+        raise ValueError(f"its nodes are not trees of at most {MAX_GLB_NODES}")
     parts = [part for node in nodes if "mesh" in node for part in meshes[node["mesh"]]["primitives"]]
     named = [index for part in parts for index in (*part["attributes"].values(), part.get("indices"))]
-    if sum(counts[index] for index in named if index is not None) > MAX_CORNERS + len(data):
-        raise ValueError("its nodes repeat their meshes too often")
+    if sum(counts[index] for index in named if index is not None) > MAX_GLB_CORNERS + len(data):
+        raise ValueError("its nodes repeat meshes too often")
     waiting = [root for scene in document.get("scenes", []) for root in scene.get("nodes", [])]
     for _ in range(len(nodes) + len(waiting)):
         if waiting:
             waiting += nodes[waiting.pop()].get("children", [])
     if waiting:
-        raise ValueError("its nodes form a ring")
+        raise ValueError("its nodes form a cycle")
 
 
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """trimesh cannot keep an OBJ's order once it has several materials or objects: it regroups and splits vertices."""
+    """Own parser, because trimesh regroups and splits the vertices of an OBJ with several materials or objects."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]
     polygons = [n for n, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
@@ -190,7 +211,7 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
-    """(F, 3) of an OBJ's face lines, polygons as fans; kept, because all files of a sequence have the same lines.
+    """(F, 3) of an OBJ's face lines, polygons as fans; cached, because all files of a sequence have the same lines.
 
     OBJ counts vertices from 1 up, or backwards from the latest of the `earlier` ones of each line. Raises ValueError.
     """

@@ -1,4 +1,4 @@
-"""What a studio recorded, independent of how it was stored."""
+"""Data model of a capture, independent of its layout on disk."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -27,15 +27,15 @@ class Capture:
     """A multi-view recording with a tracked mesh of constant topology per timestep.
 
     faces      (F, 3) int32, shared by all timesteps
-    neutral    (V, 3) float64 metres: the canonical mesh (expression and pose zero)
+    neutral    (V, 3) float64 meters: the canonical mesh (expression and pose zero)
     views      split name ("train", "val", "test") -> its views; empty for a bare mesh sequence
     timesteps  all timesteps that have a mesh, ascending
     regions    key region name -> (F,) bool
-    mesh       timestep -> (V, 3) float64, the tracked mesh in world space; read when called
+    mesh       timestep -> (V, 3) float64, the tracked mesh in world space, read on demand
     expression_mesh  (timestep, zero_pose) -> (V, 3) float64 without rigid head motion (STGA, selective training)
     flame      the parameters and model behind the meshes, for FLAME captures
-    given_selection  timestep -> (F,) bool where the capture came with its own selection
-    warnings   one sentence each, for the person who opened it
+    given_selection  timestep -> (F,) bool where the capture comes with a selection
+    warnings   one sentence each
     """
 
     root: Path

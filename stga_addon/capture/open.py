@@ -1,12 +1,13 @@
-"""Open a capture folder, whichever layout it has."""
+"""Opening a capture folder of any layout."""
 
 from collections.abc import Mapping
 from dataclasses import replace
+from os.path import isdir, isfile  # which are False, not an error, for a path that is too long
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from .flame_capture import CANONICAL_NAME, PARAMETERS, open_flame_capture, open_flame_motion
 from .mesh_capture import mesh_files, open_mesh_capture, open_mesh_folder
 from .model import Capture, View
@@ -14,9 +15,8 @@ from .principal_point import principal_point_warning
 from .release import is_release, open_release
 from .transforms import PRINCIPAL_POINTS, SPLITS, Frame, Transforms, has_transforms, read_splits
 
-NO_TRANSFORMS = Transforms({}, None, None)
-SMALLEST_HEAD, TYPICAL, LARGEST_HEAD = 0.05, 0.3, 3.0
-"""Largest extent of a neutral mesh, metres: outside of these, it is probably not in metres."""
+MIN_HEAD_EXTENT_M, TYPICAL_HEAD_EXTENT_M, MAX_HEAD_EXTENT_M = 0.05, 0.3, 3.0
+"""Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
 
 
 def open_capture(folder: Path, flame: Path | None = None, principal_point: str = "vhap") -> Capture:
@@ -26,18 +26,20 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
 
     Layouts: "flame" (VHAP and GaussianAvatars; needs the model file `flame`), "mesh" (`mesh_path` per frame, or a
     bare folder of meshes, which has no views) and "release" (STGA's authors). `principal_point` as in
-    `read_transforms`; the capture carries a warning where the masks speak for another one.
+    `read_transforms`; `Capture.warnings` says where the masks fit another one better.
     Raises StgaError in one sentence naming file, field and what was expected, also for any image, mask or tracked
     file that is missing.
     """
     if principal_point not in PRINCIPAL_POINTS:
-        raise StgaError(f"principal point convention {principal_point!r} is not one of {', '.join(PRINCIPAL_POINTS)}")
-    if folder.suffix.lower() == ".npz" and folder.is_file():
+        raise StgaError(
+            f"principal point convention {shorten(principal_point)} is not one of {', '.join(PRINCIPAL_POINTS)}"
+        )
+    if folder.suffix.lower() == ".npz" and isfile(folder):
         return open_flame_motion(folder.resolve(), flame)
-    if not folder.is_dir():
+    if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root = folder.resolve()
-    transforms = read_splits(root, principal_point) if has_transforms(root) else NO_TRANSFORMS
+    transforms = read_splits(root, principal_point) if has_transforms(root) else Transforms({}, None, None)
     views = {split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()}
     _require_files(transforms)
     capture = _open_layout(root, transforms, views, flame)
@@ -46,11 +48,11 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
 
 
 def _size_warning(capture: Capture) -> str | None:
-    """Limits, thresholds and the near plane are in metres, so a head in millimetres would train to nonsense."""
+    """Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained."""
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
-    if SMALLEST_HEAD <= size <= LARGEST_HEAD:
+    if MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
         return None
-    return f"{capture.root}: the neutral mesh measures {size:.3g} m; a head of {TYPICAL} m is expected, in metres"
+    return f"{capture.root}: the neutral mesh measures {size:.3g} m; expected a head of {TYPICAL_HEAD_EXTENT_M} m"
 
 
 def _open_layout(
@@ -75,21 +77,14 @@ def _open_layout(
 
 
 def _require_files(transforms: Transforms) -> None:
-    """A file that is missing should be found now, not by the training an hour later."""
+    """Raise StgaError for a missing file now rather than an hour into the training."""
     seen: set[Path] = set()
     for frame in transforms.frames:
         for field, path in _files(frame).items():
             if path is not None and path not in seen:
-                if not _is_file(path):
+                if not isfile(path):
                     raise StgaError(f"{path}: does not exist, but {frame.where} names it as its {field}")
                 seen.add(path)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name longer than names can be
-        return False
 
 
 def _files(frame: Frame) -> dict[str, Path | None]:

@@ -1,4 +1,4 @@
-"""Does the tracked mesh fall into the masks under the chosen meaning of cx and cy?"""
+"""Check of the principal point convention: does the tracked mesh lie inside the masks?"""
 
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -8,28 +8,28 @@ import numpy as np
 from .camera import Camera
 from .transforms import PRINCIPAL_POINTS, Frame, with_principal_point
 
-VIEWS = 4
-NOTABLY = 0.01  # share of the vertices
+MAX_VIEWS = 4
+MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
 
 
 def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
-    """A sentence where another convention puts notably more of the mesh into the masks, else None.
+    """A warning where another convention puts clearly more of the mesh inside the masks, else None.
 
-    Looks at a few views with masks, and at none where the conventions agree. Only what falls outside a mask tells:
-    hair and shoulders lie inside the mask and outside the mesh. Without Pillow, as in a bare Blender, no mask can be
-    looked at. Raises StgaError where one cannot be read.
+    Checks a few views in which the conventions differ. Only vertices outside of a mask count: hair and shoulders lie
+    inside the mask but beside the mesh. Without Pillow, which Blender lacks, nothing is checked.
+    Raises StgaError where a mask cannot be read.
     """
     if find_spec("PIL") is None:
         return None
     apart = [frame for frame in frames if _conventions_differ(frame)]
-    spread = np.linspace(0, len(apart) - 1, min(VIEWS, len(apart))).astype(int)
+    spread = np.linspace(0, len(apart) - 1, min(MAX_VIEWS, len(apart))).astype(int)
     outside = [_shares_outside(apart[index], mesh) for index in dict.fromkeys(spread.tolist())]
     known = [shares for shares in outside if shares is not None]
     if not known:
         return None
     share = dict(zip(PRINCIPAL_POINTS, np.mean(known, axis=0).tolist(), strict=True))
     best = min(share, key=lambda convention: share[convention])
-    if share[chosen] < 2 * share[best] + NOTABLY:
+    if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
         return None
     return (
         f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read as {chosen!r}, "

@@ -1,4 +1,4 @@
-"""The layout in which STGA's authors released their data: triangle soups, and which triangles each frame trains."""
+"""Opening captures in the layout of the STGA authors' release: triangle soups and selected triangles."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,7 +28,7 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
         raise StgaError(f"{root}: its transforms hold no frame; expected a keyframe for each mesh in {root / 'meshes'}")
     canonical = files[timesteps[0]]
     neutral, faces = read_soup(canonical)
-    mesh = tracked_meshes(files, faces, canonical, read_soup)
+    mesh = tracked_meshes(files, len(neutral), faces, canonical, read_soup)
     chosen = {timestep: root / "training_faces" / f"{timestep:04d}.npy" for timestep in timesteps}
     return Capture(
         root=root,
@@ -41,14 +41,12 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
         mesh=mesh,
         expression_mesh=rigid_free(mesh, neutral),
         given_selection={t: read_face_ids(path, len(faces)) for t, path in chosen.items() if path.is_file()},
-        warnings=(
-            f"the layout has no canonical mesh: {canonical.name}, the first timestep, stands for the neutral one",
-        ),
+        warnings=(f"the layout has no canonical mesh: {canonical.name}, the first timestep, is the neutral mesh",),
     )
 
 
 def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, metres.
+    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, meters.
 
     The layout has no shared vertices. Raises StgaError naming the file and the field.
     """

@@ -1,4 +1,4 @@
-"""A capture in a few lines, for the person who is about to train on it."""
+"""Summary of a capture in a few lines of text."""
 
 from collections.abc import Sequence
 
@@ -7,13 +7,13 @@ import numpy as np
 from .model import Capture, View
 
 
-def describe(capture: Capture) -> list[tuple[str, str]]:
-    """(label, value) lines: what was recorded, what was tracked, and the warnings last. Reads no image."""
+def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
+    """(label, value) lines: recording, tracking, warnings. Reads no image."""
     views = [view for split in capture.views.values() for view in split]
     lines = [("folder", str(capture.root)), ("layout", capture.layout)]
-    lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained")]
+    lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained on")]
     lines += [
-        ("timesteps", spans(capture.timesteps)),
+        ("timesteps", format_ranges(capture.timesteps)),
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
         ("regions", _regions(capture)),
     ]
@@ -23,7 +23,7 @@ def describe(capture: Capture) -> list[tuple[str, str]]:
     return lines + _flame(capture) + [("warning", warning) for warning in capture.warnings]
 
 
-def spans(numbers: Sequence[int]) -> str:
+def format_ranges(numbers: Sequence[int]) -> str:
     """Ascending whole numbers as count, ranges and gaps: "5: 0–2, 6–7 (gap 3–5)"."""
     starts = [n for i, n in enumerate(numbers) if i == 0 or numbers[i - 1] != n - 1]
     ends = [n for i, n in enumerate(numbers) if i == len(numbers) - 1 or numbers[i + 1] != n + 1]
@@ -41,7 +41,7 @@ def _recorded(capture: Capture, views: list[View]) -> list[tuple[str, str]]:
     masked = sum(view.mask is not None for view in views)
     splits = [f"{name} {_split(split)}" for name, split in capture.views.items() if split]
     return [
-        ("cameras", spans(sorted({view.camera_index for view in views}))),
+        ("cameras", format_ranges(sorted({view.camera_index for view in views}))),
         ("image size", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("masks", f"{masked} of {len(views)} views"),
         ("splits", "; ".join(splits)),
@@ -59,7 +59,7 @@ def _regions(capture: Capture) -> str:
 
 
 def _flame(capture: Capture) -> list[tuple[str, str]]:
-    """Offsets as tracked: the dynamic one is looked up in the first timestep."""
+    """Largest offsets; the dynamic one is that of the first timestep."""
     if capture.flame is None:
         return []
     dynamic = capture.flame.frame(capture.flame.timesteps[0]).dynamic_offset

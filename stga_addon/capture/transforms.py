@@ -1,4 +1,4 @@
-"""Cameras and frames of a capture: `transforms_{train,val,test}.json` or `transforms.json`."""
+"""Reading of cameras and frames: `transforms_{train,val,test}.json` or `transforms.json`."""
 
 import itertools
 import math
@@ -6,21 +6,24 @@ import posixpath
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from os.path import isfile
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_json
-from .camera import MAX_IMAGE_PIXELS, Camera, camera_from_gl
+from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
 from .model import View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
-ROTATION_TOLERANCE = 1e-3  # Exporters write float32 poses, some of them rounded to a few decimals.
-MAX_NUMBER = sys.float_info.max  # JSON's whole numbers know no limit.
-MAX_NATURAL = 1 << 31
+ROTATION_TOLERANCE = 1e-3  # exporters write float32 poses, some rounded to a few decimals
+MAX_NUMBER = sys.float_info.max  # JSON does not limit whole numbers
+INDEX_LIMIT = 1 << 31
+MIN_ANGLE = 1e-9  # radians; half of it still has a tangent
+MAX_PATH_CHARACTERS, MAX_NAME_BYTES = 2000, 255
 MATRIX = "a 4x4 matrix of finite numbers"
 
 
@@ -28,10 +31,10 @@ MATRIX = "a 4x4 matrix of finite numbers"
 class Frame:
     """One entry of a transforms file.
 
-    principal  (cx, cy) in pixels exactly as the file writes them; the image centre where it does not
-    camera_id  the studio's own name of the camera, or None
-    mesh, flame  the tracked mesh or FLAME parameters of the frame's timestep, or None
-    where      file and entry, to begin messages with
+    principal  (cx, cy) in pixels as written in the file; the image center where they are missing
+    camera_id  name of the camera in the file, or None
+    mesh, flame  file of the tracked mesh or FLAME parameters of the frame's timestep, or None
+    where      file and entry, with which messages begin
     """
 
     view: View
@@ -44,7 +47,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and the files that the top level names (None where it names none)."""
+    """All frames of a capture by split, and the files named at the top level (None where they are missing)."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
@@ -63,7 +66,7 @@ def has_transforms(folder: Path) -> bool:
 def read_transforms(path: Path, principal_point: str = "vhap") -> tuple[Frame, ...]:
     """Read the frames of one transforms file; neither images nor tracked files are opened, nor need they exist.
 
-    A frame's own intrinsics win over those of the top level, because real exports carry wrong ones there.
+    A frame's own intrinsics take precedence over the top level's, which are wrong in some exports.
     `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means: "vhap"
     (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center" (cx and cy are
     ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave it only for a
@@ -103,7 +106,7 @@ def with_principal_point(camera: Camera, written: tuple[float, float], conventio
 def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
     """timestep -> its tracked file, ascending; `field` is "mesh" or "flame".
 
-    Raises StgaError where a frame has none, or where two frames of a timestep disagree.
+    Raises StgaError where a frame has none, or where two frames of a timestep name different ones.
     """
     files: dict[int, Path] = {}
     key = "mesh_path" if field == "mesh" else "flame_param_path"
@@ -119,27 +122,25 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
 def inside(root: Path, relative: str, where: str) -> Path:
     """Resolve a path of a capture's file against the folder `root` of that file.
 
-    `..` may lead to a sibling of `root`, not further; links inside the capture are the owner's and are followed.
+    `..` may lead to a sibling of `root`, not further; symbolic links inside the capture are followed.
     Raises StgaError, beginning with `where`, for absolute paths and for those that lead outside.
     """
     text = relative.replace("\\", "/")
     parts = posixpath.normpath(text).split("/")
-    if (
-        not text
-        or "\0" in text
-        or text.startswith("/")
-        or any(":" in part and PureWindowsPath(part).drive for part in parts)
-    ):
-        raise StgaError(f"{where}: {relative!r} is not a path relative to {root}")
-    # The first .. leads to the parent, where only a named sibling may follow.
+    absolute = text.startswith("/") or any(":" in part and PureWindowsPath(part).drive for part in parts)
+    if absolute or "\0" in text or parts == ["."]:
+        raise StgaError(f"{where}: {shorten(relative)} is not a path of a file relative to {root}")
+    if len(text) > MAX_PATH_CHARACTERS or any(len(part.encode()) > MAX_NAME_BYTES for part in parts):
+        raise StgaError(f"{where}: {shorten(relative)} is longer than a path can be")
+    # Behind a first "..", only the name of a sibling may follow.
     if parts[:2] == ["..", ".."] or parts == [".."]:
-        raise StgaError(f"{where}: {relative!r} leads outside {root.parent}, where the capture must stay")
+        raise StgaError(f"{where}: {shorten(relative)} leads outside of {root.parent}")
     return root.parent.joinpath(*parts[1:]) if parts[0] == ".." else root.joinpath(*parts)
 
 
 @dataclass(frozen=True)
 class _Record:
-    """A JSON object with the file it comes from, that file's folder without links, and the place in it for messages."""
+    """A JSON object, its file, that file's folder without symbolic links, and its place in the file for messages."""
 
     path: Path
     folder: Path
@@ -161,16 +162,15 @@ class _Record:
             or not low < value < high
             or abs(value) > MAX_NUMBER
         ):
-            bounds = (
-                "" if low == -math.inf else f" above {low:g}" + ("" if high == math.inf else f" and below {high:g}")
-            )
-            raise StgaError(f"{self.where(key)}: expected a finite number{bounds}, not {value!r:.40}")
+            limits = [f"{word} {limit:g}" for word, limit in (("above", low), ("below", high)) if math.isfinite(limit)]
+            expected = " ".join(["a finite number", " and ".join(limits)]).strip()
+            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
         return float(value)
 
     def natural(self, key: str) -> int:
         value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < MAX_NATURAL:
-            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {value!r:.40}")
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
+            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {shorten(value)}")
         return value
 
     def path_of(self, key: str) -> Path | None:
@@ -178,7 +178,7 @@ class _Record:
         if value is None:
             return None
         if not isinstance(value, str):
-            raise StgaError(f"{self.where(key)}: expected a relative path, not {value!r}")
+            raise StgaError(f"{self.where(key)}: expected a relative path, not {shorten(value)}")
         return inside(self.folder, value, self.where(key))
 
 
@@ -202,7 +202,7 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     frames = []
     for number, entry in enumerate(values["frames"]):
         if not isinstance(entry, dict):
-            raise StgaError(f"{path}: frames[{number}]: expected an object, not {entry!r:.40}")
+            raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
         frames.append(
             _frame(replace(shared, place=f"frames[{number}].", values=entry), shared, timed, principal_point, cameras)
         )
@@ -216,17 +216,17 @@ def _frame(
     principal_point: str,
     cameras: dict[tuple[bytes | float, ...], Camera],
 ) -> Frame:
-    """cameras: those of earlier frames by what the file says of them; most frames share theirs."""
+    """cameras: those of earlier frames by their numbers in the file, because most frames share theirs."""
     image = record.path_of("file_path")
     if image is None:
         raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
-    if not image.suffix:  # Blender's NeRF exporters leave it out.
+    if not image.suffix:  # as Blender's NeRF exporters write it
         image = image.with_name(image.name + ".png")
     key = _timestep_key(record.values)
     if timed and key is None:
         raise StgaError(f"{record.where('timestep_index')}: is missing, though other frames have it")
     width, height = _image_size(record, shared, image)
-    written = _number(record, shared, "cx", width / 2), _number(record, shared, "cy", height / 2)
+    written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
     focal = _focal(record, shared, width, height)
     matrix = _matrix(record)
     key_of_camera = matrix.tobytes(), width, height, *focal, *written
@@ -237,7 +237,7 @@ def _frame(
         timestep=record.natural(key) if key else 0,
         camera_index=record.natural("camera_index") if record.has("camera_index") else -1,
         camera=cameras[key_of_camera],
-        # Forward slashes everywhere: what is named after a view must not become a path on Windows alone.
+        # Forward slashes on every system: files are named after views.
         name=record.values["file_path"].replace("\\", "/"),
         image=image,
         mask=record.path_of("fg_mask_path"),
@@ -248,41 +248,50 @@ def _frame(
 
 
 def _timestep_key(values: dict[str, Any]) -> str | None:
-    """VHAP says timestep_index, the STGA authors' release says keyframe."""
+    """The key of the timestep: VHAP writes timestep_index, the STGA authors' release keyframe."""
     return next((key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None)
 
 
-def _number(record: _Record, shared: _Record, key: str, otherwise: float) -> float:
+def _principal(record: _Record, shared: _Record, key: str, size: int) -> float:
+    """One coordinate of the principal point as written; the image's center where there is none."""
     source = record if record.has(key) else shared
-    return source.number(key) if source.has(key) else otherwise
+    return source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS) if source.has(key) else size / 2
 
 
 def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int]:
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
-        if not image.is_file():
+        if not isfile(image):
             raise StgaError(f"{record.where('w')}: w and h are missing, and so is the image {image} to take them from")
         from .images import image_size
 
         return image_size(image)
     width, height = source.number("w", low=0), source.number("h", low=0)
-    if width % 1 or height % 1 or width * height > MAX_IMAGE_PIXELS:
+    if not is_image_size(width, height):
         raise StgaError(f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}")
     return int(width), int(height)
 
 
 def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
+    focal = _written_focal(record, shared, width, height)
+    for name, value in zip(("fl_x", "fl_y"), focal, strict=True):
+        if not 1 <= value <= MAX_FOCAL_PIXELS:
+            raise StgaError(f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}")
+    return focal
+
+
+def _written_focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
     for source in (record, shared):
         if source.has("fl_x"):
             fl_x = source.number("fl_x", low=0)
         elif source.has("camera_angle_x"):
-            fl_x = width / 2 / math.tan(source.number("camera_angle_x", low=0, high=math.pi) / 2)
+            fl_x = width / 2 / math.tan(source.number("camera_angle_x", low=MIN_ANGLE, high=math.pi) / 2)
         else:
             continue
         if source.has("fl_y"):
             return fl_x, source.number("fl_y", low=0)
         if source.has("camera_angle_y") and not source.has("fl_x"):
-            return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=0, high=math.pi) / 2)
+            return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=MIN_ANGLE, high=math.pi) / 2)
         return fl_x, fl_x
     raise StgaError(f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level")
 
@@ -298,6 +307,8 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
     where = record.where("transform_matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
+    if np.abs(matrix).max() > MAX_COORDINATE_M:
+        raise StgaError(f"{where}: the camera lies farther than {MAX_COORDINATE_M:g} from the origin")
     rotation = matrix[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:
@@ -306,7 +317,7 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
 
 
 def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
-    """Give cameras without an index one: that of the same camera elsewhere, or the next free number."""
+    """Frames whose cameras all have an index: that of the same camera elsewhere, or the next free number."""
     known = {_camera_key(f): f.view.camera_index for f in frames if f.view.camera_index >= 0}
     taken = set(known.values())
     free = (number for number in itertools.count() if number not in taken)
@@ -322,8 +333,8 @@ def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
 
 
 def _camera_key(frame: Frame) -> str | bytes:
-    """What tells cameras apart: their own name, else where they stand (a rig's cameras do not move)."""
-    # Adding zero turns −0 into 0, whose bytes differ.
+    """Identity of a camera: its name, else its pose (the cameras of a rig do not move)."""
+    # Adding zero turns -0 into 0, whose bytes differ.
     return frame.camera_id or (np.round(frame.view.camera.world_to_camera, 6) + 0.0).tobytes()
 
 

@@ -11,7 +11,7 @@ from ..capture.model import Capture
 from ..errors import StgaError
 from ..jobs.delegate import OpenHead
 from .arguments import add_avatar, usable_path, whole_number
-from .inputs import check_topology, open_avatar
+from .inputs import open_avatar
 
 NAME, HELP = "export", "write an avatar in another format"
 
@@ -27,8 +27,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     avatar, capture = open_avatar(options.avatar, options)
-    if capture is not None:
-        check_topology(capture, avatar)
     sequence = None if capture is None else capture.flame
     export_avatar(options.out, avatar, options.format, _posed_meshes(avatar, capture, options), sequence)
 

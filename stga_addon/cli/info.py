@@ -23,7 +23,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..capture.summary import describe
+    from ..capture.summary import summarize_capture
     from ..effects.plan import describe_effects, plan_effects
     from ..training.optimize.device import choose_device
 
@@ -40,7 +40,7 @@ def run(options: Namespace) -> None:
             found["presets"] = [preset.as_json() for preset in time_presets(capture, device=device)]
         print(json.dumps(found))
         return
-    print_table(describe(capture))
+    print_table(summarize_capture(capture))
     if plan:
         print()
         print_table(describe_effects(plan))

@@ -21,27 +21,41 @@ def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | Non
     """The avatar of a run folder or file, and the capture that was given or that the run was trained on.
 
     Where Blender has a head open and no capture is named, the capture as that head plays it.
+    Raises StgaError where the run's own capture has changed, or a given one has other triangles.
     """
-    capture, flame = getattr(options, "capture", None), getattr(options, "flame", None)
+    given, flame = getattr(options, "capture", None), getattr(options, "flame", None)
+    capture = None
     if source.is_dir():
-        from ..training.optimize.tracking import with_refined_tracking
-        from ..training.run.folder import read_run
-
-        run = read_run(source)
-        avatar, principal_point = read_avatar(source / "avatar.npz"), run.principal_point
-        capture, flame = capture or run.capture, flame or run.flame
-    else:
-        avatar, principal_point = read_avatar(source), "vhap"
-        if capture is not None and avatar.settings.get("tracking"):
+        capture = _run_capture(source, given, flame)
+    avatar = read_avatar(avatar_path(source))
+    if capture is None and given is not None:
+        capture = open_capture(given, flame, avatar.principal_point)
+        if avatar.settings.get("tracking"):
             print(f"warning: {source}: was trained on refined meshes, which only its run's folder has", file=sys.stderr)
-    opened = None if capture is None else open_capture(capture, flame, principal_point)
-    if opened is not None and source.is_dir():
-        opened = with_refined_tracking(opened, source)
-    return avatar, opened if opened is None or options.head is None else options.head.played(opened)
+    if capture is None:
+        return avatar, None
+    check_topology(capture, avatar)
+    return avatar, capture if options.head is None else options.head.played(capture)
 
 
-def check_topology(capture: Capture, avatar: Avatar) -> Capture:
-    """`capture`. Raises StgaError where its mesh has other triangles than the avatar's."""
+def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
+    """The capture of a run, or another one whose meshes are to drive its avatar; with the run's refined tracking."""
+    from ..training.optimize.tracking import with_refined_tracking
+    from ..training.run.folder import read_run
+    from ..training.run.open_run import open_run
+
+    if given is None:
+        return with_refined_tracking(open_run(folder, flame=flame).capture, folder)
+    run = read_run(folder)
+    return with_refined_tracking(open_capture(given, flame or run.flame, run.principal_point), folder)
+
+
+def avatar_path(source: Path) -> Path:
+    """The avatar file that a run folder or an avatar file names."""
+    return source / "avatar.npz" if source.is_dir() else source
+
+
+def check_topology(capture: Capture, avatar: Avatar) -> None:
+    """Raise StgaError where the capture's mesh has other triangles than the avatar's."""
     if not np.array_equal(capture.faces, avatar.faces):
         raise StgaError(f"{capture.root}: its mesh has other triangles than the one this avatar was trained on")
-    return capture

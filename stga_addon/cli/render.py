@@ -3,7 +3,7 @@
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -14,11 +14,11 @@ from ..capture.open import open_capture
 from ..capture.transforms import read_transforms
 from ..errors import StgaError
 from ..files import replacing
-from ..flame.motion import driven
+from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
 from ..jobs.delegate import OpenHead
 from .arguments import add_avatar, add_principal_point, color, usable_path
-from .inputs import check_topology, open_avatar
+from .inputs import avatar_path, check_topology, open_avatar
 
 NAME, HELP = "render", "render an avatar, one PNG per camera entry"
 
@@ -45,7 +45,8 @@ def run(options: Namespace) -> None:
 
     from ..raster.render import to_uint8
 
-    views = [frame.view for frame in read_transforms(options.cameras, options.principal_point or "vhap")]
+    principal_point = options.principal_point or _principal_point(options.source)
+    views = [frame.view for frame in read_transforms(options.cameras, principal_point)]
     if options.motion is None:
         render = _renderer(options)
     else:
@@ -54,6 +55,11 @@ def run(options: Namespace) -> None:
     for view, name in zip(tqdm(views, desc="Rendering", unit="image"), names, strict=True):
         with replacing(options.out / name) as partial:
             Image.fromarray(to_uint8(render(view))).save(partial, format="PNG")
+
+
+def _principal_point(source: Path) -> str:
+    """The convention that the avatar was trained with; a PLY has none."""
+    return "vhap" if source.suffix.lower() == ".ply" else read_avatar(avatar_path(source)).principal_point
 
 
 def _renderer(options: Namespace) -> Callable[[View], np.ndarray]:
@@ -66,8 +72,7 @@ def _renderer(options: Namespace) -> Callable[[View], np.ndarray]:
     avatar, capture = open_avatar(options.source, options)
     if capture is None:
         raise StgaError(f"{options.source}: an avatar needs the meshes of a capture to follow; give --capture")
-    driver = check_topology(capture, avatar)
-    return lambda view: render_avatar(avatar, _mesh(driver, view), view.camera, options.background)
+    return lambda view: render_avatar(avatar, _mesh(capture, view), view.camera, options.background)
 
 
 def _reenactment(options: Namespace, views: list[View]) -> tuple[Callable[[View], np.ndarray], list[View]]:
@@ -77,14 +82,13 @@ def _reenactment(options: Namespace, views: list[View]) -> tuple[Callable[[View]
 
     if options.source.suffix.lower() == ".ply":
         raise StgaError(f"{options.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
-    is_run = options.source.is_dir()
-    flame = options.flame or (read_run(options.source).flame if is_run else None)
-    avatar = read_avatar(options.source / "avatar.npz" if is_run else options.source)
+    flame = options.flame or (read_run(options.source).flame if options.source.is_dir() else None)
+    avatar = read_avatar(avatar_path(options.source))
     motion = open_capture(options.motion, flame)
     if motion.flame is None:
         raise StgaError(f"{options.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
     check_topology(motion, avatar)
-    sequence = driven(motion.flame, avatar.neutral)
+    sequence = transferred_motion(motion.flame, avatar.neutral)
     cameras = {view.camera_index: view for view in reversed(views)}
     placed = [
         replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")

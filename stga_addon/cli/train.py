@@ -1,10 +1,10 @@
 """Train an avatar from a capture, or continue a run."""
 
 from argparse import ArgumentParser, Namespace
+from dataclasses import replace
 from typing import Any
 
 from ..capture.model import Capture
-from ..capture.open import open_capture
 from ..errors import StgaError
 from ..jobs.delegate import OpenHead
 from ..selection import SelectionOptions
@@ -47,24 +47,26 @@ def run(options: Namespace) -> None:
     from ..effects.plan import describe_effects, with_effect_plan
     from ..report.run_summary import CurveUpdater, report_run
     from ..training.optimize.device import choose_device
-    from ..training.run.folder import read_run
     from ..training.run.loop import train
+    from ..training.run.open_run import device_of, open_run
     from ..training.run.progress import Progress
     from ..training.run.progress_bar import ProgressBar
 
     if not options.capture.is_dir():
         raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
-    device, why = choose_device(options.device)
-    print(why)
     if options.resume:
-        run = read_run(options.out)
+        opened = open_run(options.out, options.capture, options.flame, options.principal_point)
+        run, capture = opened.run, opened.capture
         _refuse_changes(options, run)
-        capture = open_capture(run.capture, options.flame or run.flame, run.principal_point)
+        device, why = device_of(run, options.device)
+        run = replace(run, device=device)
     else:
         if (options.out / "run.json").exists():
             raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
+        device, why = choose_device(options.device)
         capture = open_named_capture(options)
         run = with_effect_plan(_new_run(options, capture, device), capture, device)
+    print(why)
     for warning in capture.warnings:
         print(f"warning: {warning}")
     print_table(describe_effects(run.effect_plan))
@@ -76,18 +78,16 @@ def run(options: Namespace) -> None:
             return bar.report(progress)
 
         selection = None if options.head is None else options.head.selection()
-        avatar = train(capture, options.out, run, selection, options.resume, report, device)
+        avatar = train(capture, options.out, run, selection, options.resume, report)
     for line in report_run(options.out):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
-        print(f"its meshes: {options.out / 'tracking.npz'}, in Blender with Apply Motion, Own Offsets")
+        print(f"refined meshes: {options.out / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
-    if run.capture != options.capture.resolve():
-        raise StgaError(f"{options.out}: this run trains {run.capture}, not {options.capture.resolve()}")
     settings = run.settings
     began_with = {
         "budget": settings.seconds,
@@ -99,7 +99,6 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
         "preset": settings.preset,
         "target_psnr": settings.target_psnr,
         "stop_when_flat": settings.stop_when_flat,
-        "principal_point": run.principal_point,
     }
     for name, value in began_with.items():
         if getattr(options, name) not in (None, value):
@@ -108,7 +107,7 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
     decided = {decision.effect: decision for decision in run.effect_plan}
     for name, choice in parse_choices(options.effect).items():
         if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
-            raise StgaError(f"--effect {name}={choice}: this run has decided otherwise; use another --out")
+            raise StgaError(f"--effect {name}={choice}: differs from what was decided for this run; use another --out")
 
 
 def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
@@ -132,7 +131,7 @@ def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
     if choices or (options.schedule != "paper" and options.strategy != "gaussian-avatars"):
         changes["effects"] = choices
     settings = make_settings(schedule=options.schedule or "default", preset=options.preset, **changes)
-    return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
+    return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings, device=device)
 
 
 def _preset_seconds(capture: Capture, preset: str, device: str) -> float:

@@ -1,4 +1,4 @@
-"""Builds the extension's zip from a checkout: `python -m stga_addon.development.package --out dist`."""
+"""Build of the extension's zip from a checkout: `python -m stga_addon.development.package --out dist`."""
 
 import argparse
 import hashlib
@@ -23,22 +23,22 @@ WHEELS = {
     "trimesh-5.2.0-py3-none-any.whl": "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29",
     "tqdm-4.70.1-py3-none-any.whl": "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73",
 }
-EARLIEST = (1980, 1, 1, 0, 0, 0)
-"""The first time that a zip can hold: equal sources give an equal zip."""
+ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
+"""Modification time of every entry, the earliest that a zip can hold: equal sources give an equal zip."""
 
 
 def build_zip(out: Path, root: Path = ROOT) -> Path:
     """Write `<id>-<version>.zip` into the folder `out`, atomically; equal sources give equal bytes.
 
-    Fetches the wheels into `root/wheels` where they are not there yet. Raises StgaError where `root` is no
-    checkout or a wheel cannot be had.
+    Downloads the wheels into `root/wheels` where they are missing. Raises StgaError where `root` is not a checkout or
+    a wheel cannot be downloaded.
     """
     manifest = read_manifest(root)
     fetch_wheels(root / "wheels")
     path = out / f"{manifest['id']}-{manifest['version']}.zip"
     with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for file in extension_files(root, manifest):
-            entry = zipfile.ZipInfo(file.relative_to(root).as_posix(), EARLIEST)
+            entry = zipfile.ZipInfo(file.relative_to(root).as_posix(), ENTRY_TIME)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, file.read_bytes())
@@ -46,7 +46,7 @@ def build_zip(out: Path, root: Path = ROOT) -> Path:
 
 
 def read_manifest(root: Path) -> dict[str, Any]:
-    """The extension's manifest. Raises StgaError where `root` has none."""
+    """The extension's manifest. Raises StgaError where the file is missing."""
     try:
         return tomllib.loads((root / MANIFEST).read_text(encoding="utf-8"))
     except OSError as error:
@@ -54,14 +54,14 @@ def read_manifest(root: Path) -> dict[str, Any]:
 
 
 def extension_files(root: Path, manifest: dict[str, Any]) -> list[Path]:
-    """The files of the zip, sorted: everything but `paths_exclude_pattern`, and of the wheels those in the manifest."""
+    """The files of the zip, sorted: what `paths_exclude_pattern` leaves, with the wheels that the manifest lists."""
     patterns = manifest["build"]["paths_exclude_pattern"]
     wheels = [root / name for name in manifest["wheels"]]
     return sorted([*_walk(root, root, [*patterns, "/wheels/"]), *wheels])
 
 
 def fetch_wheels(folder: Path) -> None:
-    """Download WHEELS with pip into `folder` where they are missing. Raises StgaError where pip cannot."""
+    """Download WHEELS with pip into `folder` where they are missing. Raises StgaError where pip fails."""
     missing = [name for name in WHEELS if not _is_intact(folder / name)]
     if not missing:
         return
@@ -96,7 +96,7 @@ def _walk(folder: Path, root: Path, patterns: Sequence[str]) -> Iterator[Path]:
 
 
 def _is_excluded(entry: Path, root: Path, patterns: Sequence[str]) -> bool:
-    """The part of .gitignore's rules that the manifest uses: a leading / anchors, a trailing / means a folder."""
+    """Implements the .gitignore rules that the manifest uses: a leading / anchors, a trailing / means a folder."""
     for pattern in patterns:
         if pattern.endswith("/") and not entry.is_dir():
             continue

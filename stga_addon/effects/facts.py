@@ -1,25 +1,24 @@
-"""What the rules ask of a capture, looked up once and only if asked."""
+"""Measurements of a capture that the rules of effects ask for, each made once and only if asked."""
 
-from functools import cached_property
+from dataclasses import replace
+from functools import cache, cached_property
 
 import numpy as np
 
-from ..avatar.strain import GAIN
+from ..avatar.strain import STRAIN_GAIN
 from ..capture.model import Capture
 from ..flame.forward import FlameFrame
-from ..flame.sequence import turns
+from ..flame.sequence import joint_angles
 from ..flame.teeth import LOWER_LIP, TEETH_VERTICES, TEMPLATE_VERTICES, UPPER_LIP
 from ..selection import select_capture
 from ..training.settings import TrainingSettings
-from .evidence import CameraColors, Evidence, calm, camera_evidence, fit_cameras, linear_evidence
+from .evidence import CameraColors, Evidence, camera_evidence, fit_cameras, linear_evidence, stable_colors
 from .samples import Samples, take_samples
 
-MOST_FRAMES = 64
-"""Tracked frames that are looked at for what moves, evenly spread."""
-
-
-LARGEST = 4.0
-"""Errors of more than this many median ones are not the view's doing: lids, lips, teeth."""
+MAX_TIMESTEPS = 64
+"""Timesteps that are posed to measure motion, evenly spread."""
+MAX_VIEW_ERROR_RATIO = 4.0
+"""Errors above this multiple of the median come from lids, lips and teeth, not from the direction of view."""
 
 
 class CaptureFacts:
@@ -45,86 +44,100 @@ class CaptureFacts:
         return len({view.timestep for view in self.views})
 
     @cached_property
-    def calm(self) -> np.ndarray:
-        """(S, K, 3) sampled colours of the triangles that change little."""
-        return calm(self.samples.color.astype(np.float64))
+    def stable_colors(self) -> np.ndarray:
+        """(S, K, 3) sampled colors of the triangles that change little."""
+        return stable_colors(self.samples.color.astype(np.float64))
 
     @cached_property
     def camera_colors(self) -> CameraColors:
-        return fit_cameras(self.samples, self.calm)
+        return fit_cameras(self.samples, self.stable_colors)
 
     @cached_property
-    def even(self) -> np.ndarray:
-        """(S, K, 3) sampled colours without what the cameras differ by."""
+    def matched_colors(self) -> np.ndarray:
+        """(S, K, 3) sampled colors without the differences between cameras."""
         return self.camera_colors.undo(self.samples.color.astype(np.float64), self.samples.camera)
 
     @cached_property
     def camera_difference(self) -> Evidence:
-        return camera_evidence(self.samples, self.calm)
+        return camera_evidence(self.samples, self.stable_colors)
 
     @cached_property
     def view_dependence(self) -> Evidence:
-        """What the mesh does not follow counts little, because it is no view's doing."""
+        """Errors are clipped, so that motion that the mesh does not follow counts little."""
         each = np.arange(len(self.samples.camera))
-        return linear_evidence(self.even, self.samples.direction, each, LARGEST)
+        return linear_evidence(self.matched_colors, self.samples.direction, each, MAX_VIEW_ERROR_RATIO)
 
     @cached_property
     def strain_dependence(self) -> Evidence:
-        return linear_evidence(self.even, self.samples.strain, self.samples.timestep)
+        return linear_evidence(self.matched_colors, self.samples.strain, self.samples.timestep)
 
     @cached_property
     def pixel_range(self) -> float:
-        """How many times wider the widest pixel is than the narrowest, at the head, over the views looked at."""
-        return float(self.samples.ground.max() / self.samples.ground.min())
+        """Width of the widest pixel at the head over that of the narrowest, among the sampled views that show it."""
+        widths = self.samples.pixel_width[~np.isnan(self.samples.pixel_width)]
+        return float(widths.max() / widths.min()) if len(widths) else 1.0
 
     def pixels_per_splat(self, percentile: float) -> float:
-        """Of the triangles that are seen, at the size trained at; 0 where none is."""
+        """Percentile over the visible triangles, at the trained image size; 0 where none is visible."""
         lattice = self.settings.lattice
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
         return float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2) if len(pixels) else 0.0
 
     @cached_property
-    def beside(self) -> float:
-        """Share of the foreground that lies beside the mesh; NaN without masks."""
-        return float(self.samples.beside.sum() / max(self.samples.covered.sum(), 1))
+    def uncovered(self) -> float:
+        """Share of the foreground that the mesh does not cover; NaN without masks."""
+        return float(self.samples.uncovered.sum() / max(self.samples.foreground.sum(), 1))
 
     @cached_property
     def outside(self) -> float:
-        """Share of the mesh that sticks out of the foreground by two pixels or more; NaN without masks."""
+        """Share of the mesh outside of the foreground by two pixels or more; NaN without masks."""
         return float(self.samples.outside.sum() / max(self.samples.mesh.sum(), 1))
 
     @cached_property
-    def selected(self) -> float:
-        """Share of the triangles that a frame selects by the settings' rule, on average."""
-        chosen = select_capture(self.capture, self.settings.selection)
+    def sampled_timesteps(self) -> tuple[int, ...]:
+        """At most MAX_TIMESTEPS of the tracked timesteps, evenly spread."""
+        timesteps = self.capture.timesteps
+        rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), MAX_TIMESTEPS)).round().astype(int)
+        return tuple(timesteps[row] for row in rows)
+
+    @cached_property
+    def sampled(self) -> Capture:
+        """The capture at the sampled timesteps only; meshes of a head with teeth are kept, for its lips."""
+        pose = self.capture.expression_mesh
+        return replace(
+            self.capture,
+            timesteps=self.sampled_timesteps,
+            expression_mesh=cache(pose) if self.has_teeth else pose,
+        )
+
+    @cached_property
+    def selected_share(self) -> float:
+        """Mean share of the triangles that the settings' rule selects in a sampled timestep."""
+        chosen = select_capture(self.sampled, self.settings.selection)
         return float(np.mean([faces.mean() for faces in chosen.values()]))
 
     @cached_property
     def strain(self) -> float:
-        """Root mean square of how the triangles' stretch changes with time, as a share of their size."""
+        """Root mean square change of the triangles' stretch over time, as a share of their size."""
         strain = self.samples.strain
-        return float(np.sqrt(((strain - strain.mean(0)) ** 2).mean())) / GAIN
+        return float(np.sqrt(((strain - strain.mean(0)) ** 2).mean())) / STRAIN_GAIN
 
     @cached_property
     def frames(self) -> list[FlameFrame]:
-        """Some of the tracked frames; none without FLAME's parameters."""
+        """FLAME's parameters in the sampled timesteps; none for other captures."""
         sequence = self.capture.flame
-        if sequence is None:
-            return []
-        count = len(sequence.timesteps)
-        chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).round().astype(int)).tolist()
-        return [sequence.frame(sequence.timesteps[n]) for n in chosen]
+        return [] if sequence is None else [sequence.frame(timestep) for timestep in self.sampled_timesteps]
 
-    def turns(self, *joints: int) -> float:
-        """Largest angle in degrees by which one of FLAME's joints is turned."""
-        return float(turns(self.frames)[list(joints)].max())
+    def joint_angle(self, *joints: int) -> float:
+        """Largest angle in degrees by which one of these FLAME joints turns."""
+        return float(joint_angles(self.frames)[list(joints)].max())
 
     @cached_property
-    def lips(self) -> float:
-        """Millimetres by which the lips part at most, beyond what they do in the neutral mesh."""
-        capture, upper, lower = self.capture, list(UPPER_LIP), list(LOWER_LIP)
-        chosen = capture.timesteps[:: max(1, len(capture.timesteps) // MOST_FRAMES)]
-        meshes = [capture.neutral, *(capture.expression_mesh(timestep, "head") for timestep in chosen)]
+    def lip_gap_mm(self) -> float:
+        """How far the lips part at most, beyond their distance in the neutral mesh."""
+        upper, lower, zero_pose = list(UPPER_LIP), list(LOWER_LIP), self.settings.selection.zero_pose
+        posed = (self.sampled.expression_mesh(timestep, zero_pose) for timestep in self.sampled_timesteps)
+        meshes = [self.capture.neutral, *posed]
         gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
         return 1000 * (max(gaps) - gaps[0])
 

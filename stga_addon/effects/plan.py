@@ -1,4 +1,4 @@
-"""From a capture to the effects of a run, and from there to its settings."""
+"""Effect plan: deciding the effects of a run from its capture."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
-    """The run with its effects decided, once, before it begins; one whose settings ask for none is left as it is.
+    """The run with its effects decided; unchanged where it has a plan already or its settings ask for none.
 
-    device: what it is to be trained on, one of `choose_device`.
+    device: of the training, as `choose_device` returns it.
     Raises StgaError for a choice that cannot work on this capture.
     """
     if run.settings.effects is None or run.effect_plan or not capture.views.get("train"):
@@ -30,7 +30,7 @@ def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run"
 def plan_effects(
     capture: Capture, settings: TrainingSettings, device: str = "cpu"
 ) -> tuple[TrainingSettings, tuple[EffectDecision, ...]]:
-    """Look at a capture with training views for a few seconds; returns the settings that follow, and why.
+    """The settings that suit a capture with training views, and the reasons; takes a few seconds.
 
     Raises StgaError where an image cannot be read, or for a choice in `settings.effects` that cannot work.
     """
@@ -53,7 +53,7 @@ def _decided(effect: Effect, choice: str, verdict: Verdict) -> bool:
     if choice == "auto":
         return verdict.on
     if verdict.only and (choice == "on") != verdict.on:
-        raise StgaError(f"--effect {effect.name}={choice}: cannot be, because {verdict.reason}")
+        raise StgaError(f"--effect {effect.name}={choice}: is not possible, because {verdict.reason}")
     return choice == "on"
 
 
@@ -62,5 +62,5 @@ def _needs(effect: Effect) -> str:
 
 
 def describe_effects(plan: Sequence[EffectDecision]) -> list[tuple[str, str]]:
-    """(effect, what was decided and why) lines."""
+    """(effect, decision and reason) lines."""
     return [(decision.effect, str(decision)) for decision in plan]

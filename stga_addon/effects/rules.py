@@ -1,4 +1,4 @@
-"""Which effects a capture calls for: one rule an effect, with the figure that decided."""
+"""Rules that decide a run's effects from measurements of its capture."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -6,46 +6,45 @@ from typing import Any
 
 import numpy as np
 
-from ..flame.sequence import TURN
+from ..flame.sequence import MIN_JOINT_ANGLE_DEG
 from .facts import CaptureFacts
 
-FEWEST_CAMERAS = 4
-"""With fewer, colour that depends on the view has nothing between the cameras to be right about."""
-VIEW_LEVELS = 1.0
-"""Levels of 255 that colours must follow the direction of view by."""
-CAMERA_LEVELS = 1.5
-"""Levels of 255 that the cameras must differ by, to be brought together."""
-STRAIN_LEVELS = 1.0
-"""Levels of 255 that colours must follow the triangles' deformation by."""
-STILL = 1e-6
-"""Stretch that is rounding."""
-PIXEL_RANGE = 1.25
-"""Widest over narrowest pixel from which splats narrower than a pixel would look different to different cameras."""
-FINE = 4.0
-"""Pixels a splat below which what keeps splats from being narrower than a pixel changes how they look."""
-EVEN = 6.0
-"""Levels of 255 that a background of one colour may scatter by."""
-SAME = 3.0
-"""Levels of 255 by which a background may miss the colour that the settings name."""
-BESIDE = 0.003
-"""Share of the foreground beside the mesh from which something must stand for it."""
-PIXELS_PER_SPLAT = 0.5
-"""Fewer than this leave nothing for further splats to show."""
-LIPS, JAW = 1.5, 3.0
-"""Millimetres that the lips must part by, or degrees that the jaw must open by, for teeth to be seen."""
-
-OUTSIDE = 0.001
-"""Share of the mesh outside the masks from which the tracking cannot be right."""
+MIN_CAMERAS_FOR_VIEW_COLOR = 4
+"""With fewer, view-dependent color is not constrained between the cameras."""
+MIN_VIEW_DEPENDENCE_LEVELS = 1.0
+"""Gain in levels of 255 from which color depends on the direction of view."""
+MIN_CAMERA_DIFFERENCE_LEVELS = 1.5
+"""Gain in levels of 255 from which differences between cameras are corrected."""
+MIN_STRAIN_DEPENDENCE_LEVELS = 1.0
+"""Gain in levels of 255 from which color depends on the triangles' deformation."""
+MIN_STRETCH = 1e-6
+"""Share of a triangle's size; less is rounding."""
+MAX_PIXEL_WIDTH_RATIO = 1.25
+"""Widest pixel at the head over the narrowest; above it, splats narrower than a pixel look different to each camera."""
+FINE_SPLAT_PIXELS = 4.0
+"""Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
+MAX_BACKGROUND_SPREAD_LEVELS = 6.0
+"""Root mean square deviation of a uniform background, in levels of 255."""
+BACKGROUND_TOLERANCE_LEVELS = 3.0
+"""Largest difference, in levels of 255, between the background and the color in the settings."""
+MIN_UNCOVERED_SHARE = 0.003
+"""Share of the foreground that the mesh does not cover, from which splats are added for it."""
+MIN_PIXELS_PER_SPLAT = 0.5
+"""90th percentile over triangles, below which further splats have no detail to show."""
+MIN_LIP_GAP_MM, MIN_JAW_ANGLE_DEG = 1.5, 3.0
+"""Teeth are visible when the lips part, or the jaw opens, by more than this."""
+MAX_OUTSIDE_SHARE = 0.001
+"""Share of the mesh outside of the masks above which the tracking is inaccurate."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a rule found.
+    """What a rule decided.
 
     on       whether the capture calls for the effect
-    reason   why, in half a sentence with its figure
-    only     nothing else can work, so the reason is also what an override is refused with
-    changes  further settings that go with the effect being on
+    reason   a clause with the figure that decided
+    only     no other choice can work: an override is refused with the reason
+    changes  further settings for when the effect is on
     """
 
     on: bool
@@ -56,10 +55,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect: its name, what it costs while it is on, its rule, and the settings that switch it.
+    """An effect: its name, its cost while it is on, its rule, and the settings that switch it.
 
-    rule     what decides; None where the capture has nothing that the effect could apply to
-    on, off  what it sets of `TrainingSettings`
+    rule     returns None where the effect does not apply to the capture
+    on, off  changes to `TrainingSettings`
     """
 
     name: str
@@ -71,91 +70,96 @@ class Effect:
 
 def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
-        return Verdict(False, "one camera sees everything from one direction only", only=True)
-    if facts.cameras < FEWEST_CAMERAS:
-        return Verdict(False, f"{facts.cameras} cameras are too few to tell how colour depends on the view")
+        return Verdict(False, "a single camera sees everything from one direction", only=True)
+    if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
+        return Verdict(False, f"{facts.cameras} cameras are too few to tell how color depends on the view")
     found = facts.view_dependence
-    says = f"colours follow the direction of view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
-    return Verdict(found.gain >= VIEW_LEVELS, says)
+    reason = f"colors depend on the view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
+    return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
 
 
 def exposure(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
-        return Verdict(False, "one camera has no other to differ from", only=True)
+        return Verdict(False, "a single camera has no other to differ from", only=True)
     found, colors = facts.camera_difference, facts.camera_colors
     rows = tuple(
         (float(camera), *gain, *offset)
         for camera, gain, offset in zip(colors.camera, colors.gain.tolist(), colors.offset.tolist(), strict=True)
     )
-    says = f"{facts.cameras} cameras show the same colours {found.gain:.1f} of 255 levels apart"
-    return Verdict(found.gain >= CAMERA_LEVELS, says, changes={"exposure": rows})
+    reason = f"{facts.cameras} cameras show the same colors {found.gain:.1f} of 255 levels apart"
+    return Verdict(found.gain >= MIN_CAMERA_DIFFERENCE_LEVELS, reason, changes={"exposure": rows})
 
 
 def antialiasing(facts: CaptureFacts) -> Verdict:
     settings, widest = facts.settings, facts.pixel_range
     if settings.scale < 1 or settings.coarse_share > 0:
-        return Verdict(True, "images are trained on at less than the size that they are drawn at")
-    if widest > PIXEL_RANGE:
+        return Verdict(True, "images are trained at a smaller size than they are rendered at")
+    if widest > MAX_PIXEL_WIDTH_RATIO:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
     pixels = facts.pixels_per_splat(50)
-    return Verdict(
-        pixels < FINE, f"pixels are alike at the head, and half of the splats have under {pixels:.1f} of them"
-    )
+    reason = f"pixels have the same width at the head, and half of the splats cover less than {pixels:.1f}"
+    return Verdict(pixels < FINE_SPLAT_PIXELS, reason)
 
 
 def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
-    backdrops = samples.backdrop
-    if np.isnan(backdrops).any():
-        return Verdict(False, "not every image has a mask or transparency that says where the head ends", only=True)
-    color, uneven = backdrops.mean(0), float(samples.unevenness.max())
-    apart = max(uneven, float(abs(backdrops - color).max()))
-    if apart > EVEN:
-        return Verdict(False, f"behind the head the images vary by {apart:.0f} of 255 levels", only=True)
-    named = bool(abs(color - 255 * np.array(facts.settings.background)).max() < SAME)
+    backgrounds = samples.background
+    if np.isnan(backgrounds).any():
+        return Verdict(False, "not every image has a mask or transparency that shows where the head ends", only=True)
+    color, spread = backgrounds.mean(0), float(samples.background_spread.max())
+    spread = max(spread, float(abs(backgrounds - color).max()))
+    if spread > MAX_BACKGROUND_SPREAD_LEVELS:
+        return Verdict(False, f"behind the head the images vary by {spread:.0f} of 255 levels", only=True)
+    named = bool(abs(color - 255 * np.array(facts.settings.background)).max() < BACKGROUND_TOLERANCE_LEVELS)
     changes = {} if named else {"background": tuple((color / 255).round(4).tolist())}
     red, green, blue = color.round().astype(int).tolist()
-    return Verdict(True, f"masks everywhere, and one colour behind the head ({red}, {green}, {blue})", changes=changes)
+    return Verdict(
+        True, f"every image has a mask, and one color behind the head ({red}, {green}, {blue})", changes=changes
+    )
 
 
 def hull_points(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
-        return Verdict(False, "one camera cannot tell how far away something beside the mesh is", only=True)
-    if np.isnan(facts.beside):
-        return Verdict(facts.settings.hull_points, "without masks, how much lies beside the mesh is not known")
-    return Verdict(facts.beside > BESIDE, f"{facts.beside:.1%} of the foreground lies beside the mesh")
+        return Verdict(False, "a single camera does not show how far away something beside the mesh is", only=True)
+    if np.isnan(facts.uncovered):
+        return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
+    return Verdict(
+        facts.uncovered > MIN_UNCOVERED_SHARE, f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
+    )
 
 
 def density(facts: CaptureFacts) -> Verdict:
     pixels = facts.pixels_per_splat(90)
-    return Verdict(pixels > PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
+    return Verdict(pixels > MIN_PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
 
 
 def selection(facts: CaptureFacts) -> Verdict:
     threshold = 1000 * facts.settings.selection.threshold
-    if facts.selected == 0:
-        return Verdict(False, f"no triangle moves by more than {threshold:g} mm in any frame", only=True)
-    says = f"a frame moves {facts.selected:.0%} of the triangles by more than {threshold:g} mm"
+    if facts.selected_share == 0:
+        count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
+        reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
+        return Verdict(False, reason, only=count == total)
+    reason = f"a frame moves {facts.selected_share:.0%} of the triangles by more than {threshold:g} mm"
     asked = facts.settings.strategy == "selective"
-    return Verdict(asked, says + ("" if asked else ", but training all of them measured best"))
+    return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
 def strain_color(facts: CaptureFacts) -> Verdict:
-    if facts.strain < STILL:
+    if facts.strain < MIN_STRETCH:
         return Verdict(False, "the mesh has the same shape in every training frame", only=True)
     if facts.timesteps < 3:
-        return Verdict(False, f"{facts.timesteps} frames are too few to tell how colour follows deformation")
+        return Verdict(False, f"{facts.timesteps} frames are too few to tell how color follows deformation")
     found = facts.strain_dependence
-    says = f"colours follow deformation by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
-    return Verdict(found.gain >= STRAIN_LEVELS, says)
+    reason = f"colors depend on deformation by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
+    return Verdict(found.gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
 
 
 def teeth(facts: CaptureFacts) -> Verdict | None:
     if not facts.has_teeth:
         return None
-    jaw, lips = facts.turns(2), facts.lips
-    says = f"the jaw opens by {jaw:.0f}°, the lips by {lips:.1f} mm"
-    return Verdict(jaw > JAW or lips > LIPS, says)
+    jaw, lips = facts.joint_angle(2), facts.lip_gap_mm
+    reason = f"the jaw opens by {jaw:.0f}°, the lips by {lips:.1f} mm"
+    return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
 
 
 def joint(name: str, *joints: int) -> Effect:
@@ -164,8 +168,8 @@ def joint(name: str, *joints: int) -> Effect:
     def rule(facts: CaptureFacts) -> Verdict | None:
         if not facts.frames:
             return None
-        turn = facts.turns(*joints)
-        return Verdict(turn > TURN, f"turns by up to {turn:.1f}°")
+        turn = facts.joint_angle(*joints)
+        return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
 
     return Effect(name, f"{9 * len(joints)} shape keys and drivers in Blender", rule)
 
@@ -185,10 +189,10 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     if facts.device != "cpu":
         return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", only=True)
     if facts.timesteps == 1:
-        return Verdict(False, "the splats of a single frame go where its images are by themselves", only=True)
+        return Verdict(False, "the splats of a single frame follow its images without it", only=True)
     if np.isnan(facts.outside):
-        return Verdict(False, "without masks, whether the mesh is where the images are is not known")
-    return Verdict(facts.outside > OUTSIDE, f"{facts.outside:.2%} of the mesh sticks out of the masks")
+        return Verdict(False, "without masks, the mesh cannot be compared with the images")
+    return Verdict(facts.outside > MAX_OUTSIDE_SHARE, f"{facts.outside:.2%} of the mesh sticks out of the masks")
 
 
 EFFECTS = (
@@ -242,4 +246,4 @@ EFFECTS = (
         off={"tracking": False},
     ),
 )
-"""In the order in which they are shown."""
+"""In display order."""

@@ -1,4 +1,4 @@
-"""What the cameras saw of the tracked mesh: the colour of triangles in a few of the training views."""
+"""Samples of a capture: colors, sizes and coverage of triangles in a few training views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from ..capture.camera import Camera
 from ..capture.images import read_view
 from ..capture.model import Capture, View
 
-MOST_VIEWS = 48
-MOST_TIMESTEPS = 12
-MOST_FACES = 3000
-"""More of each would change no decision, and cost more than a few seconds."""
-HEIGHT = 400
-"""Images of more than half as many rows again are looked at in this many: a tracked head's triangles are then two or
-three pixels wide."""
-FACING = 0.35
-"""Cosine between normal and line of sight below which a triangle is seen too much from the side to have a colour."""
-RIM = 3
-"""Pixels along the mask's edge whose colours are mixed with the background's."""
-BESIDE = 0.01
-"""How far, as a share of the image's height, foreground may lie beside the mesh and still count as tracking error."""
-DEEP = 0.003
-"""A triangle's centre may lie this share of its distance behind what is drawn there, and still be seen."""
+MAX_VIEWS = 48
+MAX_TIMESTEPS = 12
+MAX_FACES = 3000
+"""More of each would change no decision, and take more than a few seconds."""
+SAMPLED_HEIGHT_PIXELS = 400
+"""Images at least half as high again are shrunk to this height: triangles are then two or three pixels wide."""
+MIN_NEAR_DEPTH_M = 0.01
+MIN_FACING_COSINE = 0.35
+"""Between normal and line of sight; below it, a triangle is too oblique to have a color."""
+MASK_EDGE_PIXELS = 3
+"""Along the mask's edge, colors are mixed with the background."""
+TRACKING_ERROR_SHARE = 0.01
+"""Foreground up to this share of the image's height beside the mesh counts as tracking error."""
+DEPTH_TOLERANCE_SHARE = 0.003
+"""A triangle is visible if its center lies at most this share of its distance behind the nearest triangle there."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,18 @@ class Samples:
 
     faces      (K,) the triangles
     camera, timestep  (S,) of the views
-    color      (S, K, 3) float32 in 0…255, mean around the triangle's centre; NaN where it is not seen
+    color      (S, K, 3) float32 from 0 to 255, mean around the triangle's center; NaN where it is not visible
     direction  (S, K, 3) unit vectors from the camera to the triangle, world axes
     strain     (S, K, 3) of the triangles (`avatar.strain`)
-    pixels     (S, K) area of the triangle in pixels of the whole image; NaN where it is not seen
-    ground     (S,) metres that a pixel is wide at the head
-    covered    (S,) pixels of the whole image that the foreground has, and
-    beside     (S,) how many of them lie beside the mesh; NaN without a mask
-    mesh       (S,) pixels of the whole image that the mesh has, and
-    outside    (S,) how many of them lie outside the foreground; NaN without a mask
-    backdrop   (S, 3) mean colour outside the mask, and
-    unevenness (S,) root mean square deviation from it in levels of 255; NaN without a mask
+    pixels     (S, K) area of the triangle in pixels; NaN where it is not visible
+    pixel_width  (S,) meters that a pixel spans at the head; NaN for a head behind the camera
+    foreground (S,) pixels inside the mask; NaN without one, like the following
+    uncovered  (S,) those of them that lie beside the mesh
+    mesh       (S,) pixels of the mesh
+    outside    (S,) those of them that lie outside the mask
+    background (S, 3) mean color outside the mask
+    background_spread  (S,) root mean square deviation from it in levels of 255
+    Pixels are those of the image at its own size.
     """
 
     faces: np.ndarray
@@ -55,13 +56,13 @@ class Samples:
     direction: np.ndarray
     strain: np.ndarray
     pixels: np.ndarray
-    ground: np.ndarray
-    covered: np.ndarray
-    beside: np.ndarray
+    pixel_width: np.ndarray
+    foreground: np.ndarray
+    uncovered: np.ndarray
     mesh: np.ndarray
     outside: np.ndarray
-    backdrop: np.ndarray
-    unevenness: np.ndarray
+    background: np.ndarray
+    background_spread: np.ndarray
 
     @property
     def seen(self) -> np.ndarray:
@@ -70,17 +71,17 @@ class Samples:
 
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
-    """At most MOST_VIEWS of them: timesteps evenly spread, cameras about equally often."""
+    """At most MAX_VIEWS of them: timesteps evenly spread, cameras about equally often."""
     timesteps = sorted({view.timestep for view in views})
-    if len(timesteps) > MOST_TIMESTEPS:
-        timesteps = [timesteps[n] for n in np.linspace(0, len(timesteps) - 1, MOST_TIMESTEPS).round().astype(int)]
+    if len(timesteps) > MAX_TIMESTEPS:
+        timesteps = [timesteps[n] for n in np.linspace(0, len(timesteps) - 1, MAX_TIMESTEPS).round().astype(int)]
     rng = np.random.default_rng(seed)
     left: dict[int, list[View]] = {t: [view for view in views if view.timestep == t] for t in timesteps}
     used = dict.fromkeys((view.camera_index for view in views), 0)
     chosen: list[View] = []
-    while len(chosen) < MOST_VIEWS and any(left.values()):
+    while len(chosen) < MAX_VIEWS and any(left.values()):
         for timestep in rng.permutation(timesteps).tolist():
-            if left[timestep] and len(chosen) < MOST_VIEWS:
+            if left[timestep] and len(chosen) < MAX_VIEWS:
                 shuffled = [left[timestep][n] for n in rng.permutation(len(left[timestep]))]
                 view = min(shuffled, key=lambda view: used[view.camera_index])
                 left[timestep].remove(view)
@@ -90,72 +91,83 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:
-    """Look at a few training views of a capture. Raises StgaError where an image cannot be read."""
+    """Sample a few training views of a capture, one image at a time. Raises StgaError where one cannot be read."""
     views = sample_views(capture.views["train"], seed)
     rng = np.random.default_rng(seed)
     count = len(capture.faces)
-    faces = np.sort(rng.permutation(count)[:MOST_FACES])
+    faces = np.sort(rng.permutation(count)[:MAX_FACES])
     basis = strain_basis(capture.neutral, capture.faces)
     strain = {t: face_strain(basis, capture.mesh(t))[faces] for t in {view.timestep for view in views}}
-    looks = [_look(capture, view, faces) for view in views]
+    rows = [_sample_view(capture, view, faces) for view in views]
     return Samples(
         faces,
         np.array([view.camera_index for view in views]),
         np.array([view.timestep for view in views]),
         strain=np.stack([strain[view.timestep] for view in views]),
-        **{name: np.stack([look[name] for look in looks]) for name in looks[0]},
+        **{name: np.stack([row[name] for row in rows]) for name in rows[0]},
     )
 
 
-def _look(capture: Capture, view: View, faces: np.ndarray) -> dict[str, np.ndarray]:
+def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, np.ndarray]:
     """One view's row of every array of `Samples` that depends on the image."""
-    scale = HEIGHT / view.camera.height
+    scale = SAMPLED_HEIGHT_PIXELS / view.camera.height
     small, image, mask = read_view(view, scale if scale < 2 / 3 else 1.0)
     camera, mesh = small.camera, np.asarray(capture.mesh(view.timestep))
     corners, depth = camera.project(mesh)
     depths = depth[capture.faces].mean(1)
     towards = _facing(mesh, capture.faces, camera)
-    nearest = _nearest(corners[capture.faces], depths, (towards > 0) & (depth[capture.faces] > 0.01).all(1), camera)
-    centre = corners[capture.faces[faces]].mean(1)
-    x, y = np.round(centre - 0.5).astype(int).T
+    nearest = _nearest(
+        corners[capture.faces], depths, (towards > 0) & (depth[capture.faces] > MIN_NEAR_DEPTH_M).all(1), camera
+    )
+    center = corners[capture.faces[faces]].mean(1)
+    x, y = np.round(center - 0.5).astype(int).T
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     x, y = np.where(inside, x, 0), np.where(inside, y, 0)
     in_front = np.where(nearest[y, x] >= 0, depths[nearest[y, x]], np.inf)
-    clean = np.ones(image.shape[:2], bool) if mask is None else binary_erosion(mask > 127, iterations=RIM)
-    seen = inside & (towards[faces] > FACING) & (depths[faces] < in_front * (1 + DEEP)) & clean[y, x]
+    clean = np.ones(image.shape[:2], bool) if mask is None else binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
+    seen = (
+        inside
+        & (towards[faces] > MIN_FACING_COSINE)
+        & (depths[faces] < in_front * (1 + DEPTH_TOLERANCE_SHARE))
+        & clean[y, x]
+    )
     direction = mesh[capture.faces[faces]].mean(1) - camera.position
-    grown = view.camera.width * view.camera.height / (camera.width * camera.height)
+    area = view.camera.width * view.camera.height / (camera.width * camera.height)
+    distance = float(np.median(depth))
     return {
-        "color": np.where(seen[:, None], _colors(image, centre), np.nan).astype(np.float32),
-        "direction": direction / np.linalg.norm(direction, axis=1, keepdims=True),
-        "pixels": np.where(seen, grown * _areas(corners[capture.faces[faces]]), np.nan),
-        "ground": np.array(np.median(depth) / view.camera.fl_x),  # of the image as it was taken
-        **_around(image, mask, nearest >= 0, grown),
+        "color": np.where(seen[:, None], _colors(image, center), np.nan).astype(np.float32),
+        "direction": direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12),
+        "pixels": np.where(seen, area * _areas(corners[capture.faces[faces]]), np.nan),
+        "pixel_width": np.array(distance / view.camera.fl_x if distance > 0 else np.nan),
+        **_coverage(image, mask, nearest >= 0, area),
     }
 
 
 def _facing(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(F,) cosine between each triangle's normal and the way to the camera."""
+    """(F,) cosine between each triangle's normal and its direction to the camera."""
     corners = mesh[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    way = camera.position - corners.mean(1)
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
-    return np.asarray(np.einsum("fi,fi->f", normal, way) / np.maximum(lengths, 1e-30))
+    to_camera = camera.position - corners.mean(1)
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
+    return np.asarray(np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30))
 
 
 def _nearest(corners: np.ndarray, depth: np.ndarray, shown: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) the nearest triangle in each pixel, −1 for none; corners (F, 3, 2), depth (F,), shown (F,) bool."""
+    """(H, W) index of the nearest triangle in each pixel, -1 for none; corners (F, 3, 2), depth (F,), shown (F,) bool.
+
+    Painter's algorithm: triangles are drawn whole, from far to near.
+    """
     picture = Image.new("I", (camera.width, camera.height), -1)
     draw = ImageDraw.Draw(picture)
     drawn = np.flatnonzero(shown)
-    drawn = drawn[np.argsort(-depth[drawn], kind="stable")]  # the painter's order, far to near
+    drawn = drawn[np.argsort(-depth[drawn], kind="stable")]
     for face, polygon in zip(drawn.tolist(), (corners[drawn].reshape(-1, 6) - 0.5).tolist(), strict=True):
         draw.polygon(polygon, fill=face)
     return np.asarray(picture)
 
 
 def _colors(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(K, 3) mean colour of 3 x 3 pixels around positions (K, 2)."""
+    """(K, 3) mean color of 3 x 3 pixels around positions (K, 2)."""
     smooth = uniform_filter(image.astype(np.float32), (3, 3, 0))
     rows = np.stack([at[:, 1], at[:, 0]]) - 0.5
     return np.stack([map_coordinates(smooth[..., c], rows, order=1, mode="nearest") for c in range(3)], -1)
@@ -167,21 +179,21 @@ def _areas(corners: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)
 
 
-def _around(image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, grown: float) -> dict[str, np.ndarray]:
-    """What a view shows outside the mesh (H, W) bool and the mask; grown: pixels of the whole image in one of these."""
+def _coverage(image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, area: float) -> dict[str, np.ndarray]:
+    """How mesh (H, W) bool and mask cover each other, and the background; area: of a pixel, in original pixels."""
     unknown = np.array(np.nan)
     if mask is None:
-        names = ("covered", "beside", "mesh", "outside", "unevenness")
-        return {"backdrop": np.full(3, np.nan), **dict.fromkeys(names, unknown)}
-    near = binary_dilation(mesh, iterations=max(1, round(BESIDE * len(image))))
+        names = ("foreground", "uncovered", "mesh", "outside", "background_spread")
+        return {"background": np.full(3, np.nan), **dict.fromkeys(names, unknown)}
+    near = binary_dilation(mesh, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
     foreground = mask > 127
-    clear = image[binary_erosion(mask == 0, iterations=RIM, border_value=1)].astype(np.float64)
-    backdrop = clear.mean(0) if len(clear) else np.full(3, np.nan)
+    clear = image[binary_erosion(mask == 0, iterations=MASK_EDGE_PIXELS, border_value=1)].astype(np.float64)
+    background = clear.mean(0) if len(clear) else np.full(3, np.nan)
     return {
-        "covered": np.array(grown * foreground.sum()),
-        "beside": np.array(grown * (foreground & ~near).sum()),
-        "mesh": np.array(grown * mesh.sum()),
-        "outside": np.array(grown * (mesh & ~binary_dilation(foreground, np.ones((3, 3)))).sum()),
-        "backdrop": backdrop,
-        "unevenness": np.array(np.sqrt(((clear - backdrop) ** 2).mean())) if len(clear) else unknown,
+        "foreground": np.array(area * foreground.sum()),
+        "uncovered": np.array(area * (foreground & ~near).sum()),
+        "mesh": np.array(area * mesh.sum()),
+        "outside": np.array(area * (mesh & ~binary_dilation(foreground, np.ones((3, 3)))).sum()),
+        "background": background,
+        "background_spread": np.array(np.sqrt(((clear - background) ** 2).mean())) if len(clear) else unknown,
     }

@@ -1,4 +1,4 @@
-"""FLAME's forward pass in numpy: parameters to vertices."""
+"""FLAME's forward pass in NumPy: parameters to vertices."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from .model import FlameModel
 
 @dataclass(frozen=True)
 class FlameFrame:
-    """One timestep's parameters: axis-angle in radians, lengths in metres.
+    """One timestep's parameters: axis-angle in radians, lengths in meters.
 
     expr            (E,) expression coefficients
     rotation, neck_pose, jaw_pose, translation  (3,)
@@ -52,7 +52,7 @@ def axis_angle_matrices(axis_angle: np.ndarray) -> np.ndarray:
 def shaped_vertices(
     model: FlameModel, shape: np.ndarray, expr: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """Template with identity (I,), expression (E,) and vertex offset (V, 3) added, before posing: (V, 3) metres."""
+    """Template with identity (I,), expression (E,) and vertex offset (V, 3) added, before posing: (V, 3) meters."""
     shaped = model.v_template + model.shapedirs @ np.concatenate([shape, expr])
     return np.asarray(shaped if offset is None else shaped + offset)
 
@@ -65,7 +65,7 @@ def joint_positions(model: FlameModel, shaped: np.ndarray) -> np.ndarray:
 def flame_forward(
     model: FlameModel, shape: np.ndarray, frame: FlameFrame, static_offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """Vertices (V, 3) in metres of one frame: blend shapes, pose correctives, linear blend skinning, translation.
+    """Vertices (V, 3) in meters of one frame: blend shapes, pose correctives, linear blend skinning, translation.
 
     shape (I,); static_offset (V, 3) or None. FLAME (Li et al. 2017) with the vertex offsets of VHAP.
     """

@@ -1,4 +1,4 @@
-"""FLAME's forward pass in torch: batched over frames and differentiable. The numpy twin is `forward`."""
+"""FLAME's forward pass in torch: batched over frames and differentiable (NumPy: `forward`)."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ def axis_angle_matrices(axis_angle: torch.Tensor) -> torch.Tensor:
     """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3) in radians; the gradient at zero is finite."""
     squared = (axis_angle**2).sum(-1)
     small = squared < 1e-6
-    # sqrt has an infinite slope at zero, and `where` would multiply it by zero into a NaN: keep it away from zero.
+    # The slope of sqrt is infinite at zero, and `where` would multiply it by zero, which is NaN.
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     first = torch.where(small, 1 - squared / 6 + squared**2 / 120, angle.sin() / angle)
     half = (angle / 2).sin() / angle
@@ -53,7 +53,7 @@ def flame_forward(
     translation: torch.Tensor,
     offset: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Vertices (T, V, 3) in metres of T frames.
+    """Vertices (T, V, 3) in meters of T frames.
 
     shape (I,) or (T, I); expr (T, E); pose (T, 5, 3) axis-angle of root, neck, jaw, left eye, right eye;
     translation (T, 3); offset (V, 3) or (T, V, 3): static plus dynamic offset, or None.

@@ -1,4 +1,4 @@
-"""FLAME's vertex masks as regions of triangles."""
+"""Regions of triangles from FLAME's vertex masks."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""FLAME's head model: a template, its blend shapes, and a skeleton of five joints."""
+"""Reading of FLAME head models: template, blend shapes and a skeleton of five joints."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_tab
 class FlameModel:
     """FLAME's parameters as float64 arrays; V vertices, F triangles, K shape components, joints as in `JOINTS`.
 
-    v_template   (V, 3) metres
+    v_template   (V, 3) meters
     shapedirs    (V, 3, K): the first `n_identity` are identity, the others expression
     posedirs     (V, 3, 36): correctives, linear in the entries of the rotations of joints 1 to 4 minus identity
     j_regressor  (5, V): shaped vertices to joint positions
@@ -53,7 +53,7 @@ def read_flame(path: Path, masks: Path | None = None) -> FlameModel:
 
     Vertex masks come from `masks`, else from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
     beside the model where there is one. Any sizes that agree with each other are accepted. Raises StgaError naming the
-    file and key that is missing, of the wrong shape or not finite, and any class a pickle has no business asking for.
+    file and key that is missing, of the wrong shape or not finite, and any class in a pickle that is not an array.
     """
     path = Path(path)
     in_npz = path.suffix.lower() == ".npz"
@@ -97,7 +97,7 @@ def _floats(path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tu
 
 
 def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
+    if array.dtype.kind == "f" and (abs(array) < 2**53).all() and (array == np.round(array)).all():
         array = array.astype(np.int64)
     if array.dtype.kind not in "iu":
         raise StgaError(f"{path}: {key} holds {array.dtype}, expected whole numbers")
@@ -118,7 +118,7 @@ def _identity_count(path: Path, arrays: Mapping[str, np.ndarray], components: in
 def _parents(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
     parents: np.ndarray = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(np.int64)
-    parents[0] = -1  # the published files spell the root's parent as 2**32 - 1
+    parents[0] = -1  # the published files write the root's parent as 2**32 - 1
     if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
         raise StgaError(f"{path}: kintree_table names the parents {parents.tolist()}, expected each before its child")
     return parents

@@ -1,4 +1,4 @@
-"""One person's motion made ready for another's head: at another speed, stronger or weaker."""
+"""Retargeting of a FLAME motion: other person, speed and strength."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ from .forward import FlameFrame
 from .quaternions import from_axis_angle, slerp, to_axis_angle
 from .sequence import FlameSequence
 
-# What can be taken from a motion or left: the part -> the fields of a frame.
+# Part of a motion that can be transferred -> fields of a frame.
 PARTS = {
     "expression": ("expr",),
     "jaw": ("jaw_pose",),
@@ -19,18 +19,18 @@ PARTS = {
 }
 LINEAR = ("expr", "translation")
 ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
-ROUNDING = 1e-6  # of a timestep: a last frame that arithmetic puts just behind the end still counts
+TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 
 
 def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     """The frames at the first timestep and every `step` timesteps after it, up to the last.
 
-    Between timesteps coefficients and translation are linear, and rotations turn evenly on the shortest arc. The
-    person's own dynamic offsets are left out.
+    Coefficients and translation are interpolated linearly, rotations on the shortest arc (slerp). Dynamic offsets,
+    which belong to the tracked person, are left out.
     """
     times = np.asarray(sequence.timesteps, np.float64)
-    wanted = np.arange(times[0], times[-1] + ROUNDING, step)
-    row = np.clip(np.searchsorted(times, wanted + ROUNDING, side="right") - 1, 0, max(len(times) - 2, 0))
+    wanted = np.arange(times[0], times[-1] + TIME_TOLERANCE, step)
+    row = np.clip(np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1, 0, max(len(times) - 2, 0))
     after = np.minimum(row + 1, len(times) - 1)
     share = (wanted - times[row]) / np.maximum(times[after] - times[row], 1.0)
     tracked = {name: _stacked(sequence, name) for name in (*LINEAR, *ROTATIONS)}
@@ -44,9 +44,9 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
 
 
 def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFrame]:
-    """The frames exaggerated (above 1) or toned down: expression, jaw, eyes and neck about the neutral face.
+    """The frames with their motion scaled by `strength`: expression, jaw, eyes and neck about the neutral face.
 
-    The head's rotation and translation are scaled about the first frame's, so that it stays where it is.
+    Rotation and translation of the head are scaled about the first frame's.
     """
     first = frames[0]
     here = np.array([strength])
@@ -65,11 +65,11 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
     return changed
 
 
-def driven(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
+def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
     """The motion on the person whose neutral mesh is `neutral` (V, 3), of the same model.
 
-    What makes a person, shape and static offset, FLAME adds up before it poses: the difference of the neutral mesh
-    from the template is all that is needed. The other person's dynamic offsets are left out.
+    FLAME adds shape and static offset to the template before posing, so the difference between neutral mesh and
+    template replaces both. Dynamic offsets, which belong to the tracked person, are left out.
     """
     return replace(
         motion,

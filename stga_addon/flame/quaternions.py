@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions wxyz: what interpolates along the shortest arc."""
+"""Rotations as unit quaternions (w, x, y, z), and their interpolation."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def to_axis_angle(quaternions: np.ndarray) -> np.ndarray:
 
 
 def continuous(quaternions: np.ndarray) -> np.ndarray:
-    """(T, 4) with signs such that each step takes the short way; q and -q are one rotation."""
+    """(T, 4) with signs changed so that consecutive quaternions are close; q and -q are the same rotation."""
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(1))
     signs = np.cumprod(np.where(flips < 0, -1.0, 1.0))
     return np.concatenate([quaternions[:1], quaternions[1:] * signs[:, None]])
@@ -33,7 +33,7 @@ def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarra
     second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine)
     angle = np.arctan2(np.linalg.norm(second - cosine * first, axis=-1, keepdims=True), cosine)
     share = np.asarray(share)[..., None]
-    # Ratios of sines as sinc, which is finite where the two are one.
+    # Ratios of sines as sinc, which is finite where the rotations are equal.
     whole = np.sinc(angle / np.pi)
     near, far = ((s * np.sinc(s * angle / np.pi)) / whole for s in (1 - share, share))
     return np.asarray(near * first + far * second)

@@ -1,4 +1,4 @@
-"""A tracked FLAME sequence: per-timestep parameter files and the meshes they stand for."""
+"""Tracked FLAME sequences: reading of parameter files, and their meshes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +14,10 @@ from .teeth import TEETH_VERTICES
 
 ZERO_POSES = ("head", "all")
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
-COEFFICIENTS = ("expr", "shape")
+COEFFICIENT_FIELDS = ("expr", "shape")
 REQUIRED_FIELDS = ("expr", "rotation", "translation")
 # What trackers other than VHAP call the fields.
-ALIASES = {
+FIELD_ALIASES = {
     "exp": "expr",
     "expression": "expr",
     "global_orient": "rotation",
@@ -29,21 +29,22 @@ ALIASES = {
     "betas": "shape",
 }
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
-POSES = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
-TURN = 0.5  # degrees by which a joint must turn to count as moving
-LAST_TIMESTEP = 1 << 20  # Blender's last frame; a motion is played with all frames between its timesteps
-MOTION_PACKING = 256  # dynamic offsets that are all zero, as most are, pack a published FLAME's motion 116 times
+POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
+MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
+MAX_TIMESTEP = 1 << 20  # Blender's last frame
+MAX_MOTION_EXPANSION = 256  # dynamic offsets, mostly zero, compress a motion of the published FLAME 116 times
 
 
 @dataclass(frozen=True)
 class FlameSequence:
     """One person's motion.
 
-    model          with the teeth already added where they are wanted
+    model          including teeth where they are used
     shape          (I,) identity coefficients
-    static_offset  (V, 3) metres or None
+    static_offset  (V, 3) meters or None
     timesteps      ascending
-    frame          timestep -> its parameters; reads the file when called
+    frame          timestep -> its parameters, read on demand
     """
 
     model: FlameModel
@@ -54,7 +55,7 @@ class FlameSequence:
 
 
 def sequence_mesh(sequence: FlameSequence, timestep: int) -> np.ndarray:
-    """The tracked mesh of a timestep in world space: (V, 3) metres."""
+    """The tracked mesh of a timestep in world space: (V, 3) meters."""
     return _mesh(sequence, sequence.frame(timestep))
 
 
@@ -79,8 +80,8 @@ def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:
-    """The same motion with what makes the person, shape and static offset, in the template: FLAME adds it up before it
-    poses, and a mesh then needs a quarter of the components."""
+    """The same motion with shape and static offset baked into the template, so that a mesh needs a quarter of the blend
+    shapes."""
     model = sequence.model
     shapes = model.shapedirs[:, :, model.n_identity :]
     template = shaped_vertices(model, sequence.shape, np.zeros(shapes.shape[2]), sequence.static_offset)
@@ -88,7 +89,7 @@ def with_identity(sequence: FlameSequence) -> FlameSequence:
     return replace(sequence, model=person, shape=np.zeros(0), static_offset=None)
 
 
-def turns(frames: Sequence[FlameFrame]) -> np.ndarray:
+def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     """Largest angle (5,) in degrees by which the frames turn each of `JOINTS`."""
     return np.asarray(np.degrees(np.linalg.norm([frame.pose for frame in frames], axis=2).max(axis=0)))
 
@@ -119,10 +120,11 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     """Read a whole motion from one file: arrays with a leading time axis, of which any but one may be missing (zero).
 
     VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a GaussianAvatars avatar, and
-    plain files of expression and pose, by the names in `ALIASES` too; `pose` holds the joints of `POSES`. Timesteps
-    count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
+    plain files of expression and pose, whose fields may have the names in `FIELD_ALIASES` too. `pose` holds the joints
+    of `POSE_LAYOUTS`. Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and
+    the field.
     """
-    arrays = _spelled_out(path, read_npz(path, max_compression=MOTION_PACKING))
+    arrays = _spelled_out(path, read_npz(path, max_compression=MAX_MOTION_EXPANSION))
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
         raise StgaError(f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of")
@@ -134,7 +136,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
         if array.ndim < 2 or len(array) != count:
             raise StgaError(f"{path}: {name} has shape {array.shape}, expected {count} timesteps first")
     if "shape" in arrays and arrays["shape"].ndim == 2:
-        arrays["shape"] = arrays["shape"][0]  # one a timestep: whoever is tracked stays the same person
+        arrays["shape"] = arrays["shape"][0]  # one per timestep, all of the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
     timesteps = _timesteps(path, arrays.get("timesteps", np.arange(count)), count)
     row = {timestep: number for number, timestep in enumerate(timesteps)}
@@ -143,28 +145,28 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
         return _frame(path, {name: array[row[timestep]] for name, array in moving.items()}, model)
 
     for timestep in timesteps:
-        frame(timestep)  # a wrong value in the middle is reported when the file is opened, not minutes later
+        frame(timestep)  # report a wrong value when the file is opened, not minutes later
     return FlameSequence(model, shape, static_offset, timesteps, frame)
 
 
 def _timesteps(path: Path, found: np.ndarray, count: int) -> tuple[int, ...]:
     named = found.dtype.kind in "iu" and found.shape == (count,)
-    if not named or found[0] < 0 or (found[1:] <= found[:-1]).any() or found[-1] > LAST_TIMESTEP:
-        limits = f"from 0 to {LAST_TIMESTEP}, each more than the one before"
-        raise StgaError(f"{path}: timesteps are no {count} whole numbers {limits}")
+    if not named or found[0] < 0 or (found[1:] <= found[:-1]).any() or found[-1] > MAX_TIMESTEP:
+        limits = f"from 0 to {MAX_TIMESTEP}, each more than the one before"
+        raise StgaError(f"{path}: timesteps: expected {count} whole numbers {limits}")
     return tuple(found.tolist())
 
 
 def _spelled_out(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays by VHAP's names, with `pose` taken apart."""
-    named = {ALIASES[name]: array for name, array in arrays.items() if name in ALIASES} | dict(arrays)
+    """The arrays by VHAP's names, with `pose` split into joints."""
+    named = {FIELD_ALIASES[name]: array for name, array in arrays.items() if name in FIELD_ALIASES} | dict(arrays)
     pose = named.pop("pose", None)
     if pose is None:
         return named
-    if pose.ndim < 2 or not len(pose) or pose[0].size not in POSES:
-        sizes = " or ".join(f"(timesteps, {size})" for size in POSES)
+    if pose.ndim < 2 or not len(pose) or pose[0].size not in POSE_LAYOUTS:
+        sizes = " or ".join(f"(timesteps, {size})" for size in POSE_LAYOUTS)
         raise StgaError(f"{path}: pose has shape {pose.shape}, expected {sizes}")
-    fields = POSES[pose[0].size]
+    fields = POSE_LAYOUTS[pose[0].size]
     columns = pose.reshape(len(pose), -1)
     parts = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
     return dict(zip(fields, parts, strict=True)) | named
@@ -189,8 +191,8 @@ def _identity(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
 def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
-    if not np.isfinite(array).all():
-        raise StgaError(f"{path}: {name} holds values that are not finite")
+    if not (np.abs(array.astype(np.float64)) <= MAX_PARAMETER).all():
+        raise StgaError(f"{path}: {name} holds values that are not finite, or beyond {MAX_PARAMETER:g}")
     return array.astype(np.float64)
 
 
@@ -201,7 +203,7 @@ def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) 
         return vector
     array = _finite(path, name, arrays[name])
     given = array[0] if array.ndim == 2 and len(array) == 1 else array
-    fits = given.ndim == 1 and (given.size == size or (name in COEFFICIENTS and given.size < size))
+    fits = given.ndim == 1 and (given.size == size or (name in COEFFICIENT_FIELDS and given.size < size))
     if not fits:
         raise StgaError(f"{path}: {name} has shape {array.shape}, expected ({size},) or (1, {size})")
     vector[: given.size] = given

@@ -1,4 +1,4 @@
-"""The two rows of teeth that GaussianAvatars adds to FLAME's mesh."""
+"""Teeth: the two rows that GaussianAvatars adds to FLAME's mesh."""
 
 from dataclasses import replace
 
@@ -9,16 +9,16 @@ from .model import JOINTS, FlameModel
 
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES, TEETH_FACES = 120, 168
-COLUMNS = 15
+TEETH_PER_ROW = 15
 # Inner lip vertices of the 5023-vertex topology, from the person's left corner of the mouth to the right.
 UPPER_LIP = (1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830)
 LOWER_LIP = (1576, 1577, 1773, 1774, 1795, 1802, 1865, 3503, 2948, 2905, 2898, 2881, 2880, 2713, 2712)
 # Order of the eight rows among the added vertices: upper, lower; root, edge; B for back.
-ROWS = ("UR", "LR", "UE", "LE", "URB", "UEB", "LRB", "LEB")
+TEETH_ROWS = ("UR", "LR", "UE", "LE", "URB", "UEB", "LRB", "LEB")
 # Two triangles a column; a corner is (row, 0 or 1 for the column's near or far end). The diagonal flips in the middle
 # of the mouth (the first half and the second half below) so that left and right mirror each other. The first corner
 # matters: a triangle's local frame starts there.
-STRIPS = {
+TEETH_STRIPS = {
     "upper front": ("UR0 UE1 UE0 UR0 UR1 UE1", "UR0 UR1 UE0 UR1 UE1 UE0"),
     "upper back": ("URB0 UEB0 UEB1 URB0 UEB1 URB1", "URB0 UEB0 URB1 URB1 UEB0 UEB1"),
     "upper bottom": ("UEB0 UE0 UEB1 UEB1 UE0 UE1", "UEB0 UE0 UE1 UEB0 UE1 UEB1"),
@@ -40,12 +40,12 @@ def with_teeth(model: FlameModel) -> FlameModel:
         )
     upper, lower = list(UPPER_LIP), list(LOWER_LIP)
     teeth = _positions(model.v_template[upper], model.v_template[lower])
-    shapedirs = np.tile((model.shapedirs[upper] + model.shapedirs[lower]) / 2, (len(ROWS), 1, 1))
+    shapedirs = np.tile((model.shapedirs[upper] + model.shapedirs[lower]) / 2, (len(TEETH_ROWS), 1, 1))
     shapedirs[:, :, model.n_identity :] = 0
     weights = np.zeros((TEETH_VERTICES, len(JOINTS)))
-    for row, name in enumerate(ROWS):
+    for row, name in enumerate(TEETH_ROWS):
         joint = JOINTS.index("neck" if name.startswith("U") else "jaw")
-        weights[row * COLUMNS : (row + 1) * COLUMNS, joint] = 1
+        weights[row * TEETH_PER_ROW : (row + 1) * TEETH_PER_ROW, joint] = 1
     added = np.arange(TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)
     return replace(
         model,
@@ -70,15 +70,15 @@ def _positions(upper_lip: np.ndarray, lower_lip: np.ndarray) -> np.ndarray:
     rows["UR"], rows["LR"] = rows["UE"] + 2 * up, rows["LE"] - 2 * up
     for front in ("UR", "UE", "LR", "LE"):
         rows[front + "B"] = rows[front] - forward
-    return np.concatenate([rows[name] for name in ROWS])
+    return np.concatenate([rows[name] for name in TEETH_ROWS])
 
 
 def teeth_faces(first: int) -> np.ndarray:
     """(168, 3) int32 triangles of the teeth, whose vertices start at id `first`."""
-    start = {name: first + row * COLUMNS for row, name in enumerate(ROWS)}
+    start = {name: first + row * TEETH_PER_ROW for row, name in enumerate(TEETH_ROWS)}
     faces = []
-    for halves in STRIPS.values():
-        for column in range(COLUMNS - 1):
-            corners = halves[column >= COLUMNS // 2].split()
+    for halves in TEETH_STRIPS.values():
+        for column in range(TEETH_PER_ROW - 1):
+            corners = halves[column >= TEETH_PER_ROW // 2].split()
             faces += [start[corner[:-1]] + column + int(corner[-1]) for corner in corners]
     return np.array(faces, np.int32).reshape(-1, 3)

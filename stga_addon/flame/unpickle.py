@@ -1,8 +1,8 @@
-"""Arrays out of a pickle without running anything it asks for.
+"""Reading arrays from a pickle without running any code that it names.
 
 FLAME's model files are Python 2 pickles of numpy arrays, scipy.sparse matrices and chumpy objects. A pickle may name
-any function and have it called, so every global a file asks for is answered with an inert stand-in defined here, and
-a global outside that short list is refused by name. numpy itself rebuilds nothing; neither scipy nor chumpy is needed.
+any function and have it called. Here every global of a short list is replaced by an inert class or function defined in
+this module, and any other is refused by name. Neither numpy's own reconstruction nor scipy or chumpy is used.
 """
 
 import io
@@ -22,21 +22,21 @@ from ..files import file_size
 
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22
-"""Of a sparse matrix or a list of numbers; FLAME's joint regressor has 25,115."""
+"""In a sparse matrix or a list of numbers; FLAME's joint regressor has 25,115."""
 MAX_INSTRUCTIONS = 1 << 18
 """FLAME's own files have a few thousand."""
-FREE_BYTES = 64 << 20
-MAX_COPIES = 8
-"""Bytes of arrays beyond 64 MiB that a byte of the file may stand for: a pickle can name the same data many times."""
+MIN_ALLOWED_BYTES = 64 << 20
+MAX_EXPANSION = 8
+"""Bytes of arrays per byte of the file, beyond MIN_ALLOWED_BYTES: a pickle can name the same data many times."""
 SPARSE_CLASS = re.compile(r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)")
 
 
-class _Stray(Exception):
+class _NotAnArray(Exception):
     """A pickled value that cannot become an array; the message completes 'is ...'."""
 
 
 class _Inert:
-    """What a pickle builds in place of an object: remembers its state, does nothing."""
+    """Stands for an object: keeps its arguments and state, does nothing."""
 
     source = "object"
 
@@ -96,19 +96,33 @@ class _Refused(Exception):
     """A global outside the list; the message is its name."""
 
 
-class _RestrictedUnpickler(pickle.Unpickler):
-    """Functions are methods here: a pickle can set attributes of a plain function, which outlive its reading."""
+class _Function:
+    """A function that a pickle may call but not change: BUILD would write into the `__dict__` of a plain one."""
 
+    __slots__ = ("_call",)
+
+    def __init__(self, call: Callable[..., Any]) -> None:
+        self._call = call
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._call(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("sets attributes of a function")
+
+
+class _RestrictedUnpickler(pickle.Unpickler):
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")
-        self.room = len(data)
-        self.functions: dict[str, Callable[..., Any]] = {
+        self.allowance = len(data)
+        functions: dict[str, Callable[..., Any]] = {
             "_codecs.encode": self.encode,
             "collections.OrderedDict": self.ordered,
             **{f"{core}.multiarray._reconstruct": self.array_shell for core in ("numpy.core", "numpy._core")},
             **{f"{module}._reconstructor": self.rebuild for module in ("copy_reg", "copyreg")},
             **{f"{module}.set": self.collect for module in ("__builtin__", "builtins")},
         }
+        self.functions = {name: _Function(call) for name, call in functions.items()}
 
     def find_class(self, module: str, name: str) -> Any:
         wanted = f"{module}.{name}"
@@ -149,9 +163,9 @@ class _RestrictedUnpickler(pickle.Unpickler):
         return set(*items)
 
     def take(self, count: int) -> None:
-        """Whoever copies each thing once has room enough; one thing copied a thousand times would fill the memory."""
-        self.room -= count
-        if self.room < 0:
+        """Count what is copied: a short pickle that copies one thing a thousand times would fill the memory."""
+        self.allowance -= count
+        if self.allowance < 0:
             raise pickle.UnpicklingError("copies more than the file holds")
 
 
@@ -162,7 +176,7 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     objects replaced by their value. Raises StgaError where the file is missing, truncated, too large, no dictionary
     of arrays, or asks for any other class (named in the message).
     """
-    loaded, room = _load(path)
+    loaded, allowance = _load(path)
     if not isinstance(loaded, dict):
         raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
     arrays = {}
@@ -172,13 +186,13 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
         if name in entries:
             try:
                 arrays[key] = _dense(entries[name])
-            except _Stray as error:
+            except _NotAnArray as error:
                 raise StgaError(f"{path}: {key} is {error}, expected an array of numbers") from error
             except Exception as error:
                 # Shapes, indices and states are whatever the file says, of any type and size.
                 raise StgaError(f"{path}: {key} is malformed ({error}), expected an array of numbers") from error
-            room -= arrays[key].nbytes
-            if room < 0:
+            allowance -= arrays[key].nbytes
+            if allowance < 0:
                 raise StgaError(f"{path}: {key} and the arrays before it are larger than the file can hold")
     return arrays
 
@@ -202,7 +216,7 @@ def _load(path: Path) -> tuple[Any, int]:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     try:
         _check_instructions(data)
-        return _RestrictedUnpickler(data).load(), FREE_BYTES + MAX_COPIES * size
+        return _RestrictedUnpickler(data).load(), MIN_ALLOWED_BYTES + MAX_EXPANSION * size
     except _Refused as error:
         raise StgaError(f"{path}: asks for the class {error}, refused: only arrays are read") from error
     except Exception as error:
@@ -233,14 +247,14 @@ def _dense(value: Any) -> np.ndarray:
         return _chumpy(value)
     if isinstance(value, list | tuple | int | float):
         if _leaves(value, {}) > MAX_DENSE_ELEMENTS:
-            raise _Stray(f"a list of more than {MAX_DENSE_ELEMENTS} numbers")
+            raise _NotAnArray(f"a list of more than {MAX_DENSE_ELEMENTS} numbers")
         try:
             plain = np.asarray(value)
         except (ValueError, OverflowError) as error:
-            raise _Stray("a ragged list") from error
+            raise _NotAnArray("a ragged list") from error
         if plain.dtype.kind in "biuf":
             return plain
-    raise _Stray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
+    raise _NotAnArray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
 
 
 def _leaves(value: Any, known: dict[int, int]) -> int:
@@ -256,14 +270,14 @@ def _leaves(value: Any, known: dict[int, int]) -> int:
 def _array(value: _Array) -> np.ndarray:
     state = value.state
     if not isinstance(state, tuple) or len(state) < 4:
-        raise _Stray("an incomplete array")
+        raise _NotAnArray("an incomplete array")
     shape, dtype, fortran, raw = state[-4:]
     return _from_bytes(raw, _dtype(dtype), shape, "F" if fortran else "C")
 
 
 def _from_buffer(value: _Buffer) -> np.ndarray:
     if len(value.arguments) != 4:
-        raise _Stray("an incomplete array")
+        raise _NotAnArray("an incomplete array")
     raw, dtype, shape, order = value.arguments
     return _from_bytes(raw, _dtype(dtype), shape, "F" if order == "F" else "C")
 
@@ -273,13 +287,13 @@ def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.nd
         try:
             raw = raw.encode("latin1")
         except UnicodeEncodeError as error:
-            raise _Stray("an array of text") from error
+            raise _NotAnArray("an array of text") from error
     if not isinstance(raw, bytes | bytearray):
-        raise _Stray("an array of objects")
+        raise _NotAnArray("an array of objects")
     if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise _Stray("an array without a shape")
+        raise _NotAnArray("an array without a shape")
     if len(raw) != math.prod(shape) * dtype.itemsize:
-        raise _Stray(f"an array of shape {shape} with {len(raw)} bytes of data")
+        raise _NotAnArray(f"an array of shape {shape} with {len(raw)} bytes of data")
     flat = np.frombuffer(raw, dtype).astype(dtype.newbyteorder("="))
     return flat.reshape(shape[::-1]).T if order == "F" else flat.reshape(shape)
 
@@ -287,9 +301,9 @@ def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.nd
 def _dtype(value: Any) -> np.dtype[Any]:
     code = value.arguments[0] if isinstance(value, _Dtype) and value.arguments else None
     if not isinstance(code, str) or not re.fullmatch(r"[iuf][1248]|b1", code):
-        raise _Stray(f"an array of type {code}" if isinstance(code, str) else "an array of unknown type")
+        raise _NotAnArray(f"an array of type {code}" if isinstance(code, str) else "an array of unknown type")
     if code == "f1":
-        raise _Stray("an array of type f1")
+        raise _NotAnArray("an array of type f1")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
     return np.dtype(code).newbyteorder(">" if order == ">" else "<")
 
@@ -299,15 +313,15 @@ def _sparse(value: _Sparse) -> np.ndarray:
     state = value.state if isinstance(value.state, dict) else {}
     shape = state.get("_shape", state.get("shape"))
     if not isinstance(shape, tuple) or len(shape) != 2 or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise _Stray("a sparse matrix without a shape")
+        raise _NotAnArray("a sparse matrix without a shape")
     if math.prod(shape) > MAX_DENSE_ELEMENTS:
-        raise _Stray(f"a sparse matrix of shape {shape}, too large to fill in")
+        raise _NotAnArray(f"a sparse matrix of shape {shape}, too large to fill in")
     data = _dense(state.get("data"))
     rows, columns = _sparse_indices(value.format, state)
     if not (data.shape == rows.shape == columns.shape):
-        raise _Stray("a sparse matrix whose indices do not match its data")
+        raise _NotAnArray("a sparse matrix whose indices do not match its data")
     if len(data) and (min(rows.min(), columns.min()) < 0 or rows.max() >= shape[0] or columns.max() >= shape[1]):
-        raise _Stray("a sparse matrix with indices outside its shape")
+        raise _NotAnArray("a sparse matrix with indices outside its shape")
     dense = np.zeros(shape, np.float64)
     np.add.at(dense, (rows, columns), data)  # a sparse matrix may hold an entry twice, meaning their sum
     return dense
@@ -321,7 +335,7 @@ def _sparse_indices(layout: str, state: dict[str, Any]) -> tuple[np.ndarray, np.
     inner, starts = _integers(state.get("indices")), _integers(state.get("indptr"))
     counts = np.diff(starts)
     if len(starts) == 0 or (counts < 0).any() or counts.sum() != len(inner):
-        raise _Stray("a sparse matrix whose index pointers do not match its indices")
+        raise _NotAnArray("a sparse matrix whose index pointers do not match its indices")
     outer = np.repeat(np.arange(len(counts)), counts)
     return (inner, outer) if layout == "csc" else (outer, inner)
 
@@ -329,7 +343,7 @@ def _sparse_indices(layout: str, state: dict[str, Any]) -> tuple[np.ndarray, np.
 def _integers(value: Any) -> np.ndarray:
     array = _dense(value)
     if array.dtype.kind not in "iu" or array.ndim != 1:
-        raise _Stray("a sparse matrix with broken indices")
+        raise _NotAnArray("a sparse matrix with broken indices")
     return array.astype(np.int64)
 
 
@@ -341,8 +355,8 @@ def _chumpy(value: _Chumpy) -> np.ndarray:
     if "a" in state and "idxs" in state:
         source, chosen = _dense(state["a"]).ravel(), _dense(state["idxs"])
         if chosen.dtype.kind not in "iu" or (chosen.size and not 0 <= chosen.min() <= chosen.max() < source.size):
-            raise _Stray(f"a {value.source} with indices outside its array")
+            raise _NotAnArray(f"a {value.source} with indices outside its array")
         picked: np.ndarray = source[chosen]
         shape = state.get("preferred_shape")
         return picked.reshape(shape) if isinstance(shape, tuple) and math.prod(shape) == picked.size else picked
-    raise _Stray(f"a {value.source}, whose value is not stored in the file")
+    raise _NotAnArray(f"a {value.source}, whose value is not stored in the file")

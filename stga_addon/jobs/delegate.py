@@ -1,4 +1,4 @@
-"""The head of an open .blend file as a folder, for a command about it that runs in another Python than Blender's."""
+"""Running a CLI command on the open .blend file: its head as a folder that another Python reads."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -8,6 +8,8 @@ import numpy as np
 
 from ..capture.model import Capture
 from ..capture.open import open_capture
+from ..capture.transforms import PRINCIPAL_POINTS
+from ..errors import StgaError
 from ..files import read_json, read_npz, write_json, write_npz
 
 FOLDER = "STGA_HEAD"
@@ -48,9 +50,16 @@ def write_head(folder: Path, head: OpenHead, played: bool) -> None:
 
 
 def read_head(folder: Path) -> OpenHead:
-    """The head that `write_head` wrote. Raises StgaError where there is none."""
-    values = read_json(folder / HEAD)
-    capture, flame, avatar = (values[name] and Path(values[name]) for name in ("capture", "flame", "avatar"))
+    """The head that `write_head` wrote. Raises StgaError where there is none or it is damaged."""
+    path = folder / HEAD
+    values = read_json(path)
+    if not isinstance(values, dict) or values.get("principal_point") not in PRINCIPAL_POINTS:
+        raise StgaError(f"{path}: is not the head of an open .blend file (principal_point is missing)")
+    for name, needed in (("capture", True), ("flame", False), ("avatar", False)):
+        value = values.get(name)
+        if not isinstance(value, str) and (needed or value is not None):
+            raise StgaError(f"{path}: {name} is {value!r:.40}, expected a path")
+    flame, avatar = (Path(values[name]) if values.get(name) else None for name in ("flame", "avatar"))
 
     def selection() -> dict[int, np.ndarray] | None:
         return _by_timestep(folder / SELECTION) if (folder / SELECTION).exists() else None
@@ -59,7 +68,7 @@ def read_head(folder: Path) -> OpenHead:
         meshes = _by_timestep(folder / PLAYED)
         return replace(capture, timesteps=tuple(sorted(meshes)), mesh=meshes.__getitem__, flame=None)
 
-    return OpenHead(capture, flame, values["principal_point"], avatar, selection, played)
+    return OpenHead(Path(values["capture"]), flame, values["principal_point"], avatar, selection, played)
 
 
 def _by_timestep(path: Path) -> dict[int, np.ndarray]:

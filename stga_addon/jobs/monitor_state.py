@@ -211,7 +211,8 @@ def _status_read(state: MonitorState, event: StatusRead) -> Outcome:
         effects.append(ReadCurve(folder))
     if (folder, files, event.snapshot) != (state.folder, state.files, state.snapshot):
         effects.append(Redraw())
-    state = replace(state, folder=folder, files=files, snapshot=event.snapshot)
+    error = "" if state.stopped else state.error
+    state = replace(state, folder=folder, files=files, snapshot=event.snapshot, error=error, stopped=False)
     if state.loading is not None:
         return state, tuple(effects)
     has_result = worker in (WorkerState.FINISHED, WorkerState.CANCELLED) and not state.result_shown

@@ -1,64 +1,73 @@
-"""A training job: written into the run's folder by whoever wants it, carried out by a worker of its own.
+"""Training jobs: written into a run's folder by Blender, carried out by a worker.
 
-RUN/job/job.json       the capture and the settings
+RUN/job/job.json       the capture, the device and the settings
 RUN/job/selection.npz  timestep -> triangles to train, where they were painted
-RUN/job/preview.npz    the avatar as it was a few seconds ago
-beside what every task has (`task`)
+RUN/job/preview.npz    the avatar of a few seconds ago
+besides the files of the worker's status folder
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..avatar.file import Avatar, write_avatar
+from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..files import read_json, write_json, write_npz
-from ..training.settings import TrainingSettings, from_json, to_json
+from ..training.optimize.device import choose_device
+from ..training.run.folder import SELECTION, Run
+from ..training.run.open_run import device_of, open_run
+from ..training.settings import DEVICES, TrainingSettings, from_json, to_json
 from ..worker.launch import prepare_status_folder
 from ..worker.status import StatusWriter, remove_status_folder, status_writer
 
 if TYPE_CHECKING:
     from ..training.run.progress import Progress, Report
 
-FORMAT, VERSION = "stga-job", 1
-JOB, SELECTION, PREVIEW = "job.json", "selection.npz", "preview.npz"
+FORMAT, VERSION = "stga-job", 2
+JOB, PREVIEW = "job.json", "preview.npz"
 PREVIEW_S = 4.0
 """Seconds between two previews."""
 
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """What to train: the capture with what it takes to open it, and the settings; None continues the run there is."""
+    """What to train.
+
+    settings  None to resume the run in the folder
+    device    one of DEVICES; "auto" resumes a run on the device that it was trained on
+    """
 
     capture: Path
     flame: Path | None
     principal_point: str
     settings: TrainingSettings | None
+    device: str = "auto"
 
 
 def job_folder(run: Path) -> Path:
-    """The job's folder, inside that of the run: they move together."""
+    """The job's folder: inside that of the run, so that they move together."""
     return run / "job"
 
 
 def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] | None = None) -> None:
-    """Make a run's folder ready for the job's worker.
+    """Prepare a run's folder for the job's worker.
 
     selection: timestep -> (F,) bool, to be trained instead of what the rule selects.
-    Raises StgaError while a worker is there, where there is a run already (none, to continue), or on a full disk.
+    Raises StgaError while a worker is in the folder, where it holds a run already (to resume: none, or one that was
+    trained on something else), or on a full disk.
     """
     folder = job_folder(run)
-    has_run = (run / "run.json").exists()
-    if has_run and job.settings is not None:
+    if job.settings is None:
+        open_run(run, job.capture, job.flame, job.principal_point)
+    elif (run / "run.json").exists():
         raise StgaError(f"{run}: already holds a run; resume it, or choose another folder")
-    if not has_run and job.settings is None:
-        raise StgaError(f"{run}: holds no run that could be resumed (run.json is missing)")
     prepare_status_folder(folder)
     for stale in (SELECTION, PREVIEW):
         (folder / stale).unlink(missing_ok=True)
@@ -72,6 +81,7 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
             "capture": str(job.capture),
             "flame": None if job.flame is None else str(job.flame),
             "principal_point": job.principal_point,
+            "device": job.device,
             "settings": None if job.settings is None else to_json(job.settings),
         },
     )
@@ -84,15 +94,20 @@ def read_job(run: Path) -> TrainingJob:
     if not isinstance(values, dict) or (values.get("format"), values.get("version")) != (FORMAT, VERSION):
         raise StgaError(f"{path}: is not a job that this version reads (format '{FORMAT}', version {VERSION})")
     try:
-        flame, settings = values["flame"], values["settings"]
+        flame, settings, device = values["flame"], values["settings"], values["device"]
+        if device not in DEVICES:
+            raise ValueError(f"device is {device!r:.40}")
         return TrainingJob(
             Path(values["capture"]),
             None if flame is None else Path(flame),
             str(values["principal_point"]),
             None if settings is None else from_json(settings),
+            device,
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StgaError(f"{path}: a field is missing or malformed ({error})") from error
+    except StgaError as error:
+        raise StgaError(f"{path}: {error}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
 
 
 def remove_job(run: Path) -> None:
@@ -108,44 +123,51 @@ def remove_job(run: Path) -> None:
 
 
 def worker_arguments(run: Path) -> list[str]:
-    """What a worker's interpreter runs, after `-m`."""
+    """Arguments of the worker's interpreter, after `-m`."""
     return ["stga_addon", "job", str(run.resolve())]
 
 
 def run_training_job(run: Path, also: "Report | None" = None) -> Path:
-    """Carry out the run's job, telling in its folder how far it is; returns the path of the avatar.
+    """Carry out the run's job, with its status in the job's folder; return the path of the avatar.
 
     also: called as well after every iteration.
-    Raises what training raises; the sentence is in the folder, too.
+    Raises what training raises; the message is in the final status, too.
     """
     folder = job_folder(run)
-    if not (folder / JOB).is_file():  # before anything is written into a folder that is none of ours
+    if not (folder / JOB).is_file():  # before anything is written into a folder that may be of something else
         raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
     with status_writer(folder) as writer:
         writer.update(0.0, "Starting")
-        from ..effects.plan import with_effect_plan
-        from ..training.optimize.device import choose_device
-        from ..training.run.folder import Run, read_run, read_selection
+        from ..training.run.checkpoint import read_selection
         from ..training.run.loop import train
 
         job = read_job(run)
-        capture = open_capture(job.capture, job.flame, job.principal_point)
+        wanted, capture = _open(run, job, lambda stage: writer.update(0.0, stage))
         selection = None
         if (folder / SELECTION).exists():
             selection = read_selection(folder, len(capture.faces))
-        device, why = choose_device("auto")
-        writer.update(0.0, why)
-        if job.settings is None:
-            wanted = read_run(run)
-        else:
-            writer.update(0.0, "Analyzing the capture")
-            wanted = with_effect_plan(Run(capture.root, job.flame, job.principal_point, job.settings), capture, device)
-        report = _Report(writer, also)
-        return train(capture, run, wanted, selection, job.settings is None, report, device)
+        return train(capture, run, wanted, selection, job.settings is None, _Report(writer, also))
+
+
+def _open(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> tuple[Run, Capture]:
+    """The run to train, new or resumed, and its capture."""
+    from ..effects.plan import with_effect_plan
+
+    if job.settings is None:
+        opened = open_run(folder, job.capture, job.flame, job.principal_point)
+        device, reason = device_of(opened.run, job.device)
+        report(reason)
+        return replace(opened.run, device=device), opened.capture
+    capture = open_capture(job.capture, job.flame, job.principal_point)
+    device, reason = choose_device(job.device)
+    report(reason)
+    report("Analyzing the capture")
+    run = Run(capture.root, job.flame, job.principal_point, job.settings, device=device)
+    return with_effect_plan(run, capture, device), capture
 
 
 class _Report:
-    """What training calls after every iteration: passes it on, and leaves a preview now and then."""
+    """The report of a training job: status, and a preview every few seconds."""
 
     def __init__(self, writer: StatusWriter, also: "Report | None") -> None:
         self.writer, self.also = writer, also
@@ -159,5 +181,5 @@ class _Report:
         return bool(self.also and self.also(progress)) or stop
 
     def _preview(self, avatar: Avatar) -> None:
-        with suppress(StgaError):  # training goes on without; where the disk is full, it will say so itself
+        with suppress(StgaError):  # training continues without a preview, and reports a full disk itself
             write_avatar(self.writer.folder / PREVIEW, avatar)

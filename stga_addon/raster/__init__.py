@@ -1,1 +1,4 @@
-"""Splats and a camera to an image and its gradient. Importing `render` needs numba and torch."""
+"""Rasterizer: splats and a camera to an image and its gradient.
+
+`render` (needs numba) renders splats and avatars; `reference` is the oracle of the kernels in `cpu/` and `gpu/`.
+"""

@@ -1,4 +1,4 @@
-"""Splats where a scene has them; needs nothing that draws."""
+"""Splats placed in a scene, and the image made of them; importing this needs numpy only."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from ..avatar.splats import Splats
 
 @dataclass(frozen=True)
 class PosedSplats:
-    """One posed set of splats in a scene with others.
+    """One set of splats in a scene with others: a layer of `compose`.
 
-    frames: those of the splats' triangles (`WORLD` for a world-space set), in the space they were trained in.
-    to_world (4, 4): from there to the scene; it may scale and shear. antialiased as in `Avatar`.
+    frames: those of the splats' triangles (`WORLD` for a world-space set), in the space that the splats were trained
+    in. to_world (4, 4): from that space to the scene; it may scale and shear. antialiased as in `Avatar`.
     """
 
     splats: Splats
@@ -24,10 +24,10 @@ class PosedSplats:
 
 @dataclass(frozen=True)
 class ComposedImage:
-    """A picture of splats on nothing.
+    """Image of several layers on a transparent background.
 
-    rgb (3, H, W) float32: display values, premultiplied; alpha (H, W); depth (H, W) meters along the view axis, the
-    mean over what a pixel shows, 0 where it shows nothing, or None where nobody asked for it.
+    rgb (3, H, W) float32: display values (sRGB), premultiplied with alpha (H, W). depth (H, W): meters along the view
+    axis, the alpha-weighted mean of what a pixel shows, 0 where that is nothing; None if it was not asked for.
     """
 
     rgb: np.ndarray

@@ -1,19 +1,25 @@
-"""The renderer that the fast kernels are tested against: plain torch, any dtype, gradients by autograd.
+"""Reference renderer: one plain torch function per stage, against which both sets of kernels are tested.
 
-Small scenes only: every splat is evaluated at every pixel.
+Any dtype, gradients by autograd. Small scenes only: every splat is evaluated at every pixel. Stages: `embed` (triangles
+to world space), `project`, `sh_color`, `splat_alpha` and `blend`, which `render` chains, and `image_loss`.
 """
 
 from math import pi, sqrt
 
 import torch
 from torch import Tensor
+from torch.nn.functional import conv2d, normalize
 
+from ..avatar.embedding import FaceFrames
 from ..capture.camera import Camera
 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
-FRUSTUM_MARGIN = 0.3  # how far beyond the image, in half fields of view, the Jacobian still follows a splat
+LOW_PASS_PX2 = 0.3
+NEAR_M = 0.01
+FRUSTUM_MARGIN = 0.3
+"""How far beyond the image, in half fields of view, the Jacobian still follows a splat."""
 
 
 def render(
@@ -24,46 +30,117 @@ def render(
     sh: Tensor,
     camera: Camera,
     sh_degree: int = 3,
-    near: float = 0.01,
-    low_pass: float = 0.3,
+    near: float = NEAR_M,
     antialiased: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image of world-space splats: color (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight · z.
 
     xyz (N, 3) meters, rotation (N, 4) wxyz of any length, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3) of
-    which the first (sh_degree + 1)² are used. near in meters, low_pass in square pixels, z the camera's.
-    antialiased: opacity loses what low_pass adds to the projected area (Mip-Splatting, 2D filter).
+    which the first (sh_degree + 1)² are used. near in meters, z the camera's.
+    antialiased: opacity loses what the low-pass adds to the projected area (Mip-Splatting, 2D filter).
     Splats closer than `near` are dropped; the rest are blended front to back by z, in input order where z ties.
-    A pixel ends before the splat that would leave it a transmittance of MIN_TRANSMITTANCE or less
-    (3D Gaussian Splatting, sections 4 to 6, with gsplat's constants).
+    (3D Gaussian Splatting, sections 4 to 6, with gsplat's constants.)
     """
-    view = torch.as_tensor(camera.world_to_camera, dtype=xyz.dtype, device=xyz.device)
-    in_camera = xyz @ view[:3, :3].T + view[:3, 3]
-    z = in_camera[:, 2].detach()
+    z = camera_space(xyz, camera)[:, 2].detach()
     order = torch.argsort(z, stable=True)
     order = order[z[order] >= near]
-
-    covariance = view[:3, :3] @ _covariance(rotation[order], log_scale[order]) @ view[:3, :3].T
+    center, covariance, depth, compensation = project(xyz[order], rotation[order], log_scale[order], camera)
     position = torch.as_tensor(camera.position, dtype=xyz.dtype, device=xyz.device)
-    color = sh_color(sh[order], xyz[order] - position, sh_degree)
-    center, projected = _project(in_camera[order], covariance, camera, low_pass)
     visible = torch.sigmoid(opacity[order])
     if antialiased:
-        blur = low_pass * torch.eye(2, dtype=xyz.dtype, device=xyz.device)
-        visible = visible * (torch.linalg.det(projected - blur) / torch.linalg.det(projected)).clamp_min(0).sqrt()
-    alpha = _alpha(center, projected, visible, camera)
-    return _composite(alpha, color, in_camera[order, 2])
+        visible = visible * compensation
+    alpha = splat_alpha(center, covariance, visible, camera)
+    return blend(alpha, sh_color(sh[order], xyz[order] - position, sh_degree), depth)
+
+
+def embed(
+    xyz: Tensor, rotation: Tensor, log_scale: Tensor, frames: FaceFrames, face: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """World-space xyz (N, 3), rotation (N, 4) wxyz and log_scale (N, 3) of splats in the frames of triangles face
+    (N,)."""
+    n = len(xyz)
+    assert xyz.shape == log_scale.shape == (n, 3), (xyz.shape, log_scale.shape)
+    assert rotation.shape == (n, 4), rotation.shape
+    assert face.shape == (n,), face.shape
+    origin, axes, quaternion, scale = (
+        torch.as_tensor(array, dtype=xyz.dtype)[face]
+        for array in (frames.origin, frames.rotation, frames.quaternion, frames.scale)
+    )
+    w, x, y, z = quaternion.unbind(-1)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    product = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)  # quaternion ⊗ ·
+    world = scale[:, None] * torch.einsum("nij,nj->ni", axes, xyz) + origin
+    return world, torch.einsum("nij,nj->ni", product, rotation), log_scale + scale.log()[:, None]
+
+
+def camera_space(xyz: Tensor, camera: Camera) -> Tensor:
+    """World points (N, 3) in camera space (N, 3)."""
+    assert xyz.shape == (len(xyz), 3), xyz.shape
+    view = torch.as_tensor(camera.world_to_camera, dtype=xyz.dtype, device=xyz.device)
+    return xyz @ view[:3, :3].T + view[:3, 3]
+
+
+def project(xyz: Tensor, rotation: Tensor, log_scale: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project N world-space Gaussians; all must be in front of the camera.
+
+    Returns center (N, 2) in pixels, covariance (N, 2, 2) in square pixels with the low-pass, depth (N,) in meters, and
+    compensation (N,): the factor of opacity that keeps what the low-pass adds from showing.
+    """
+    n = len(xyz)
+    assert xyz.shape == log_scale.shape == (n, 3), (xyz.shape, log_scale.shape)
+    assert rotation.shape == (n, 4), rotation.shape
+    turn = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=xyz.dtype, device=xyz.device)
+    axes = turn @ (rotation_matrix(rotation) * log_scale.exp()[:, None, :])
+    x, y, z = camera_space(xyz, camera).unbind(-1)
+    fx, fy = camera.fl_x, camera.fl_y
+    slope_x = clamp_to_frustum(x / z, camera.width, fx, camera.cx)
+    slope_y = clamp_to_frustum(y / z, camera.height, fy, camera.cy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([fx / z, zero, -fx * slope_x / z], dim=-1),
+            torch.stack([zero, fy / z, -fy * slope_y / z], dim=-1),
+        ],
+        dim=-2,
+    )
+    center = torch.stack([fx * x / z + camera.cx, fy * y / z + camera.cy], dim=-1)
+    sharp = jacobian @ (axes @ axes.mT) @ jacobian.mT
+    covariance = sharp + LOW_PASS_PX2 * torch.eye(2, dtype=xyz.dtype, device=xyz.device)
+    compensation = (torch.linalg.det(sharp) / torch.linalg.det(covariance)).clamp_min(0).sqrt()
+    return center, covariance, z, compensation
+
+
+def clamp_to_frustum(slope: Tensor, size: int, focal: float, principal: float) -> Tensor:
+    """Slopes x/z or y/z (N,) kept near the image's borders: the linearized projection explodes far outside it."""
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    return slope.clamp(-principal / focal - margin, (size - principal) / focal + margin)
+
+
+def rotation_matrix(quaternion: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions wxyz (N, 4) of any length."""
+    assert quaternion.shape == (len(quaternion), 4), quaternion.shape
+    w, x, y, z = normalize(quaternion, dim=-1).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def sh_color(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
     """Color (N, 3) ≥ 0 of coefficients sh (N, K, 3) seen along `direction` (N, 3), of any length."""
     count = (degree + 1) ** 2
-    basis = sh_basis(torch.nn.functional.normalize(direction, dim=-1))[:, :count]
+    assert direction.shape == (len(sh), 3), direction.shape
+    assert sh.shape == (len(sh), sh.shape[1], 3), sh.shape
+    assert sh.shape[1] >= count, sh.shape
+    basis = sh_basis(normalize(direction, dim=-1))[:, :count]
     return (0.5 + torch.einsum("nk,nkc->nc", basis, sh[:, :count])).clamp_min(0)
 
 
 def sh_basis(direction: Tensor) -> Tensor:
     """Real spherical harmonics (N, 16) up to degree 3 of unit directions (N, 3), 3D Gaussian Splatting's signs."""
+    assert direction.shape == (len(direction), 3), direction.shape
     x, y, z = direction.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     return torch.stack(
@@ -89,49 +166,13 @@ def sh_basis(direction: Tensor) -> Tensor:
     )
 
 
-def rotation_matrix(quaternion: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions wxyz (N, 4) of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def _covariance(rotation: Tensor, log_scale: Tensor) -> Tensor:
-    axes = rotation_matrix(rotation) * log_scale.exp()[:, None, :]
-    return axes @ axes.mT
-
-
-def _project(points: Tensor, covariance: Tensor, camera: Camera, low_pass: float) -> tuple[Tensor, Tensor]:
-    """Center (N, 2) in pixels and 2D covariance (N, 2, 2) in square pixels of splats given in camera space."""
-    x, y, z = points.unbind(-1)
-    fx, fy = camera.fl_x, camera.fl_y
-    slope_x = _clamp_to_frustum(x / z, camera.width, fx, camera.cx)
-    slope_y = _clamp_to_frustum(y / z, camera.height, fy, camera.cy)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            torch.stack([fx / z, zero, -fx * slope_x / z], dim=-1),
-            torch.stack([zero, fy / z, -fy * slope_y / z], dim=-1),
-        ],
-        dim=-2,
-    )
-    blur = low_pass * torch.eye(2, dtype=points.dtype, device=points.device)
-    center = torch.stack([fx * x / z + camera.cx, fy * y / z + camera.cy], dim=-1)
-    return center, jacobian @ covariance @ jacobian.mT + blur
-
-
-def _clamp_to_frustum(slope: Tensor, size: int, focal: float, principal: float) -> Tensor:
-    """Far outside the image the linearized projection explodes, so its slope stays near the image's borders."""
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    return slope.clamp(-principal / focal - margin, (size - principal) / focal + margin)
-
-
-def _alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
-    """Opacity (N, H, W) of every splat at every pixel center."""
+def splat_alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
+    """Alpha (N, H, W) of projected splats at every pixel's center: center (N, 2), covariance (N, 2, 2), opacity
+    (N,)."""
+    n = len(center)
+    assert center.shape == (n, 2), center.shape
+    assert covariance.shape == (n, 2, 2), covariance.shape
+    assert opacity.shape == (n,), opacity.shape
     px = torch.arange(camera.width, dtype=center.dtype, device=center.device) + 0.5
     py = torch.arange(camera.height, dtype=center.dtype, device=center.device) + 0.5
     dx = px[None, None, :] - center[:, 0, None, None]
@@ -142,17 +183,41 @@ def _alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) 
     return torch.where(alpha >= MIN_ALPHA, alpha, 0)
 
 
-def _composite(alpha: Tensor, color: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend splats given front to back: alpha (N, H, W), color (N, 3), z (N,)."""
-    shape = alpha.shape[1:]
+def blend(alpha: Tensor, color: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Blend splats given front to back: alpha (N, H, W), color (N, 3), depth (N,), to the three images of `render`.
+
+    A pixel ends before the splat that would leave it a transmittance of MIN_TRANSMITTANCE or less.
+    """
+    n, *shape = alpha.shape
+    assert color.shape == (n, 3), color.shape
+    assert depth.shape == (n,), depth.shape
     transmittance = alpha.new_ones(shape)
     running = torch.ones(shape, dtype=torch.bool, device=alpha.device)
-    rgb, depth = alpha.new_zeros(3, *shape), alpha.new_zeros(shape)
-    for a, c, distance in zip(alpha, color, z, strict=True):
+    rgb, distance = alpha.new_zeros(3, *shape), alpha.new_zeros(shape)
+    for a, c, z in zip(alpha, color, depth, strict=True):
         remaining = transmittance * (1 - a)
         running = running & (remaining > MIN_TRANSMITTANCE)
         weight = torch.where(running, transmittance * a, 0)
         rgb = rgb + c[:, None, None] * weight
-        depth = depth + distance * weight
+        distance = distance + z * weight
         transmittance = torch.where(running, remaining, transmittance)
-    return rgb, 1 - transmittance, depth
+    return rgb, 1 - transmittance, distance
+
+
+def image_loss(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Maps (3, H, W) of |difference| and SSIM of two images (3, H, W) in 0…1; the loss mixes 1 − SSIM and the other.
+
+    SSIM: Gaussian window of 11 pixels, σ 1.5, zero padding (Wang et al. 2004, as used by 3D Gaussian Splatting).
+    """
+    assert image.shape == target.shape == (3, *image.shape[1:]), (image.shape, target.shape)
+    line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=image.dtype) ** 2) / (2 * 1.5**2))
+    window = torch.outer(line, line) / line.sum() ** 2
+
+    def blur(values: Tensor) -> Tensor:
+        return conv2d(values[:, None], window[None, None], padding=5)[:, 0]
+
+    x, y, c1, c2 = blur(image), blur(target), 0.01**2, 0.03**2
+    variances = blur(image * image) - x**2 + blur(target * target) - y**2
+    covariance = blur(image * target) - x * y
+    ssim = (2 * x * y + c1) * (2 * covariance + c2) / ((x**2 + y**2 + c1) * (variances + c2))
+    return (image - target).abs(), ssim

@@ -1,4 +1,4 @@
-"""Arrays between a process that wants pictures and one that draws them: a length, then an npz without pickle."""
+"""Messages between render client and server: a mark, a length, then named arrays as an npz without pickle."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -11,23 +11,26 @@ from ..avatar.embedding import FaceFrames
 from ..avatar.splats import Splats
 from .posed_splats import PosedSplats
 
-SPLATS = [field.name for field in fields(Splats)]
-FRAMES = [field.name for field in fields(FaceFrames)]
+MARK = b"stga"
+SPLAT_FIELDS = [field.name for field in fields(Splats)]
+FRAME_FIELDS = [field.name for field in fields(FaceFrames)]
 
 
-def send(stream: Any, arrays: Mapping[str, Any]) -> None:
+def send(stream: BinaryIO, arrays: Mapping[str, Any]) -> None:
     """Write one message."""
     packed = io.BytesIO()
     np.savez(packed, **arrays)
-    stream.write(packed.tell().to_bytes(8, "little"))
+    stream.write(MARK + packed.tell().to_bytes(8, "little"))
     stream.write(packed.getbuffer())
     stream.flush()
 
 
-def receive(stream: BinaryIO | Any) -> dict[str, np.ndarray]:
-    """Read one message. Raises EOFError where the other side is gone."""
-    size = int.from_bytes(_exactly(stream, 8), "little")
-    with np.load(io.BytesIO(_exactly(stream, size)), allow_pickle=False) as arrays:
+def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
+    """Read one message. Raises EOFError at the end of the stream, ValueError for what is no message."""
+    mark, size = _read_exactly(stream, len(MARK)), int.from_bytes(_read_exactly(stream, 8), "little")
+    if mark != MARK:
+        raise ValueError(f"a message begins with {MARK!r}, got {mark!r}")
+    with np.load(io.BytesIO(_read_exactly(stream, size)), allow_pickle=False) as arrays:
         return dict(arrays)
 
 
@@ -35,8 +38,8 @@ def pack_layers(layers: Sequence[PosedSplats]) -> dict[str, Any]:
     """Layers as named arrays."""
     arrays: dict[str, Any] = {"layers": len(layers)}
     for index, layer in enumerate(layers):
-        arrays |= {f"{index} splats {name}": getattr(layer.splats, name) for name in SPLATS}
-        arrays |= {f"{index} frames {name}": getattr(layer.frames, name) for name in FRAMES}
+        arrays |= {f"{index} splats {name}": getattr(layer.splats, name) for name in SPLAT_FIELDS}
+        arrays |= {f"{index} frames {name}": getattr(layer.frames, name) for name in FRAME_FIELDS}
         arrays |= {f"{index} to_world": layer.to_world, f"{index} antialiased": layer.antialiased}
     return arrays
 
@@ -45,8 +48,8 @@ def unpack_layers(arrays: Mapping[str, np.ndarray]) -> list[PosedSplats]:
     """The inverse of `pack_layers`."""
     return [
         PosedSplats(
-            Splats(**{name: arrays[f"{index} splats {name}"] for name in SPLATS}),
-            FaceFrames(**{name: arrays[f"{index} frames {name}"] for name in FRAMES}),
+            Splats(**{name: arrays[f"{index} splats {name}"] for name in SPLAT_FIELDS}),
+            FaceFrames(**{name: arrays[f"{index} frames {name}"] for name in FRAME_FIELDS}),
             arrays[f"{index} to_world"],
             bool(arrays[f"{index} antialiased"]),
         )
@@ -54,7 +57,7 @@ def unpack_layers(arrays: Mapping[str, np.ndarray]) -> list[PosedSplats]:
     ]
 
 
-def _exactly(stream: BinaryIO | Any, size: int) -> bytes:
+def _read_exactly(stream: BinaryIO, size: int) -> bytes:
     parts = []
     while size:
         part = stream.read(size)

@@ -1,17 +1,19 @@
-"""Render server: `python -m stga_addon.raster.render_server` answers render requests on its pipes."""
+"""Render server: `python -m stga_addon.raster.render_server` answers render requests, stdin to stdout."""
 
 import sys
-from typing import Any
+from typing import BinaryIO
 
-from ..capture.camera import Camera
 from ..worker.environment_use import mark_environment_used
-from .cpu.compose import compose
-from .posed_splats import PosedSplats
-from .render_protocol import receive, send, unpack_layers
+from ..worker.stdout import claim_stdout
 
 
-def serve(requests: Any, answers: Any) -> None:
-    """Answer until the other side is gone; layers stay until others come."""
+def serve(requests: BinaryIO, replies: BinaryIO) -> None:
+    """Answer requests until the stream ends; layers are kept until a request brings others."""
+    from ..capture.camera import Camera
+    from .cpu.compose import compose
+    from .posed_splats import PosedSplats
+    from .render_protocol import receive, send, unpack_layers
+
     layers: list[PosedSplats] = []
     while True:
         try:
@@ -23,16 +25,15 @@ def serve(requests: Any, answers: Any) -> None:
                 layers = unpack_layers(request)
             width, height, fl_x, fl_y, cx, cy = request["camera"].tolist()
             camera = Camera(int(width), int(height), fl_x, fl_y, cx, cy, request["pose"])
-            picture = compose(layers, camera, bool(request["with_depth"]))
-            answer: dict[str, Any] = {"rgb": picture.rgb, "alpha": picture.alpha}
-            if picture.depth is not None:
-                answer["depth"] = picture.depth
-        except Exception as error:  # the one who asked shall hear it, whatever it is
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        send(answers, answer)
+            image = compose(layers, camera, bool(request["with_depth"]))
+        except Exception as error:  # the client reports it, whatever it is
+            send(replies, {"error": f"{type(error).__name__}: {error}"})
+        else:
+            depth = {} if image.depth is None else {"depth": image.depth}
+            send(replies, {"rgb": image.rgb, "alpha": image.alpha, **depth})
 
 
 if __name__ == "__main__":
+    replies = claim_stdout()
     mark_environment_used()
-    pipe, sys.stdout = sys.stdout.buffer, sys.stderr  # nothing else may get between the messages
-    serve(sys.stdin.buffer, pipe)
+    serve(sys.stdin.buffer, replies)

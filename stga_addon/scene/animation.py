@@ -1,4 +1,4 @@
-"""F-curves and drivers, written with all their keyframes at once."""
+"""F-curves and drivers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ def write_curve(
 ) -> None:
     """Add one f-curve with all its keyframes at once.
 
-    curves from `action_curves`; index of the array element (0 for a scalar); frames, values (K,), frames ascending.
+    curves: from `action_curves`; index: of the array element, 0 for a scalar; frames, values (K,), frames ascending.
     """
     points = curves.new(data_path, index=index).keyframe_points
     points.add(len(frames))
@@ -24,7 +24,7 @@ def write_curve(
 
 
 def write_triangle_curves(keys: Any, names: Sequence[str], timesteps: Sequence[float]) -> None:
-    """Animate shape keys that take turns: each is 1 at its own timestep and 0 from its neighbours' on, linear between.
+    """Animate shape keys by triangle waves: each is 1 at its own timestep and 0 at all others, linear between.
 
     keys: the Key data-block; names and timesteps (T), ascending.
     """
@@ -40,11 +40,11 @@ def add_driver(
 ) -> Any:
     """Drive one value of the data-block `owner` by an expression of other data-blocks' properties.
 
-    index of the array element, -1 for a scalar; variables: name -> (data-block, data path). Expressions of at most
-    255 characters with arithmetic only are evaluated without Python, so they run where scripts are not trusted.
+    index: of the array element, -1 for a scalar; variables: name -> (data-block, data path). Expressions of at most
+    255 characters with arithmetic only are evaluated without Python, so they work where scripts are not trusted.
     """
     curve = owner.driver_add(data_path, index)
-    # A new driver comes with keyframes at 0 and 1, to which results closer than 1e-4 would snap.
+    # A new driver has keyframes at 0 and 1, to which Blender snaps results closer than 1e-4.
     curve.keyframe_points.clear()
     driver = curve.driver
     driver.type = "SCRIPTED"

@@ -1,4 +1,4 @@
-"""The .blend file as a whole."""
+"""Opening, saving and looking up objects in the .blend file."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from ..errors import StgaError
 
 
 def new_file() -> None:
-    """Start from an empty file with factory settings: no default cube, nobody's preferences."""
+    """Start from an empty file with factory settings: no default cube, no user preferences."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
@@ -31,9 +31,9 @@ def open_file(path: Path) -> None:
 
 
 def look_through_camera() -> None:
-    """Let the file open with its 3D viewports on the scene's camera, in colour.
+    """Set the 3D viewports to the scene's camera and to Material Preview.
 
-    Blender's own view shows twenty metres of grid, in which a head is a dot.
+    Blender's default view shows twenty meters of grid, in which a head is a dot.
     """
     for screen in bpy.data.screens:
         for area in screen.areas:
@@ -43,7 +43,7 @@ def look_through_camera() -> None:
 
 
 def current_scene() -> Any:
-    """The scene that is open."""
+    """The scene of the open file."""
     return bpy.context.scene
 
 

@@ -1,4 +1,4 @@
-"""The capture's cameras as Blender cameras that see what was photographed, with the photographs behind them."""
+"""The capture's cameras as Blender cameras, with its images as backgrounds."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -15,20 +15,20 @@ from . import compat, tags
 from .animation import write_curve
 from .objects import Warn, log_warning, place, remove
 
-SENSOR_WIDTH = 36.0  # millimetres; with the horizontal fit only its ratio to the focal length matters
-CLIP_START = 0.01  # metres
-DISPLAY_SIZE = 0.1  # metres; Blender's own metre would draw every camera of a rig across the head
-SAME_POSE = 1e-9
-SAME_INTRINSICS = 1e-6  # pixels
+SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
+CLIP_START = 0.01  # meters
+DISPLAY_SIZE = 0.1  # meters; Blender's default of one meter would cover the head with cameras
+POSE_TOLERANCE = 1e-9  # of matrix entries
+INTRINSICS_TOLERANCE = 1e-6  # pixels
 
 
 def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> list[Any]:
     """One camera object for each of the capture's cameras, ascending by index, under `root` (from `capture_root`).
 
-    Focal length and principal point are the capture's; so is the pose, keyframed where it changes over time. The
-    images are background images, one a timestep and shown on its frame (Blender's own image sequences count by a file
-    name's last number, which in captures is the camera). Importing again replaces what the last import made. `warn`
-    hears of images that are missing and of cameras whose intrinsics change.
+    Focal length, principal point and pose are the capture's; a pose that changes over time is keyframed. The images
+    are background images, one per timestep and visible on its frame (Blender's image sequences number frames by a file
+    name's last number, which in captures is the camera). Importing again replaces the last import. `warn` reports
+    missing images and cameras whose intrinsics change.
     """
     cameras = []
     old = {camera[tags.CAMERA_INDEX]: camera for camera in tags.find(tags.CAMERA, capture.root)}
@@ -39,11 +39,11 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
 
 
 def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_warning) -> None:
-    """Make `scene` render through `camera`, one of `import_cameras`', as it was photographed.
+    """Make `scene` render the images of `camera`, one of `import_cameras`'.
 
     Sets the active camera, the resolution, the pixel aspect, the frame range (the capture's timesteps) and the view
-    transform: splats' colours are trained in sRGB, so it has to be Standard. `warn` hears of cameras whose images
-    have another size, since a Blender scene has only one.
+    transform: splat colors are trained in sRGB, so it has to be Standard. `warn` reports cameras whose images have
+    another size, since a Blender scene has only one.
     """
     if camera.get(tags.KIND) != tags.CAMERA:
         raise StgaError(f"{camera.name}: is not a camera imported from a capture")
@@ -59,12 +59,12 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
     scene.view_settings.look = "None"
     for other in tags.find(tags.CAMERA, capture.root):
         same_size = tuple(other[tags.IMAGE_SIZE]) == (width, height)
-        if not same_size or abs(other[tags.PIXEL_ASPECT] - aspect) > SAME_INTRINSICS:
+        if not same_size or abs(other[tags.PIXEL_ASPECT] - aspect) > INTRINSICS_TOLERANCE:
             warn(f"{other.name}: its images have another size or pixel aspect than the scene, set from {camera.name}")
 
 
 def _views_by_camera(capture: Capture) -> dict[int, list[View]]:
-    """camera index -> its views of all splits, one a timestep, ascending."""
+    """camera index -> its views of all splits, one per timestep, ascending."""
     cameras: dict[int, dict[int, View]] = {}
     for views in capture.views.values():
         for view in views:
@@ -76,7 +76,8 @@ def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn
     first = views[0].camera
     title = f"{root.name} camera {index:02d}"
     data = bpy.data.cameras.new(title)
-    _set_intrinsics(data, first)
+    set_intrinsics(data, first)
+    data.clip_start, data.display_size = CLIP_START, DISPLAY_SIZE
     camera = place(root, tags.CAMERA, title, data, old)
     camera[tags.CAMERA_INDEX] = index
     camera[tags.IMAGE_SIZE] = [first.width, first.height]
@@ -88,27 +89,28 @@ def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn
     return camera
 
 
-def _set_intrinsics(data: Any, camera: Camera) -> None:
-    """Blender measures the shift in image widths, right and up; a pixel is fl_x / fl_y as high as it is wide."""
+def set_intrinsics(data: Any, camera: Camera) -> None:
+    """Give a Blender camera's data the focal lengths and principal point of `camera`.
+
+    Blender's shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its width.
+    """
     data.sensor_fit = "HORIZONTAL"
-    data.sensor_width = SENSOR_WIDTH
-    data.lens = camera.fl_x * SENSOR_WIDTH / camera.width
+    data.sensor_width = SENSOR_WIDTH_MM
+    data.lens = camera.fl_x * SENSOR_WIDTH_MM / camera.width
     data.shift_x = (camera.width / 2 - camera.cx) / camera.width
     data.shift_y = (camera.cy - camera.height / 2) / camera.width * camera.fl_x / camera.fl_y
-    data.clip_start = CLIP_START
-    data.display_size = DISPLAY_SIZE
 
 
 def _same_intrinsics(one: Camera, other: Camera) -> bool:
     values = np.array([(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy) for c in (one, other)])
-    return bool(np.abs(values[0] - values[1]).max() <= SAME_INTRINSICS)
+    return bool(np.abs(values[0] - values[1]).max() <= INTRINSICS_TOLERANCE)
 
 
 def _set_pose(camera: Any, views: list[View]) -> None:
     poses = np.stack([view.camera.camera_to_world_gl for view in views])
     camera.rotation_mode = "QUATERNION"
     camera.matrix_basis = Matrix(poses[0].tolist())
-    if np.abs(poses - poses[0]).max() <= SAME_POSE:
+    if np.abs(poses - poses[0]).max() <= POSE_TOLERANCE:
         return
     curves = compat.action_curves(camera)
     frames = np.array([view.timestep for view in views])
@@ -125,7 +127,7 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     found = [view for view in views if view.image.is_file()]
     if len(found) < len(views):
         missing = next(view.image for view in views if not view.image.is_file())
-        warn(f"{missing}: is missing, as are {len(views) - len(found) - 1} other images of {data.name}")
+        warn(f"{missing}: is missing, and {len(views) - len(found) - 1} other images of {data.name}")
     if not found:
         return
     curves = compat.action_curves(data)
@@ -134,7 +136,7 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
         background = data.background_images.new()
         background.image = _load_image(view.image)
         background.show_background_image = row == 0
-        # Shown from its own frame until the next image's; the first also before, the last also after.
+        # Visible from its own frame until the next image's; the first also before, the last also after.
         near = np.arange(max(row - 1, 0), min(row + 2, len(found)))
         path = f"background_images[{row}].show_background_image"
         write_curve(curves, path, 0, frames[near], (near == row).astype(float), "CONSTANT")

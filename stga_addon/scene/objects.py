@@ -1,4 +1,4 @@
-"""The objects of one capture in the scene: an Empty that turns y-up into z-up, and everything under it."""
+"""Creating, replacing and removing the objects of a capture."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -10,20 +10,20 @@ import bpy
 
 from . import tags
 
-# Receives one sentence for a person to read; operators pass their own report.
+# Receives one sentence for the user; operators pass their own report.
 Warn = Callable[[str], None]
 log_warning: Warn = logging.getLogger(__name__).warning
 
 
 def capture_root(source: Path, name: str | None = None) -> Any:
-    """The Empty everything imported from the folder or file `source` hangs under; makes it where there is none.
+    """The Empty that is the parent of all imported from the folder or file `source`; created where there is none.
 
-    Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so that what lies under it keeps the
-    capture's own coordinates. It lives in a collection of its own; both are called `name` (default: source's name).
+    Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so that its children keep the capture's
+    own coordinates. It is in a collection of its own; both are called `name` (default: source's name).
     """
-    found = tags.find(tags.ROOT, source)
-    if found:
-        return found[0]
+    existing = tags.find(tags.ROOT, source)
+    if existing:
+        return existing[0]
     name = name or source.resolve().stem
     collection = bpy.data.collections.new(name)
     bpy.context.scene.collection.children.link(collection)
@@ -36,49 +36,49 @@ def capture_root(source: Path, name: str | None = None) -> Any:
 
 
 def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> Any:
-    """Put new `data` into the scene as an object of this kind under `root`.
+    """An object of this kind under `root`, with new `data`; returns it.
 
-    Where the object exists from an earlier import it stays and only its data is exchanged, so that modifiers, parents
-    and constraints which point to it go on working; its old data, keyframes and drivers are removed.
+    An object that exists from an earlier import is kept and given the new data, so that modifiers, parents and
+    constraints which refer to it go on working; its old data, keyframes and drivers are removed.
     """
-    thing = existing
-    if thing is None:
-        thing = bpy.data.objects.new(name, data)
-        root.users_collection[0].objects.link(thing)
-        thing.parent = root
+    obj = existing
+    if obj is None:
+        obj = bpy.data.objects.new(name, data)
+        root.users_collection[0].objects.link(obj)
+        obj.parent = root
     else:
         leave_edit_mode()
-        old_data, old_action = thing.data, _action(thing)
-        thing.animation_data_clear()
-        thing.data = data
+        old_data, old_action = obj.data, _action(obj)
+        obj.animation_data_clear()
+        obj.data = data
         _purge([old_data], [old_action])
         data.name = name
-    tags.mark(thing, kind, Path(root[tags.CAPTURE]))
-    return thing
+    tags.mark(obj, kind, Path(root[tags.CAPTURE]))
+    return obj
 
 
-def reset(thing: Any) -> None:
-    """Take a mesh object of an earlier import back to its bare mesh: without keyframes, drivers and shape keys."""
+def reset(obj: Any) -> None:
+    """Remove keyframes, drivers and shape keys of a mesh object from an earlier import."""
     leave_edit_mode()
-    actions = [_action(thing), _action(thing.data.shape_keys)]
-    thing.animation_data_clear()
-    if thing.data.shape_keys is not None:
-        thing.shape_key_clear()
+    actions = [_action(obj), _action(obj.data.shape_keys)]
+    obj.animation_data_clear()
+    if obj.data.shape_keys is not None:
+        obj.shape_key_clear()
     _purge([], actions)
 
 
 def leave_edit_mode() -> None:
-    """Back to object mode, whichever mode the active object is in: what is being edited cannot be exchanged."""
+    """Put the active object into object mode: data cannot be exchanged while it is edited."""
     active = bpy.context.view_layer.objects.active
     if active is not None and active.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def remove(things: Iterable[Any]) -> None:
+def remove(objects: Iterable[Any]) -> None:
     """Delete objects with their data and actions."""
-    for thing in list(things):
-        data, action = thing.data, _action(thing)
-        bpy.data.objects.remove(thing)
+    for obj in list(objects):
+        data, action = obj.data, _action(obj)
+        bpy.data.objects.remove(obj)
         _purge([data], [action])
 
 
@@ -87,7 +87,7 @@ def _action(owner: Any) -> Any:
 
 
 def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
-    """Delete data-blocks that nothing uses any more, and the actions and background images they leave behind."""
+    """Delete unused data-blocks, and the actions and background images that only they used."""
     left = [action for action in actions if action is not None]
     for data in datas:
         if data is None or data.users:

@@ -12,15 +12,15 @@ def go_to_frame(frame: int) -> None:
 
 
 def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
-    """Set each frame of the scene in turn, with progress at the mouse pointer; in the end the frame is what it was."""
+    """Set each frame of the scene in turn, with progress at the mouse pointer; restore the current frame at the end."""
     scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
-    before, between = scene.frame_current, scene.frame_subframe
+    frame, subframe = scene.frame_current, scene.frame_subframe
     manager.progress_begin(0, max(len(numbers), 1))
     try:
-        for done, number in enumerate(numbers):
+        for index, number in enumerate(numbers):
             scene.frame_set(number)
-            manager.progress_update(done)
+            manager.progress_update(index)
             yield number
     finally:
         manager.progress_end()
-        scene.frame_set(before, subframe=between)
+        scene.frame_set(frame, subframe=subframe)

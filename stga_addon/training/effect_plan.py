@@ -1,4 +1,4 @@
-"""What was decided about a run's effects, and why (`effects.rules` decides)."""
+"""Effect plan of a run: what was decided about each effect, and why (`effects.rules` decides)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ EFFECTS = (
     "dynamic-offsets",
     "tracking",
 )
-"""Names of what `effects.rules` decides."""
+"""Names of all effects."""
 TRACKING = "tracking.npz"
-"""Name of the file in a run's folder that holds its refined parameters (`tracking`, which needs torch)."""
+"""File of a run folder with refined FLAME parameters."""
 
 
 @dataclass(frozen=True)
 class EffectDecision:
-    """One effect of a run.
+    """The decision about one effect.
 
-    effect  its name, as in `--effect NAME=on`
-    choice  what was asked for: one of CHOICES
-    on      what came of it
-    reason  why, with the figure that says so
-    cost    what it costs while it is on
+    effect  name, as in `--effect NAME=on`
+    choice  the user's: one of CHOICES
+    on      the decision
+    reason  with the figure that it rests on
+    cost    of the effect while it is on
     """
 
     effect: str

@@ -12,8 +12,9 @@ from ..files import file_size
 
 ACQUIRE_TIMEOUT_S = 0.3
 """How long a lock is waited for: a process that only asks whether it is held has it for a moment."""
-PROBE_TIMEOUT_S, PROBE_INTERVAL_S = 0.03, 0.002
-"""The same between two processes that only ask."""
+PROBE_TIMEOUT_S = 0.03
+"""The same between two processes that only ask; Blender's timer waits that long for a worker of another Blender."""
+RETRY_INTERVAL_S = 0.002
 OWNER_OFFSET = 1
 """Where the owner's process number starts: on Windows, other processes cannot read the first byte, which is locked."""
 
@@ -24,7 +25,7 @@ def hold_lock(path: Path) -> Iterator[None]:
 
     Raises BlockingIOError while another process holds it, OSError where it cannot be written or is a symbolic link.
     """
-    lock = FileLock(path, timeout=ACQUIRE_TIMEOUT_S)
+    lock = FileLock(path, timeout=ACQUIRE_TIMEOUT_S, poll_interval=RETRY_INTERVAL_S)
     try:
         lock.acquire()
     except Timeout as error:
@@ -43,7 +44,7 @@ def is_locked(path: Path) -> bool:
     if not path.is_file() or path.is_symlink():
         return False
     try:
-        with FileLock(path, timeout=PROBE_TIMEOUT_S, poll_interval=PROBE_INTERVAL_S):
+        with FileLock(path, timeout=PROBE_TIMEOUT_S, poll_interval=RETRY_INTERVAL_S):
             return False
     except Timeout:
         return True

@@ -264,6 +264,9 @@ def status_writer(folder: Path) -> Iterator[StatusWriter]:
         except StgaError as error:
             writer.finish(WorkerState.FAILED, str(error))
             raise
+        except KeyboardInterrupt:
+            writer.finish(WorkerState.CANCELLED)
+            raise
         except BaseException as error:
             writer.finish(WorkerState.FAILED, _summarize(error), traceback.format_exc())
             raise

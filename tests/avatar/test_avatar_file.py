@@ -116,7 +116,7 @@ def test_wrong_arrays_are_named(tmp_path, avatar, change, complaint):
     ("fields", "complaint"),
     [
         ({"format": "other"}, "not an avatar file"),
-        ({"version": 2}, "version 2"),
+        ({"version": 1}, "version 1"),
         ({"convention": None}, "'convention'"),
         ({"convention": "flame"}, "convention is 'flame'"),
         ({"settings": []}, "'settings'"),

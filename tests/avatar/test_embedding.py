@@ -31,16 +31,16 @@ def heron(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
 def frame_by_hand(posed: np.ndarray, neutral: np.ndarray, convention: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Origin (3,), axes as columns (3, 3) and scale of one triangle (3, 3), as the two publications define them."""
     p, q, r = posed
-    centre = (p + q + r) / 3
+    center = (p + q + r) / 3
     normal = unit(np.cross(q - p, r - p))
     if convention == "stga":
-        first = unit(p - centre)
+        first = unit(p - center)
         scale = np.sqrt(heron(*posed) / heron(*neutral))
-        return centre, np.column_stack([first, np.cross(normal, first), normal]), scale
+        return center, np.column_stack([first, np.cross(normal, first), normal]), scale
     first = unit(q - p)
     third = np.cross(first, normal)
     scale = (np.sqrt((q - p) @ (q - p)) + abs(third @ (r - p))) / 2
-    return centre, np.column_stack([first, normal, third]), scale
+    return center, np.column_stack([first, normal, third]), scale
 
 
 def scipy_rotation(wxyz: np.ndarray) -> Rotation:

@@ -148,7 +148,7 @@ def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence
 
 
 def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence):
-    """Catches a detour through world coordinates, which costs digits where the head is metres away."""
+    """Catches a detour through world coordinates, which costs digits where the head is meters away."""
     avatar = avatar_on(sequence, "stga")
     far = replace(avatar, neutral=avatar.neutral + np.float32(64))
     there = replace(far, splats=in_convention(far, "gaussian_avatars"), convention="gaussian_avatars")

@@ -38,7 +38,7 @@ def test_order_4_is_the_corners_and_midpoints_of_the_four_subtriangles(conventio
         assert distance.min(1).max() < 1e-7
 
 
-def test_inset_keeps_neighbours_apart():
+def test_inset_keeps_neighbors_apart():
     """Catches points of two triangles that coincide on their common edge and would train as one."""
     neutral = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
     faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
@@ -52,7 +52,7 @@ def test_inset_keeps_neighbours_apart():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_world_scale_is_flat_along_the_normal(convention):
-    """Catches scale in the wrong unit (triangle units against metres) or flattened along the wrong axis."""
+    """Catches scale in the wrong unit (triangle units against meters) or flattened along the wrong axis."""
     neutral, faces = random_mesh(2)
     splats = lattice_splats(neutral, faces, 2, scale_factor=0.6, flatness=0.25, convention=convention)
     frames = face_frames(neutral, faces, neutral, convention)
@@ -68,8 +68,8 @@ def test_world_scale_is_flat_along_the_normal(convention):
         np.testing.assert_allclose(sigma[face], np.tile(want, (6, 1)), rtol=1e-5)
 
 
-def test_starts_grey_and_half_transparent():
-    """Catches colour or opacity initialised after, instead of before, activation."""
+def test_starts_gray_and_half_transparent():
+    """Catches color or opacity initialized after, instead of before, activation."""
     splats = lattice_splats(*random_mesh(3), sh_degree=2)
     assert splats.sh.shape[1:] == (9, 3)
     assert not splats.sh.any()

@@ -176,8 +176,8 @@ def ascii_head(body: str) -> bytes:
         (b"", "not a PLY file"),
         (b"solid stl\nend_header\n", "not a PLY file"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n", "no complete header"),
-        (head("element vertex 1000000000000\n" + GOOD), "cut off"),
-        (head("element vertex 1\n" + GOOD) + bytes(55), "cut off"),
+        (head("element vertex 1000000000000\n" + GOOD), "truncated"),
+        (head("element vertex 1\n" + GOOD) + bytes(55), "truncated"),
         (head("element vertex -1\n" + GOOD), "no vertices"),
         (head("element vertex many\n" + GOOD), "cannot be understood"),
         (head("element vertex 0\nproperty half x\n"), "cannot be understood"),
@@ -191,7 +191,7 @@ def ascii_head(body: str) -> bytes:
         (head("element vertex 1\n" + GOOD) + b"\x00\x00\xc0\x7f" + bytes(52), "'x' holds a value that is not finite"),
         (ascii_head("element vertex 1\n" + GOOD) + b"1 2 three\n" * 9, "numbers"),
         (ascii_head("element vertex 2\n" + GOOD) + b"1 1\n" * 14, "shape"),
-        (ascii_head("element vertex 90000000\n" + GOOD) + b"1 " * 14, "cut off"),
+        (ascii_head("element vertex 90000000\n" + GOOD) + b"1 " * 14, "truncated"),
     ],
 )
 def test_broken_files_are_named(tmp_path, content, complaint):

@@ -1,4 +1,4 @@
-"""Strain of a triangle against what the deformation gradient says, and colours that follow it."""
+"""Strain of a triangle against what the deformation gradient says, and colors that follow it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +18,13 @@ FACES = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]], np.int32)
 
 
 def sheet(seed: int = 0) -> np.ndarray:
-    """Five vertices of four triangles in space, edges of a centimetre."""
+    """Five vertices of four triangles in space, edges of a centimeter."""
     flat = np.array([[0, 0, 0], [1, 0.1, 0], [0.4, 1, 0], [1.3, 1.2, 0], [-0.2, 1.8, 0]])
     bumpy = flat + np.random.default_rng(seed).normal(0, 0.1, flat.shape)
     return 0.01 * bumpy
 
 
-def coloured(neutral: np.ndarray, seed: int = 0) -> Avatar:
+def colored(neutral: np.ndarray, seed: int = 0) -> Avatar:
     splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
     color = np.random.default_rng(seed).normal(0, 0.2, (len(splats), 3, 3)).astype(np.float32)
     return Avatar(replace(splats, strain_color=color), "stga", neutral.astype(np.float32), FACES)
@@ -47,7 +47,7 @@ def test_an_affine_map_strains_by_its_own_tensor() -> None:
         assert np.abs(strain).max() > 0.05
 
 
-def test_neighbours_are_averaged_as_vertices_then_triangles() -> None:
+def test_neighbors_are_averaged_as_vertices_then_triangles() -> None:
     """Catches weights: a vertex is the plain mean of its triangles, a triangle that of its vertices."""
     neutral = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1, 0], [1, 1, 0]]) * 0.01
     faces = np.array([[0, 1, 2], [2, 1, 3]])
@@ -77,7 +77,7 @@ def test_rigid_motion_far_away_does_not_strain() -> None:
 
 @pytest.mark.parametrize("broken", ["point", "line", "posed point", "torn"])
 def test_broken_triangles_stay_finite(broken: str) -> None:
-    """Catches division by an area of zero, and colours that explode with a stretch of a thousand."""
+    """Catches division by an area of zero, and colors that explode with a stretch of a thousand."""
     neutral, posed = sheet(), sheet(3)
     if broken == "point":
         neutral[FACES[1]] = neutral[2]
@@ -95,8 +95,8 @@ def test_broken_triangles_stay_finite(broken: str) -> None:
 
 
 def test_the_file_keeps_it_and_reads_avatars_without(tmp_path: Path) -> None:
-    """Catches strain colours lost in the file, and files from before they existed being refused."""
-    avatar = coloured(sheet())
+    """Catches strain colors lost in the file, and files from before they existed being refused."""
+    avatar = colored(sheet())
     write_avatar(tmp_path / "a.npz", avatar)
     np.testing.assert_array_equal(read_avatar(tmp_path / "a.npz").splats.strain_color, avatar.splats.strain_color)
     with np.load(tmp_path / "a.npz") as arrays:
@@ -105,9 +105,9 @@ def test_the_file_keeps_it_and_reads_avatars_without(tmp_path: Path) -> None:
 
 
 def test_baking_keeps_the_picture() -> None:
-    """Catches a world PLY that forgets the colours of a deformed frame, or counts them twice."""
+    """Catches a world PLY that forgets the colors of a deformed frame, or counts them twice."""
     neutral = sheet()
-    avatar, posed = coloured(neutral), sheet(4)
+    avatar, posed = colored(neutral), sheet(4)
     pose = np.eye(4)
     pose[:3, 3] = [-0.005, -0.008, 0.1]
     camera = Camera(48, 48, 150.0, 150.0, 24.0, 24.0, pose)

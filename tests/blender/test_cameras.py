@@ -84,7 +84,7 @@ def assert_projects(camera_object, one: Camera) -> None:
 
 @pytest.mark.parametrize("fl_y", [2050.0, 1900.0, 2300.0])
 @pytest.mark.parametrize(("width", "height"), [(550, 802), (802, 550)])
-def test_projection_is_the_captures(tmp_path, width, height, fl_y):
+def test_projection_equals_the_capture_s(tmp_path, width, height, fl_y):
     """Fails when a shift has the wrong sign or unit, the sensor fits the wrong side, or pixels' aspect is lost."""
     one = camera(1, width, height, fl_y)
     capture = capture_of(tmp_path, {0: [one]})
@@ -126,8 +126,8 @@ def test_studio_head_projects_into_its_masks(shared_data):
     assert mask[row[seen], column[seen]].mean() > 0.98
 
 
-def test_each_frame_shows_its_own_image(tmp_path):
-    """Fails when the background counts the camera number as Blender's sequences would, or two images show at once."""
+def test_background_images_follow_the_frame(tmp_path):
+    """Fails when backgrounds are numbered by camera as Blender's image sequences would, or two are visible at once."""
     capture = capture_of(tmp_path, {5: [camera(0)] * 3, 8: [camera(1)] * 3})
     cameras = import_cameras(capture, capture_root(tmp_path))
     for frame, timestep in ((1, 3), (3, 3), (4, 4), (5, 5), (9, 5)):
@@ -140,8 +140,8 @@ def test_each_frame_shows_its_own_image(tmp_path):
             assert imported.data.show_background_images
 
 
-def test_missing_images_are_told(tmp_path):
-    """Fails when cameras without images cannot be imported, or nobody hears of the gap."""
+def test_missing_images_are_reported(tmp_path):
+    """Fails when cameras without images cannot be imported, or missing images give no warning."""
     capture = capture_of(tmp_path, {0: [camera()] * 3})
     (tmp_path / "images" / "00004_00.png").unlink()
     said = []
@@ -151,8 +151,8 @@ def test_missing_images_are_told(tmp_path):
     assert "00004_00.png" in said[0]
 
 
-def test_importing_again_replaces(tmp_path):
-    """Fails when a second import doubles cameras or images, or keeps a camera that the capture has no more."""
+def test_second_import_replaces_the_first(tmp_path):
+    """Fails when a second import duplicates cameras or images, or keeps a camera that the capture lost."""
     root = capture_root(tmp_path)
     first = import_cameras(capture_of(tmp_path, {0: [camera(0), camera(4)], 1: [camera(1)] * 2}), root)
     counts = [len(blocks) for blocks in (bpy.data.objects, bpy.data.cameras, bpy.data.images, bpy.data.actions)]
@@ -166,8 +166,8 @@ def test_importing_again_replaces(tmp_path):
     assert len(bpy.data.cameras) == 1
 
 
-def test_the_scene_is_configured_only_when_asked(tmp_path):
-    """Fails when an import changes the render settings by itself, or configuring misses one of them."""
+def test_scene_is_configured_on_request_only(tmp_path):
+    """Fails when an import changes render settings, or configuring the scene misses one of them."""
     scene = bpy.context.scene
     scene.view_settings.view_transform = "AgX"
     before = (scene.render.resolution_x, scene.frame_start, scene.camera)
@@ -185,8 +185,8 @@ def test_the_scene_is_configured_only_when_asked(tmp_path):
     assert cameras[1].name in said[0]
 
 
-def test_changing_intrinsics_are_told(tmp_path):
-    """Fails when a zooming camera is imported as if it stood still, without a word."""
+def test_changing_intrinsics_are_reported(tmp_path):
+    """Fails when a zooming camera is imported with fixed intrinsics and no warning."""
     zoomed = replace(camera(), fl_x=1500.0)
     said = []
     import_cameras(capture_of(tmp_path, {0: [camera(), zoomed]}), capture_root(tmp_path), warn=said.append)

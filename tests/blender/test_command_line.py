@@ -1,6 +1,7 @@
 """`blender --background head.blend --command stga …`: commands about the head of the open file."""
 
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -163,3 +164,28 @@ def test_training_is_the_panels(stga, bare, folder, tmp_path):
     for other in others:
         for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_path, monkeypatch, capsys):
+    """Catches a training environment that can be chosen in the preferences' dialog alone, or is not used afterwards."""
+    operators, worker = extension.operators.environment, extension.stga_addon.worker.environment
+    command = import_module(f"{extension.__name__}.stga_addon.cli.environment")
+    monkeypatch.setenv(command.FOLDER_VARIABLE, "")  # restored after the test
+    monkeypatch.delenv(worker.PYTHON_VARIABLE, raising=False)
+    place = tmp_path / "environment"
+    for module in (operators, extension.operators.command_line):
+        monkeypatch.setattr(module, "environment_folder", lambda create=False: place)
+    monkeypatch.setattr(worker, "check_python", lambda python: "good")
+    assert stga("environment", "use", sys.executable) == 0
+    assert capsys.readouterr().out == f"{sys.executable}: good\n"
+    assert operators.training_python(bpy.context) == sys.executable
+    assert operators.has_training_python(bpy.context)
+    monkeypatch.setenv(worker.PYTHON_VARIABLE, "/farm/python")
+    assert operators.training_python(bpy.context) == "/farm/python"
+    assert operators.training_python(bpy.context, "/given/python") == "/given/python"
+    monkeypatch.delenv(worker.PYTHON_VARIABLE)
+    assert stga("environment", "remove") == 0
+    assert worker.stored_choice(place) == ""
+    if not bpy.app.online_access:
+        assert stga("environment", "make") == 2
+        assert "start it with --online-mode, or give a folder of --wheels" in capsys.readouterr().err

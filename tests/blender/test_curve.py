@@ -1,33 +1,36 @@
-"""The curve in the panel: what is painted, and when."""
+"""The accuracy curve in the panel: its image, and when it is updated."""
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from stga_addon.report.curve_image import COMING, LINE, MARGIN, SIZE, curve_image
+from stga_addon.report.curve_image import CURVE_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
-AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5}
+AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5, "ahead": 20.0, "gain": 0.8}
+OTHERS = {"ssim": 0.9, "splats": 1, "evaluation_s": 1.0, "wall_s": 1.0}
 
 
 def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
     made: list[dict[str, object]] = [
-        {"iteration": 10 * row, "seconds": float(SECONDS[row]), "psnr": float(PSNR[row])} for row in range(count)
+        {"iteration": 10 * row, "seconds": float(SECONDS[row]), "psnr": float(PSNR[row]), **OTHERS}
+        for row in range(count)
     ]
     if forecast:
         made[-1]["forecast"] = AHEAD
     return made
 
 
-def test_the_curve_is_where_the_axes_say():
+def test_curve_agrees_with_its_axes():
     """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not after the curve."""
     pixels, axes = curve_image(lines())
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
     inner = SIZE - 2 * MARGIN
-    for second, color in [(second, LINE) for second in (15, 30, 50, 75)] + [(90, COMING)]:
+    for second, color in [(second, CURVE_COLOR) for second in (15, 30, 50, 75)] + [(90, FORECAST_COLOR)]:
         column = int(MARGIN + second / 100 * inner)
         at = (column + 0.5 - MARGIN) / inner * 100
         like = np.abs(pixels[:, column, :3] - np.array(color)).sum(-1)
@@ -36,8 +39,8 @@ def test_the_curve_is_where_the_axes_say():
         assert found == pytest.approx(expected, abs=2 * (high - low) / inner)
 
 
-def test_too_little_is_no_curve():
-    """Catches a division by nothing before the first evaluations, and a flat curve without a height."""
+def test_short_and_constant_curves():
+    """Catches a division by zero before the second evaluation, and for a constant PSNR."""
     assert curve_image([]) is None
     assert curve_image(lines(1, forecast=False)) is None
     flat = [{"iteration": row, "seconds": 1.0 + row, "psnr": 30.0} for row in range(3)]
@@ -46,21 +49,32 @@ def test_too_little_is_no_curve():
     assert axes == "30 to 30.1 dB, 0 to 3 s"
 
 
-def test_it_is_painted_anew_after_every_evaluation(extension, tmp_path):
-    """Catches a picture that stays as it was, one for nothing, a panel that fails on a damaged file, and pictures that
-    are saved in the .blend file."""
+def test_preview_follows_the_evaluations(extension, tmp_path):
+    """Catches an image that is not updated, one of an empty curve, a panel that fails on a damaged file, and images
+    that are saved in the .blend file."""
     bpy = pytest.importorskip("bpy")
-    curve = extension.ui.curve
-    assert curve._update(tmp_path) is None
+    curve, monitor = extension.ui.curve, extension.operators.monitor
+    drawn = []
+    layout = SimpleNamespace(
+        column=lambda **_: SimpleNamespace(template_icon=lambda *_, **__: None, label=lambda text: drawn.append(text))
+    )
+
+    def draw() -> list[str]:
+        """Read the run's evaluations as the training monitor does, and draw; the texts below the picture."""
+        drawn.clear()
+        monitor._curves[tmp_path] = monitor._read_curve(tmp_path)
+        curve.draw_curve(layout, tmp_path)
+        return list(drawn)
+
+    assert draw() == []
     file = tmp_path / "metrics.jsonl"
     seen = []
     for count in (1, 3, 6):
         file.write_text("".join(json.dumps(line) + "\n" for line in lines(count)))
-        seen.append(curve._update(tmp_path))
-    assert seen[0] is None
-    assert seen[1] is not None
-    painted = np.array(curve._pictures[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
+        seen.append(draw())
+    assert [len(texts) for texts in seen] == [0, 1, 1]
+    painted = np.array(curve._previews[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
     np.testing.assert_allclose(painted, curve_image(lines())[0], atol=1 / 255)
     file.write_text('{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n')
-    assert curve._update(tmp_path) is None
+    assert draw() == []
     assert len(bpy.data.images) == 0

@@ -1,5 +1,6 @@
 """The render engine against `render_avatar`, through files that Blender writes."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from stga_addon.raster.cpu.project import _basis  # noqa: E402
 from stga_addon.raster.render import render as render_splats  # noqa: E402
 from stga_addon.raster.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
 from stga_addon.scene.render import engine  # noqa: E402
@@ -27,7 +29,7 @@ from .exr import read_exr  # noqa: E402
 from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
 
 WIDTH, HEIGHT = 96, 64
-SAME = 1 / 255
+TOLERANCE = 1 / 255
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +66,7 @@ def camera_at(lens: float = 60.0, **data: object):
 
 
 def textured(avatar: Avatar, scale: float = -6.0) -> Avatar:
-    """Visible splats in gentle colours."""
+    """Visible splats in muted colors."""
     rng = np.random.default_rng(5)
     count = len(avatar.splats)
     sh = rng.normal(0, 0.12, (count, 4, 3)).astype(np.float32)
@@ -94,7 +96,7 @@ def render(folder: Path) -> dict[str, np.ndarray]:
 
 
 def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
-    """(3, H, W) display values of an image with alpha, put onto a background in display values."""
+    """(3, H, W) sRGB values of an image with alpha over a gray sRGB background."""
     alpha = passes["A"]
     straight = np.stack([passes[c] for c in "RGB"]) / np.maximum(alpha, 1e-12)
     srgb = np.where(straight <= 0.0031308, straight * 12.92, 1.055 * np.maximum(straight, 0) ** (1 / 2.4) - 0.055)
@@ -102,7 +104,7 @@ def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
 
 
 def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT, focal: float | None = None) -> Camera:
-    """The camera by the textbook, in the space of the splats: focal length in pixels, shift in sensor widths."""
+    """The expected camera, in the space of the splats: focal length in pixels, shift in sensor widths."""
     bpy.context.view_layer.update()
     data = camera.data
     across = width if data.sensor_fit == "HORIZONTAL" or (data.sensor_fit == "AUTO" and width >= height) else height
@@ -116,14 +118,14 @@ def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT, foc
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 @pytest.mark.parametrize("background", [0.0, 1.0])
-def test_same_pixels_as_render(convention, background, tmp_path):
-    """Catches another camera, colour, order or pose than `stga render`'s, and alpha that does not fit the colour."""
+def test_image_equals_render_avatar(convention, background, tmp_path):
+    """Catches another camera, color, order or pose than `stga render`'s, and alpha that does not match the color."""
     avatar = textured(avatar_of(convention), -6 if convention == "stga" else -1)
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
     expected = render_avatar(avatar, evaluated_vertices(head), camera, (background,) * 3)
     assert np.abs(expected - background).max(0).mean() > 0.1, "nothing to compare"
-    assert np.abs(displayed(render(tmp_path), background) - expected).max() < SAME
+    assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
 
 
 @pytest.mark.parametrize(
@@ -135,7 +137,7 @@ def test_same_pixels_as_render(convention, background, tmp_path):
     ],
 )
 @pytest.mark.parametrize("portrait", [False, True])
-def test_cameras_are_blenders(changes, portrait, tmp_path):
+def test_camera_settings_are_applied(changes, portrait, tmp_path):
     """Catches a wrong sensor fit, shifts of the wrong sign or unit, and the resolution's percentage."""
     scene = bpy.context.scene
     width, height = (HEIGHT, WIDTH) if portrait else (WIDTH, HEIGHT)
@@ -145,12 +147,12 @@ def test_cameras_are_blenders(changes, portrait, tmp_path):
     camera = expected_camera(camera_at(45.0, **changes), shown, width, height)
     expected = render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
     assert expected.max() > 0.3
-    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME
+    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
 
 
 @pytest.mark.parametrize("crop", [False, True])
-def test_border(crop, tmp_path):
-    """Catches a border that moves the picture."""
+def test_render_region(crop, tmp_path):
+    """Catches a render region that shifts the image."""
     show(textured(avatar_of("stga")))
     camera_at()
     whole = render(tmp_path)["R"]
@@ -163,14 +165,12 @@ def test_border(crop, tmp_path):
     np.testing.assert_allclose(part if crop else part[rows, columns], whole[rows, columns], atol=1e-4)
 
 
-def test_world_colour_lies_behind(tmp_path):
-    """Catches a background that is blended in light although the splats were trained in display values."""
+def test_world_color_is_the_background(tmp_path):
+    """Catches a background that is blended in linear light although the splats were trained in sRGB."""
     scene = bpy.context.scene
     scene.render.film_transparent = False
     scene.world = bpy.data.worlds.new("world")
-    if scene.world.node_tree is None:  # Blender 4: a new world has no tree
-        scene.world.use_nodes = True
-    background = scene.world.node_tree.nodes["Background"].inputs
+    background = enable_nodes(scene.world).nodes["Background"].inputs
     background["Color"].default_value, background["Strength"].default_value = (0.4, 0.1, 0.2, 1), 0.5
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
@@ -179,11 +179,11 @@ def test_world_colour_lies_behind(tmp_path):
     expected = render_avatar(avatar, evaluated_vertices(head), camera, tuple(behind))
     passes = render(tmp_path)
     assert passes["A"].min() == 1
-    assert np.abs(displayed(passes, 0.0) - expected).max() < SAME
+    assert np.abs(displayed(passes, 0.0) - expected).max() < TOLERANCE
 
 
-def test_colours_come_out_as_trained(tmp_path):
-    """Catches colours that Standard shows otherwise than they were trained: an opaque splat of known sRGB."""
+def test_standard_view_transform_shows_trained_colors(tmp_path):
+    """Catches colors that differ from the trained ones under the Standard view transform."""
     one = random_splats(1, 1, degree=0)
     trained = np.array([0.8, 0.5, 0.1], np.float32)
     wide = replace(
@@ -227,7 +227,7 @@ def test_depth_in_metres(tmp_path):
 
 
 def test_objects_are_sorted_together(tmp_path):
-    """Catches one object painted over the other, and directions or sizes of a turned and scaled object."""
+    """Catches objects composited one after the other, and wrong directions or sizes of a transformed object."""
     rng = np.random.default_rng(6)
     scans = []
     for seed, count in ((0, 300), (1, 200)):
@@ -245,11 +245,11 @@ def test_objects_are_sorted_together(tmp_path):
     reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
     view = expected_camera(camera, bpy.data.objects["still"])
     expected = render_splats(reference, view, (0.0,) * 3)
-    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME
+    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
 
 
 def _merged(scans, spaces, eye):
-    """World splats of several, with colours for one eye: constant coefficients only."""
+    """World splats of several sets, with colors for one camera position: constant coefficients only."""
     parts = []
     for splats, space in zip(scans, spaces, strict=True):
         turn = space[:3, :3]
@@ -278,12 +278,12 @@ def test_scaled_objects(tmp_path):
     shown.scale, camera.location = (1, 1, 1), (0, 0, 1.5)
     small = render(tmp_path)
     assert small["A"].max() > 0.5
-    np.testing.assert_allclose(large["A"], small["A"], atol=SAME)
-    np.testing.assert_allclose(large["R"], small["R"], atol=SAME)
+    np.testing.assert_allclose(large["A"], small["A"], atol=TOLERANCE)
+    np.testing.assert_allclose(large["R"], small["R"], atol=TOLERANCE)
 
 
-def test_strain_colours_and_antialiasing_reach_the_picture(tmp_path):
-    """Catches parts of an avatar that do not survive the way into Blender and back."""
+def test_strain_colors_and_antialiasing_are_rendered(tmp_path):
+    """Catches parts of an avatar that are lost when it is stored in Blender and read back."""
     avatar = textured(avatar_of("stga"), -8.5)
     colors = np.random.default_rng(4).normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, strain_color=colors), antialiased=True)
@@ -292,11 +292,11 @@ def test_strain_colours_and_antialiasing_reach_the_picture(tmp_path):
     plain = replace(avatar, splats=replace(avatar.splats, strain_color=None), antialiased=False)
     expected, without = (render_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3) for a in (avatar, plain))
     assert np.abs(expected - without).max() > 0.05
-    assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < SAME
+    assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < TOLERANCE
 
 
-def test_display_settings_count(tmp_path):
-    """Catches settings that only the viewport obeys."""
+def test_display_settings_apply_to_renders(tmp_path):
+    """Catches settings that only affect the viewport."""
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
@@ -317,18 +317,18 @@ def test_display_settings_count(tmp_path):
     for name, (value, default, splats) in cases.items():
         set_input(shown, name, value)
         expected = render_avatar(replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3)
-        assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < SAME, name
+        assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE, name
         set_input(shown, name, default)
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
-    grey = displayed(render(tmp_path), 0.0)
+    gray = displayed(render(tmp_path), 0.0)
     assert (
-        np.ptp(grey, axis=0).mean()
+        np.ptp(gray, axis=0).mean()
         < np.ptp(render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3), axis=0).mean()
     )
 
 
-def test_only_what_is_visible_is_drawn(tmp_path):
-    """Catches hidden objects in the picture, and instances of a collection left out of it."""
+def test_only_visible_objects_are_rendered(tmp_path):
+    """Catches hidden objects in the image, and missing collection instances."""
     splats = replace(
         random_splats(1, 50), xyz=np.zeros((50, 3), np.float32), log_scale=np.full((50, 3), -4, np.float32)
     )
@@ -372,15 +372,15 @@ def _png(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])
-def test_cameras_that_cannot_be_drawn_through(kind):
-    """Catches a picture that is silently of another kind than the camera."""
+def test_unsupported_cameras_are_refused(kind):
+    """Catches a perspective image from a camera of another type."""
     if kind is not None:
         camera_at(type=kind)
     with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"):
         bpy.ops.render.render()
 
 
-def test_a_head_that_was_changed_is_one_sentence():
+def test_changed_topology_is_refused():
     """Catches splats scattered over a subdivided mesh, and a traceback."""
     shown, head = show(avatar_of("stga", 10))
     camera_at()
@@ -392,8 +392,8 @@ def test_a_head_that_was_changed_is_one_sentence():
         bpy.ops.render.render()
 
 
-def test_panels_forget_the_engine():
-    """Catches panels that keep an engine's name after it is gone."""
+def test_panels_drop_the_engine_on_unregister():
+    """Catches panels that still list the engine after it was unregistered."""
 
     def panels() -> list[str]:
         every = bpy.types.Panel.__subclasses__()
@@ -402,3 +402,28 @@ def test_panels_forget_the_engine():
     engine.unregister()
     assert not panels()
     engine.register(no_python)
+
+
+def test_interpreter_is_looked_up_by_the_main_thread(monkeypatch):
+    """Catches preferences, which belong to the main thread, read from a render thread, and an error that is lost."""
+    monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
+    answers, callers = [StgaError("no environment"), "python"], []
+
+    def find() -> str:
+        callers.append(threading.current_thread())
+        answer = answers.pop(0)
+        if isinstance(answer, StgaError):
+            raise answer
+        return answer
+
+    interpreter = engine.Interpreter(find)
+    interpreter.update()
+    with pytest.raises(StgaError, match="no environment"):
+        interpreter.path()
+    interpreter.update()
+    found: list[str] = []
+    thread = threading.Thread(target=lambda: found.append(interpreter.path()))
+    thread.start()
+    thread.join()
+    assert found == ["python"]
+    assert callers == [threading.main_thread()] * 2

@@ -45,14 +45,14 @@ def quaternion(axis_angle: np.ndarray) -> np.ndarray:
     return np.array([np.cos(angle / 2), *(np.sin(angle / 2) / angle * axis_angle)])
 
 
-def test_tracked_frames_are_the_forward_pass(source):
+def test_tracked_frames_equal_the_forward_pass(source):
     """Fails when a joint, a corrective, a weight, a rotation's sense or the translation is not FLAME's."""
     sequence = flame_sequence(flame_model())
     assert_parity(import_head(motion_capture(sequence, source)), sequence)
 
 
-def test_poses_set_by_hand_are_the_forward_pass(source):
-    """Fails when only the imported frames fit: baked pivots, correctives without drivers, unnormalised quaternions."""
+def test_poses_set_by_hand_equal_the_forward_pass(source):
+    """Fails when only imported frames match: fixed joints, correctives without drivers, unnormalized quaternions."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
     rig, keys = rig_of(head), head.data.shape_keys
@@ -69,7 +69,7 @@ def test_poses_set_by_hand_are_the_forward_pass(source):
 
 
 def test_small_rotations_and_offsets_do_not_snap(source):
-    """Fails when drivers keep the keyframes they are born with, to which results under 1e-4 snap."""
+    """Fails when new drivers keep their default keyframes, to which Blender snaps results below 1e-4."""
     model = flame_model()
     sequence = flame_sequence(model)
 
@@ -84,7 +84,7 @@ def test_small_rotations_and_offsets_do_not_snap(source):
 
 
 def test_correctives_of_moving_joints_only(source):
-    """Fails when joints that stay still get shape keys and drivers all the same, or moving ones lose theirs."""
+    """Fails when joints without rotation get shape keys and drivers, or rotating ones lose theirs."""
     sequence = flame_sequence(flame_model())
 
     def frame(timestep: int):
@@ -140,7 +140,7 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
         np.testing.assert_allclose(at_frame(head, timestep + 0.5), expected, atol=TOLERANCE)
 
 
-def test_every_slider_is_there(source):
+def test_all_components_have_sliders(source):
     """Fails when a component that another person's motion needs has no key, or a slider ends where faces do not."""
     model = flame_model(identity=12)
     sequence = flame_sequence(model)
@@ -161,7 +161,7 @@ def test_every_slider_is_there(source):
     assert_parity(head, sparse)
 
 
-def test_identity_sliders_are_another_person(source):
+def test_identity_sliders_move_the_joints(source):
     """Fails when joints stay where the tracked person has them, or the sliders count from FLAME's mean face."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
@@ -202,8 +202,8 @@ def test_the_published_topology_with_teeth(source, shared_data):
     np.testing.assert_allclose(at_frame(head, 2), sequence_mesh(grown, 2), atol=1e-5)
 
 
-def test_joints_that_stay_need_no_helper_bones(source):
-    """Fails when bones are cluttered with helpers where no expression moves a joint."""
+def test_fixed_joints_have_no_helper_bones(source):
+    """Fails when joints that no slider displaces get helper bones."""
     model = flame_model()
     model.shapedirs[model.j_regressor.any(axis=0)] = 0
     sequence = flame_sequence(model)
@@ -215,7 +215,7 @@ def test_joints_that_stay_need_no_helper_bones(source):
 
 
 def test_offsets_per_frame_become_keys(source):
-    """Fails when dynamic_offset is dropped, does not move the joints, or comes without a word."""
+    """Fails when dynamic_offset is dropped, does not move the joints, or is added without a warning."""
     sequence = flame_sequence(flame_model(), dynamic=True)
     said = []
     head = import_head(motion_capture(sequence, source), warn=said.append)
@@ -224,8 +224,8 @@ def test_offsets_per_frame_become_keys(source):
     assert_parity(head, sequence)
 
 
-def test_coefficients_beyond_the_sliders_are_told(source):
-    """Fails when a mesh that cannot be shown right is shown without a word."""
+def test_coefficients_beyond_the_slider_range_are_reported(source):
+    """Fails when clamped coefficients change the mesh without a warning."""
     sequence = flame_sequence(flame_model())
 
     def frame(timestep: int):
@@ -235,7 +235,7 @@ def test_coefficients_beyond_the_sliders_are_told(source):
     said = []
     import_head(motion_capture(replace(sequence, frame=frame), source), warn=said.append)
     assert len(said) == 1
-    assert "expr 7" in said[0]
+    assert "expression 7" in said[0]
     assert "frame 5" in said[0]
 
 
@@ -257,7 +257,7 @@ def test_a_flame_capture_imports_as_a_rig(tmp_path):
 
 
 def test_importing_again_replaces_the_rig(source):
-    """Fails when a second import doubles rig, modifier or drivers, or leaves actions behind."""
+    """Fails when a second import duplicates rig, modifier or drivers, or leaves unused actions."""
     first = import_head(motion_capture(flame_sequence(flame_model(), dynamic=True), source), warn=lambda sentence: None)
     rig = rig_of(first)
     counts = [len(blocks) for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)]
@@ -272,7 +272,7 @@ def test_importing_again_replaces_the_rig(source):
     assert_parity(head, sequence)
 
 
-def test_the_rig_keeps_what_was_active(source):
+def test_adding_a_rig_keeps_the_active_object(source):
     """Fails when making bones, which needs edit mode, leaves another object active or a stray object behind."""
     mine = bpy.data.objects.new("mine", None)
     bpy.context.scene.collection.objects.link(mine)

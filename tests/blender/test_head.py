@@ -11,6 +11,7 @@ from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.compat import SLOTTED_ACTIONS  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
@@ -27,7 +28,7 @@ def block_counts() -> dict[str, int]:
     return {kind: len(getattr(bpy.data, kind)) for kind in kinds}
 
 
-def test_every_frame_shows_its_timestep(tmp_path):
+def test_each_frame_evaluates_to_its_timestep(tmp_path):
     """Fails when a key is off by a frame, neighbours leak into a frame, or gaps in the timesteps shift keys."""
     capture = mesh_capture(tmp_path, timesteps=(2, 3, 7, 8))
     head = import_head(capture)
@@ -39,7 +40,7 @@ def test_every_frame_shows_its_timestep(tmp_path):
     np.testing.assert_allclose(at_frame(head, 30), capture.mesh(8), atol=1e-7)
 
 
-def test_one_timestep_holds_everywhere(tmp_path):
+def test_single_timestep_applies_to_all_frames(tmp_path):
     """Fails when a capture of one timestep has no keyframe that keeps its mesh."""
     capture = mesh_capture(tmp_path, timesteps=(5,))
     head = import_head(capture)
@@ -56,7 +57,7 @@ def test_studio_head_evaluates_to_its_tracked_meshes(shared_data):
         np.testing.assert_allclose(at_frame(head, timestep), capture.mesh(timestep), atol=1e-6)
 
 
-def test_the_capture_stands_upright(tmp_path):
+def test_up_axis_is_z(tmp_path):
     """Fails when the capture's up (y) is not Blender's (z), or when the head is mirrored on the way."""
     head = import_head(mesh_capture(tmp_path, timesteps=(1,)), name="anna")
     bpy.context.view_layer.update()
@@ -77,8 +78,8 @@ def test_faces_and_regions_keep_their_order(tmp_path):
     assert members == capture.regions["mouth"].tolist()
 
 
-def test_importing_again_replaces(tmp_path):
-    """Fails when a second import doubles the head, leaves old blocks behind, or cuts off what points to the head."""
+def test_second_import_replaces_the_first(tmp_path):
+    """Fails when a second import duplicates the head, leaves unused data-blocks, or breaks references to the head."""
     first = import_head(mesh_capture(tmp_path))
     first.modifiers.new("artist's own", "SMOOTH").iterations = 0
     follower = bpy.data.objects.new("follower", None)
@@ -93,7 +94,7 @@ def test_importing_again_replaces(tmp_path):
     assert list(second[tags.TIMESTEPS]) == [1, 2]
 
 
-def test_importing_again_while_editing(tmp_path):
+def test_second_import_in_edit_mode(tmp_path):
     """Fails when the mesh is exchanged under edit mode, which writes the old mesh back on leaving it."""
     head = import_head(mesh_capture(tmp_path))
     bpy.context.view_layer.objects.active = head
@@ -104,15 +105,15 @@ def test_importing_again_while_editing(tmp_path):
     np.testing.assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
 
 
-def test_two_captures_stand_side_by_side(tmp_path):
-    """Fails when the second capture is taken for a new import of the first."""
+def test_two_captures_are_imported_separately(tmp_path):
+    """Fails when importing a second capture replaces the first."""
     one, other = import_head(mesh_capture(tmp_path / "one")), import_head(mesh_capture(tmp_path / "other"))
     assert one != other
     assert one.parent != other.parent
 
 
-def test_a_rig_goes_when_the_capture_has_none_any_more(tmp_path):
-    """Fails when a folder that was FLAME and is a mesh capture now keeps an armature that deforms the new mesh."""
+def test_rig_is_removed_with_the_capture_s_flame_parameters(tmp_path):
+    """Fails when a folder that changed from FLAME to meshes keeps an armature that deforms the new mesh."""
     source = tmp_path / "capture"
     import_head(motion_capture(flame_sequence(flame_model()), source))
     capture = mesh_capture(source)
@@ -122,8 +123,8 @@ def test_a_rig_goes_when_the_capture_has_none_any_more(tmp_path):
     np.testing.assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
 
 
-def test_a_broken_timestep_leaves_the_scene_as_it_was(tmp_path):
-    """Fails when an unreadable mesh half-way leaves half a head in the scene."""
+def test_unreadable_timestep_leaves_the_scene_unchanged(tmp_path):
+    """Fails when a mesh that cannot be read leaves a partly imported head in the scene."""
     capture = mesh_capture(tmp_path)
 
     def mesh(timestep: int) -> np.ndarray:
@@ -137,7 +138,7 @@ def test_a_broken_timestep_leaves_the_scene_as_it_was(tmp_path):
     assert block_counts() == before
 
 
-def test_a_saved_file_shows_the_same(tmp_path):
+def test_saved_head_evaluates_the_same(tmp_path):
     """Fails when keyframes or their binding to the shape keys do not survive saving and opening."""
     capture = mesh_capture(tmp_path)
     name = import_head(capture).name
@@ -145,3 +146,10 @@ def test_a_saved_file_shows_the_same(tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
     np.testing.assert_allclose(at_frame(bpy.data.objects[name], 7), capture.mesh(7), atol=1e-7)
+
+
+@pytest.mark.skipif(not SLOTTED_ACTIONS, reason="actions have no layers before Blender 4.4")
+def test_action_layers_have_blender_s_name(tmp_path):
+    """Fails when the action's layer, which artists see, is named after something in the code."""
+    head = import_head(mesh_capture(tmp_path))
+    assert [layer.name for layer in head.data.shape_keys.animation_data.action.layers] == ["Layer"]

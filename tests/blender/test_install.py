@@ -1,4 +1,4 @@
-"""The built zip, installed the way a person installs it: into a fresh Blender profile, in a process of its own."""
+"""The built zip, installed as a user installs it: into a new Blender profile, in its own process."""
 
 import json
 import os
@@ -57,13 +57,13 @@ def test_manifest_and_package_agree():
     assert manifest["wheels"] == [f"./wheels/{name}" for name in WHEELS]
 
 
-def test_blender_finds_nothing_to_complain_about(zip_file, tmp_path):
+def test_blender_validates_the_zip(zip_file, tmp_path):
     """Catches a manifest that Blender's extension platform refuses."""
     assert "error" not in blender_ext("validate", zip_file, home=tmp_path).lower()
 
 
 def test_same_files_as_blenders_own_build(zip_file, tmp_path):
-    """Catches exclude patterns that this build reads otherwise than Blender does."""
+    """Catches exclude patterns that this build and Blender interpret differently."""
     blender_ext("build", "--source-dir", ROOT, "--output-filepath", tmp_path / "reference.zip", home=tmp_path)
     names, reference = (set(zipfile.ZipFile(path).namelist()) for path in (zip_file, tmp_path / "reference.zip"))
     assert names == reference
@@ -91,13 +91,13 @@ def test_zip_holds_what_the_extension_runs(zip_file):
 
 
 def test_equal_sources_give_an_equal_zip(zip_file, tmp_path):
-    """Catches times, orders and permissions of this machine in the zip."""
+    """Catches times, order or permissions of this computer in the zip."""
     for path in extension_files(ROOT, read_manifest(ROOT)):
         assert path.is_file()
     assert build_zip(tmp_path).read_bytes() == zip_file.read_bytes()
 
 
-def test_a_folder_that_is_no_checkout_is_refused(tmp_path):
+def test_other_folders_are_refused(tmp_path):
     """Catches an empty zip."""
     with pytest.raises(StgaError, match=r"blender_manifest\.toml: cannot be read"):
         build_zip(tmp_path / "dist", root=tmp_path)

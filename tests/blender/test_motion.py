@@ -1,4 +1,4 @@
-"""Another person's motion on a head, and a head's own motion read back, against FLAME's forward pass."""
+"""Motion applied to a head, and sampled from the scene, against FLAME's forward pass."""
 
 import re
 from dataclasses import replace
@@ -62,8 +62,8 @@ def curves_of(owner, action) -> dict:
     return {(c.data_path, c.array_index): [tuple(p.co) for p in c.keyframe_points] for c in found}
 
 
-def test_the_other_moves_this_head(head, own, other):
-    """Fails when the other's identity comes along, a frame is off, or a coefficient that was in use stays behind."""
+def test_applied_motion_equals_the_forward_pass(head, own, other):
+    """Fails when the other's identity is applied too, a frame is shifted, or an old coefficient keeps its value."""
     apply_motion(head, retimed(other), 11, "other")
     for index in range(4):
         expected = mesh(own, other.frame(index))
@@ -73,8 +73,8 @@ def test_the_other_moves_this_head(head, own, other):
 
 @pytest.mark.parametrize("as_strip", [False, True])
 @pytest.mark.parametrize("part", PARTS)
-def test_one_part_leaves_the_others_their_own_animation(head, own, other, part, as_strip):
-    """Fails when a part that was not asked for is taken along, frozen, or reset."""
+def test_applying_one_part_keeps_the_other_parts(head, own, other, part, as_strip):
+    """Fails when a part that was not chosen is replaced, frozen, or reset."""
     apply_motion(head, retimed(other), 2, "other", (part,), as_strip)
     for index in range(4):
         theirs = other.frame(index)
@@ -82,7 +82,7 @@ def test_one_part_leaves_the_others_their_own_animation(head, own, other, part, 
         np.testing.assert_allclose(at_frame(head, 2 + index), mesh(own, frame), atol=TOLERANCE)
 
 
-def test_the_old_action_stays_as_it_was(head, own, other, tmp_path):
+def test_the_old_action_is_unchanged(head, own, other, tmp_path):
     """Fails when applying edits the action in place, or the old one is gone once the file is saved and opened."""
     before = [
         (owner.animation_data.action.name, curves_of(owner, owner.animation_data.action)) for owner in owners(head)
@@ -101,8 +101,8 @@ def test_the_old_action_stays_as_it_was(head, own, other, tmp_path):
     np.testing.assert_allclose(at_frame(head, 4), sequence_mesh(own, 4), atol=TOLERANCE)
 
 
-def test_strips_lie_over_what_was_there(head, own, other):
-    """Fails when a strip replaces its surroundings, or a second one the first."""
+def test_strips_override_only_their_frames(head, own, other):
+    """Fails when a strip changes frames outside it, or a second one removes the first."""
     apply_motion(head, retimed(other), 2, "once", as_strip=True)
     apply_motion(head, retimed(other), 4, "twice", as_strip=True)
     for frame, expected in ((1, own.frame(1)), (2, other.frame(0)), (4, other.frame(0)), (7, other.frame(3))):
@@ -112,8 +112,8 @@ def test_strips_lie_over_what_was_there(head, own, other):
         assert owner.animation_data.action is None
 
 
-def test_only_what_moves_gets_an_action(head, other):
-    """Fails when empty actions and strips pile up on what the chosen part does not touch."""
+def test_only_animated_data_blocks_get_an_action(head, other):
+    """Fails when data-blocks that the chosen part does not animate get empty actions and strips."""
     rig, keys = owners(head)
     own_action = keys.animation_data.action
     apply_motion(head, retimed(other), 2, "other", ("jaw",))
@@ -123,7 +123,7 @@ def test_only_what_moves_gets_an_action(head, other):
     assert len(keys.animation_data.nla_tracks) == 2
 
 
-def test_applying_to_a_head_that_nothing_animates(head, own, other):
+def test_applying_to_a_head_without_animation(head, own, other):
     """Fails when there is no action to copy or push down."""
     for owner in owners(head):
         owner.animation_data.action = None
@@ -134,8 +134,8 @@ def test_applying_to_a_head_that_nothing_animates(head, own, other):
     apply_motion(head, retimed(other), 3, "again", ("head",), as_strip=True)
 
 
-def test_tracked_offsets_do_not_ride_along(own, other, tmp_path):
-    """Fails when the vertex offsets of the own frames deform the other's expressions."""
+def test_tracked_offsets_are_zero_under_another_motion(own, other, tmp_path):
+    """Fails when the head's own per-frame vertex offsets deform another person's expressions."""
     tracked = flame_sequence(own.model, timesteps=range(1, 5), seed=1, dynamic=True)
     for as_strip in (False, True):
         head = import_head(motion_capture(tracked, tmp_path / "own.npz"), warn=lambda sentence: None)
@@ -143,8 +143,8 @@ def test_tracked_offsets_do_not_ride_along(own, other, tmp_path):
         np.testing.assert_allclose(at_frame(head, 3), mesh(tracked, other.frame(1)), atol=TOLERANCE)
 
 
-def test_what_cannot_take_a_motion_is_told_and_left_alone(head, other, tmp_path):
-    """Fails when half a motion is written, or a head without a rig ends in a traceback."""
+def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
+    """Fails when a motion is written in part, or a head without a rig raises another error than StgaError."""
     rig = rig_of(head)
     rig.pose.bones["jaw"].rotation_mode = "XYZ"
     actions = len(bpy.data.actions)
@@ -173,8 +173,8 @@ def assert_same_motion(read: FlameSequence, frames: list) -> None:
             np.testing.assert_allclose(getattr(read.frame(index), name), getattr(frame, name), atol=2e-6)
 
 
-def test_a_performance_is_read_back(head, own):
-    """Fails when a joint is read in another's space, or a translation without the joint's own movement."""
+def test_sampled_motion_equals_the_keyframes(head, own):
+    """Fails when a rotation is read in another space, or the root joint's displacement counts as translation."""
     said = []
     bpy.context.scene.frame_set(3)
     read = sample_motion(head, own, range(1, 7), warn=said.append)
@@ -184,8 +184,8 @@ def test_a_performance_is_read_back(head, own):
     assert bpy.context.scene.frame_current == 3
 
 
-def test_a_performance_by_hand_is_read_back(head, own):
-    """Fails when only keyframes count: unkeyed poses, constraints and identity sliders make the mesh too."""
+def test_sampled_motion_includes_edits_by_hand(head, own):
+    """Fails when poses without keyframes, constraints or identity sliders are ignored."""
     rig, keys = rig_of(head), head.data.shape_keys.key_blocks
     rig.animation_data.action = head.data.shape_keys.animation_data.action = None
     rig.pose.bones["neck"].rotation_quaternion = (0.9, 0.3, 0.1, 0.2)
@@ -206,8 +206,8 @@ def test_a_performance_by_hand_is_read_back(head, own):
     np.testing.assert_allclose(at_frame(head, 1), expected, atol=1e-5)
 
 
-def test_what_flame_cannot_say_is_told(head, own):
-    """Fails when an export leaves out what an artist sculpted without a word."""
+def test_deformation_that_is_no_flame_parameter_is_reported(head, own):
+    """Fails when an export leaves out sculpted shapes without a warning."""
     key = head.shape_key_add(name="sculpted", from_mix=False)
     key.data[5].co.x += 0.01
     key.value = 1.0
@@ -217,8 +217,8 @@ def test_what_flame_cannot_say_is_told(head, own):
     assert re.search(r"by up to \d+\.\d mm", said[0])
 
 
-def test_offsets_are_read_back(own, tmp_path):
-    """Fails when tracked per-frame offsets are lost on the way out."""
+def test_sampled_motion_includes_tracked_offsets(own, tmp_path):
+    """Fails when tracked per-frame offsets are missing from a sampled motion."""
     tracked = flame_sequence(own.model, timesteps=range(1, 5), seed=1, dynamic=True)
     head = import_head(motion_capture(tracked, tmp_path / "own.npz"), warn=lambda sentence: None)
     said = []

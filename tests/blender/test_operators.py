@@ -280,7 +280,7 @@ def test_more_bounces_where_cycles_needs_them(extension):
 
 
 def test_standard_view(extension):
-    """Catches a one-click cure that does not cure: AgX turns trained colours grey."""
+    """Catches a one-click cure that does not cure: AgX turns trained colors grey."""
     bpy.context.scene.view_settings.view_transform = "AgX"
     bpy.ops.stga.standard_view()
     assert bpy.context.scene.view_settings.view_transform == "Standard"
@@ -316,5 +316,5 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     )
     color = np.empty(4 * len(points.points), np.float32)
     points.attributes["stga_display_color"].data.foreach_get("color", color)
-    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_GREY).all(1)
+    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_COLOR).all(1)
     np.testing.assert_array_equal(~frozen, read_selection(scene.stga.head)[3][avatar.splats.face])

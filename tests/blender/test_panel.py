@@ -126,3 +126,14 @@ def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch,
     assert monitor.tick() is None
     assert "ZeroDivisionError" not in capsys.readouterr().err
     assert "Monitoring stopped after an unexpected error (ZeroDivisionError" in " ".join(draw(extension))
+
+
+def test_unreadable_worker_does_not_end_the_timer_silently(extension, tmp_path, monkeypatch, capsys):
+    """Catches an error about the training environment's worker that ends the monitoring of every training, unseen."""
+    monitor = extension.operators.monitor
+    running = extension.stga_addon.worker.status.WorkerState.WORKING
+    monkeypatch.setitem(monitor._snapshots, tmp_path, monitor.WorkerSnapshot(running))
+    monkeypatch.setattr(monitor, "_inspect", lambda folder: 1 / 0)
+    assert monitor.tick() is None
+    assert "ZeroDivisionError" in capsys.readouterr().err
+    assert not monitor._snapshots[tmp_path].state.is_alive

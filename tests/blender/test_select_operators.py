@@ -111,7 +111,7 @@ def materials_of(head) -> set[str]:
 
 
 def test_heat_map(folder):
-    """Catches colours on the wrong triangles, and a head that does not look as before once they are gone."""
+    """Catches colors on the wrong triangles, and a head that does not look as before once they are gone."""
     with pytest.raises(RuntimeError, match="no frame selects a triangle yet"):
         bpy.ops.stga.heat_map()
     bpy.ops.stga.select(threshold=0.0015)
@@ -123,11 +123,11 @@ def test_heat_map(folder):
     head.data.attributes[SHARE].data.foreach_get("value", share)
     np.testing.assert_allclose(share, expected, atol=1e-6)
     assert head.data.color_attributes.active_color.name == HEAT
-    colour = np.empty(12 * len(expected), np.float32)
-    head.data.attributes[HEAT].data.foreach_get("color", colour)
-    colour = colour.reshape(-1, 3, 4)
-    assert (colour == colour[:, :1]).all(), "a triangle's corners differ"
-    hottest, never = colour[expected.argmax(), 0], colour[expected.argmin(), 0]
+    color = np.empty(12 * len(expected), np.float32)
+    head.data.attributes[HEAT].data.foreach_get("color", color)
+    color = color.reshape(-1, 3, 4)
+    assert (color == color[:, :1]).all(), "a triangle's corners differ"
+    hottest, never = color[expected.argmax(), 0], color[expected.argmin(), 0]
     assert hottest[0] > 0.8 > 0.2 > never[0]
     assert materials_of(head) == {"STGA Heat Map"}
     assert bpy.ops.stga.heat_map(show=False) == {"FINISHED"}

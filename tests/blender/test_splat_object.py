@@ -122,8 +122,8 @@ def shown_name(convention: str) -> str:
     return "head splats"
 
 
-def test_splat_object_stands_where_the_head_stands():
-    """Catches a splat object that ignores the head's parent: the two would part as soon as the root turns."""
+def test_splat_object_has_the_head_s_transform():
+    """Catches a splat object that ignores the head's parent, and separates from it when the root rotates."""
     avatar = avatar_of("stga", 100)
     head = animated_head(avatar.neutral, avatar.faces)
     head.location = (0.1, 0.2, 0.3)
@@ -133,7 +133,7 @@ def test_splat_object_stands_where_the_head_stands():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_triangles_without_area_stay_finite(convention):
+def test_degenerate_triangles_stay_finite(convention):
     """Catches divisions by zero: closed eyelids and mouths fold triangles to lines and points."""
     avatar = avatar_of(convention)
     flat = avatar.neutral.copy()
@@ -159,7 +159,7 @@ def test_attributes_hold_activated_values():
 
 
 def displayed_colors(shown) -> np.ndarray:
-    """(N, 3) scene-linear colours of the displayed points."""
+    """(N, 3) scene-linear colors of the displayed points."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     points = next(i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD")
     color = np.empty(4 * len(points.points), np.float32)
@@ -180,8 +180,8 @@ def active_camera(location=(0.0, 0.0, 0.0)):
     return camera
 
 
-def test_constant_colours_are_scene_linear():
-    """Catches sRGB shown where Blender expects scene-linear, and colours that leave 0…1."""
+def test_constant_colors_are_scene_linear():
+    """Catches sRGB shown where Blender expects scene-linear, and colors outside 0…1."""
     splats = replace(random_splats(1, 300, degree=0), sh=np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3))
     expected = linear(0.5 + 0.28209479177387814 * splats.sh[:, 0])
     assert expected.min() == 0
@@ -190,7 +190,7 @@ def test_constant_colours_are_scene_linear():
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_colours_follow_the_active_camera(degree):
+def test_colors_follow_the_active_camera(degree):
     """Catches harmonics of another order or sign, and directions in the world's instead of the splats' own space."""
     kernels = pytest.importorskip("stga_addon.raster.cpu.project")
     avatar = avatar_of("stga", 400)
@@ -212,7 +212,7 @@ def test_colours_follow_the_active_camera(degree):
     np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + 0.28209479177387814 * sh[:, 0]), atol=2e-6)
 
 
-def test_colours_follow_strain():
+def test_colors_follow_strain():
     """Catches strain of another triangle, in other axes or not averaged, against numpy on the deformed mesh."""
     avatar = avatar_of("stga", 1500)
     colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3, 3)).astype(np.float32)
@@ -233,8 +233,8 @@ def test_colours_follow_strain():
     assert np.abs(seen[1] - seen[9]).max() > 0.1
 
 
-def test_no_strain_nodes_without_strain_colours():
-    """Catches the cost of strain on every avatar that does not know it."""
+def test_no_strain_nodes_without_strain_colors():
+    """Catches strain nodes, which cost playback time, for avatars without strain colors."""
     avatar = avatar_of("stga", 10)
     show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     trees = bpy.data.node_groups
@@ -307,8 +307,8 @@ def test_quads_face_the_camera_and_cover_the_ellipsoid():
     assert EXTENT == 3.0
 
 
-def test_selection_greys_what_the_frame_freezes():
-    """Catches the colouring by another frame's selection, and by neighbours of selected triangles."""
+def test_selection_grays_out_frozen_splats():
+    """Catches the selection of another frame, and triangles that count as selected next to selected ones."""
     avatar = avatar_of("stga", 1000)
     head = animated_head(avatar.neutral, avatar.faces)
     chosen = avatar.faces[:40]
@@ -317,33 +317,33 @@ def test_selection_greys_what_the_frame_freezes():
     shown = show_avatar(avatar, head)
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
 
-    def grey() -> np.ndarray:
+    def grays() -> np.ndarray:
         return np.isclose(displayed_colors(shown), splat_nodes.FROZEN_COLOR[:3]).all(1)
 
     bpy.context.scene.frame_set(5)
     assert 0 < selected.sum() < 1000
-    np.testing.assert_array_equal(grey(), ~selected)
+    np.testing.assert_array_equal(grays(), ~selected)
     bpy.context.scene.frame_set(6)
-    assert not grey().any()
+    assert not grays().any()
     bpy.context.scene.frame_set(5)
     set_input(shown, splat_nodes.SHOW_SELECTION, False)
-    assert not grey().any()
+    assert not grays().any()
     set_input(shown, splat_nodes.SELECTED_ONLY, True)
     assert len(evaluated_splats(shown)[0]) == selected.sum()
     bpy.context.scene.frame_set(6)
     assert len(evaluated_splats(shown)[0]) == 1000
 
 
-def test_a_head_of_another_topology_is_refused():
-    """Catches an avatar that would be drawn scattered over a mesh it was not trained on."""
+def test_head_of_another_topology_is_refused():
+    """Catches splats scattered over a mesh they were not trained on."""
     avatar = avatar_of("stga", 10)
     head = animated_head(avatar.neutral, avatar.faces[::-1])
     with pytest.raises(StgaError, match="trained on"):
         show_avatar(avatar, head)
 
 
-def test_world_splats_stand_where_the_file_says():
-    """Catches a transform of splats that have no triangle."""
+def test_world_splats_keep_their_coordinates():
+    """Catches world-space splats that are transformed like embedded ones."""
     splats = random_splats(1, 500)
     xyz, rotation, scale = evaluated_splats(show_world_splats(splats, "scan"))
     np.testing.assert_allclose(xyz, splats.xyz, atol=1e-7)
@@ -351,7 +351,7 @@ def test_world_splats_stand_where_the_file_says():
     np.testing.assert_allclose(scale, np.exp(splats.log_scale), rtol=1e-5)
 
 
-def test_saved_file_does_not_hold_the_trees_twice(tmp_path: Path):
+def test_trees_and_materials_are_built_once(tmp_path: Path):
     """Catches a new tree and new materials for every avatar that is shown."""
     avatar = avatar_of("stga", 10)
     head = animated_head(avatar.neutral, avatar.faces)
@@ -363,9 +363,9 @@ def test_saved_file_does_not_hold_the_trees_twice(tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", [("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False)])
-def test_a_tree_is_built_in_small_slices(kind):
-    """Catches what holds Blender up when a live preview first comes: a part that is built with another one, a large
-    tree (the time it takes grows with the square), and parts that are built again."""
+def test_trees_are_built_one_node_group_at_a_time(kind):
+    """Catches what blocks the UI when a live preview first appears: several groups built in one call, a large tree
+    (build time is quadratic), and groups that are built again."""
     built = []
     while splat_nodes.build_next_node_group(*kind):
         built.append(len(bpy.data.node_groups))

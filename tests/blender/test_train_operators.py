@@ -51,7 +51,7 @@ def tick_until(monitor, done: Callable[[], bool]) -> None:
         if done():
             return
         time.sleep(0.02)
-    raise AssertionError("waited in vain")
+    raise AssertionError("the expected state was not reached")
 
 
 @pytest.mark.slow
@@ -76,7 +76,7 @@ def test_training_in_process(extension, tmp_path, layout):
 
 
 @pytest.mark.slow
-def test_a_worker_trains_the_same(head, tmp_path):
+def test_worker_trains_the_same(head, tmp_path):
     """Catches painted groups or settings that reach the one kind of training and not the other."""
     pytest.importorskip("torch")
     chosen = {"iterations": 8, "seed": 5, "strategy": "selective"}
@@ -88,6 +88,36 @@ def test_a_worker_trains_the_same(head, tmp_path):
     painted = read_npz(tmp_path / "there/selection.npz")
     assert painted["00003"].any()
     assert not painted["00000"].any()
+
+
+@pytest.mark.slow
+def test_resume_of_another_capture_is_refused(extension, tmp_path):
+    """Catches a run that is continued on another capture, or with another principal point, and so ruined."""
+    pytest.importorskip("torch")
+    one, other = write_mesh_capture(tmp_path / "one"), write_mesh_capture(tmp_path / "other", timesteps=(0, 5))
+    run, folder = tmp_path / "run", str(tmp_path / "run")
+    bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
+    assert bpy.ops.stga.train(directory=folder, iterations=3, device="cpu") == {"FINISHED"}
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    mistakes = (
+        (other, "opencv", rf"^Error: .*run: was trained on {one} .*{other}"),
+        (one, "vhap", "was trained with principal point 'opencv', not 'vhap'"),
+    )
+    for capture, principal_point, sentence in mistakes:
+        bpy.ops.stga.import_capture(directory=str(capture), principal_point=principal_point)
+        with pytest.raises(RuntimeError, match=sentence):
+            bpy.ops.stga.train(directory=folder, resume=True)
+        assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
+    assert bpy.ops.stga.train(directory=folder, resume=True) == {"FINISHED"}
+
+
+def test_device_reaches_the_job(head, tmp_path, monkeypatch, extension):
+    """Catches a choice of device in the panel that training does not get."""
+    monkeypatch.setattr(extension.operators.train, "run_training_job", lambda run, also: run / "avatar.npz")
+    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), device="cpu") == {"FINISHED"}
+    assert extension.stga_addon.jobs.training_job.read_job(tmp_path / "run").device == "cpu"
 
 
 def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
@@ -108,7 +138,7 @@ def test_mistakes_of_training_are_sentences(head, tmp_path):
         ({"directory": ""}, "run folder: no path given"),
         ({"directory": "//run"}, "relative to the .blend file, which has not been saved yet"),
         ({"directory": str(tmp_path / "file")}, "cannot be written"),
-        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run that could be resumed"),
+        ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run"),
         ({"directory": str(tmp_path / "run"), "python": python}, "no_python: cannot be started as a Python"),
     ):
         with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
@@ -120,15 +150,15 @@ def test_mistakes_of_training_are_sentences(head, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_failing_worker_is_a_sentence(head, tmp_path):
+def test_failed_worker_is_a_sentence(head, tmp_path):
     """Catches a background render farm that takes a failed training for a finished one."""
     (tmp_path / "capture/transforms_train.json").write_text("{")
     with pytest.raises(RuntimeError, match=r"^Error: .*transforms_train\.json: is not valid JSON"):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=sys.executable)
 
 
-def test_a_living_worker_is_not_disturbed(worker):
-    """Catches a second worker in the same folder, and a dismissed job whose worker goes on unseen."""
+def test_running_worker_cannot_be_replaced_or_dismissed(worker):
+    """Catches a second worker in the same folder, and a dismissed training whose worker continues."""
     assert not bpy.ops.stga.train.poll()
     assert not bpy.ops.stga.dismiss_training.poll()
     assert bpy.ops.stga.cancel_training() == {"FINISHED"}
@@ -140,6 +170,28 @@ def test_a_living_worker_is_not_disturbed(worker):
     assert not (worker.run / "job").exists()
     assert bpy.context.scene.stga.training_run == ""
     assert not bpy.ops.stga.dismiss_training.poll()
+
+
+def test_dismiss_removes_a_jobs_files_only(worker):
+    """Catches a Dismiss that deletes what a user put into the job's folder."""
+    (worker.folder / "notes.txt").write_text("mine")
+    worker.leave()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
+
+
+def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
+    """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no training wrote."""
+    folder = tmp_path / "documents/job"
+    folder.mkdir(parents=True)
+    names = ["job.json", "preview.npz", "selection.npz", "status.json", "worker.log"]
+    for name in names:
+        (folder / name).write_text("[]")
+    bpy.context.scene.stga.training_run = str(tmp_path / "documents")
+    extension.operators.monitor.tick()
+    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert bpy.context.scene.stga.training_run == ""
 
 
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
@@ -173,7 +225,7 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_the_end_reaches_the_scene_once(extension, worker, wanted):
+def test_result_reaches_the_scene_once(extension, worker, wanted):
     """Catches a result that is not shown, shown although it is not wanted, or shown again at every reopening."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
     scene.stga.show_result = wanted
@@ -190,7 +242,7 @@ def test_the_end_reaches_the_scene_once(extension, worker, wanted):
 
 
 def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
-    """Catches a job that a saved file forgets: its worker goes on while Blender is closed, and may end meanwhile."""
+    """Catches a training that a saved file forgets: its worker continues, and may end, while Blender is closed."""
     monitor = extension.operators.monitor
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -206,8 +258,16 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     assert bpy.context.scene.stga.splats is not None
 
 
-def test_a_blend_that_moved(extension, worker, tmp_path):
-    """Catches a job that is lost when file and run move together, and silence when the file moves alone."""
+def test_cancel_right_after_reopening(extension, worker, tmp_path):
+    """Catches a script that cannot cancel a training of the file it opened: without a window no timer has read it."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    assert bpy.ops.stga.cancel_training() == {"FINISHED"}
+    assert worker.update(0.5, "Training")
+
+
+def test_moved_blend_file(extension, worker, tmp_path):
+    """Catches a training that is lost when file and run move together, and silence when the run is gone."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
     worker.leave()
     scene.stga.run_folder, scene.stga.show_result = "//run", False
@@ -233,8 +293,8 @@ def test_undo_does_not_lose_the_worker(extension, worker):
     assert scene.stga.training_run == str(worker.run)
 
 
-def test_a_worker_that_died(extension, worker):
-    """Catches a progress bar that stands still for ever, and a report that says less than is known."""
+def test_failed_worker_ends_the_timer(extension, worker):
+    """Catches a progress bar that never ends, and a failure without the end of the log."""
     monitor = extension.operators.monitor
     (worker.folder / "worker.log").write_text("Killed\n")
     write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
@@ -244,8 +304,8 @@ def test_a_worker_that_died(extension, worker):
     assert monitor.tick() is None
 
 
-def test_a_file_that_was_made_without_the_panel(extension, tmp_path):
-    """Catches a demo.blend that an artist opens to an empty panel, and a choice of theirs that is not kept."""
+def test_file_made_without_the_panel(extension, tmp_path):
+    """Catches a demo.blend that opens with an empty panel, and a chosen head that is replaced at loading."""
     folder = write_mesh_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder))
     name = bpy.context.scene.stga.head.name

@@ -29,7 +29,7 @@ def random_selection(capture, share: float = 0.2, seed: int = 0) -> dict[int, np
 
 
 def enclosed(selected: np.ndarray, faces: np.ndarray) -> list[bool]:
-    """`closure` in plain sets."""
+    """`closure` computed with sets."""
     touched = {int(vertex) for face, chosen in zip(faces, selected, strict=True) if chosen for vertex in face}
     return [set(face.tolist()) <= touched for face in faces]
 
@@ -46,7 +46,7 @@ def test_reading_back_gives_the_closure(capture, head):
         assert (read[timestep] >= selected).all()
 
 
-def test_reading_and_writing_again_changes_nothing(capture, head):
+def test_round_trip_is_idempotent(capture, head):
     """Fails when each round trip grows the selection, or adds groups beside the old ones."""
     write_selection(head, random_selection(capture))
     once, names = read_selection(head), sorted(group.name for group in head.vertex_groups)
@@ -56,8 +56,8 @@ def test_reading_and_writing_again_changes_nothing(capture, head):
     assert all((once[timestep] == again[timestep]).all() for timestep in once)
 
 
-def test_a_new_selection_replaces_the_old_and_nothing_else(tmp_path):
-    """Fails when stale frames keep their groups, or the rig's own vertex groups are lost with them."""
+def test_new_selection_replaces_only_selection_groups(tmp_path):
+    """Fails when old timesteps keep their groups, or the rig's vertex groups are removed with them."""
     sequence = flame_sequence(flame_model(), timesteps=(1, 2))
     head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
     bones = {group.name: [head.vertex_groups[group.name].weight(3)] for group in head.vertex_groups}
@@ -72,8 +72,8 @@ def test_a_new_selection_replaces_the_old_and_nothing_else(tmp_path):
     assert read[2].sum() == 4
 
 
-def test_painted_weights_count_from_one_half(capture, head):
-    """Fails when an artist's brush strokes are not read: added, softened and erased vertices."""
+def test_weights_of_one_half_and_more_select(capture, head):
+    """Fails when painted changes are not read: added, softened and erased vertices."""
     group = head.vertex_groups.new(name=tags.group_name(3))
     group.add([10, 11, 12, 13], 1.0, "REPLACE")
     group.add([13], 0.4, "REPLACE")
@@ -84,15 +84,15 @@ def test_painted_weights_count_from_one_half(capture, head):
     assert not read_selection(head)[3].any()
 
 
-def test_only_our_spelling_names_a_timestep():
-    """Fails when an artist's group is taken for a selection, and then deleted."""
+def test_group_names_of_timesteps():
+    """Fails when an artist's own group counts as a selection, and is deleted with it."""
     assert tags.group_timestep("stga_12") == 12
     for name in ("stga_012", "stga_", "stga_-1", "stga_1_0", "stga_region_nose", "12", "jaw", "stga_٣"):
         assert tags.group_timestep(name) is None
 
 
 def test_edit_mode_and_wrong_sizes_are_refused(capture, head):
-    """Fails when Blender's own error, or a half-written selection, reaches the person."""
+    """Fails when another error than StgaError is raised, or a selection is written in part."""
     write_selection(head, random_selection(capture))
     before = read_selection(head)
     with pytest.raises(StgaError, match=r"timestep 3 has shape \(5,\)"):

@@ -22,7 +22,7 @@ def ball() -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose(camera: int) -> np.ndarray:
-    """Camera-to-world, OpenGL axes, one metre from the ball and looking at it."""
+    """Camera-to-world, OpenGL axes, one meter from the ball and looking at it."""
     angle = 0.4 * camera - 0.5
     matrix = np.eye(4)
     matrix[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -38,7 +38,7 @@ def silhouette() -> np.ndarray:
 
 
 def picture(timestep: int, camera: int) -> np.ndarray:
-    """(HEIGHT, WIDTH, 3) uint8 on white, of a colour that only this view has."""
+    """(HEIGHT, WIDTH, 3) uint8 on white, of a color that only this view has."""
     return np.where(silhouette()[..., None], [10 * timestep, 10 * camera, 128], 255).astype(np.uint8)
 
 

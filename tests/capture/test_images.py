@@ -30,7 +30,7 @@ def saved(path: Path, pixels: np.ndarray) -> Path:
     return path
 
 
-def test_plain_colour(tmp_path: Path) -> None:
+def test_plain_color(tmp_path: Path) -> None:
     """Catches swapped channels or a transposed image."""
     image = read_image(view_of(saved(tmp_path / "x.png", COLOUR)))
     np.testing.assert_array_equal(image, COLOUR)
@@ -47,8 +47,8 @@ def test_transparency_is_laid_over_the_background(tmp_path: Path, background: tu
     np.testing.assert_array_equal(read_mask(view), ALPHA)
 
 
-def test_grey_and_palette(tmp_path: Path) -> None:
-    """Catches grey, black-and-white, grey with alpha and palette images read with a missing channel axis."""
+def test_gray_and_palette(tmp_path: Path) -> None:
+    """Catches gray, black-and-white, gray with alpha and palette images read with a missing channel axis."""
     np.testing.assert_array_equal(read_image(view_of(saved(tmp_path / "l.png", GREY))), np.dstack([GREY] * 3))
     bits = GREY > 127
     np.testing.assert_array_equal(read_image(view_of(saved(tmp_path / "1.png", bits)))[..., 0], bits * 255)
@@ -62,7 +62,7 @@ def test_grey_and_palette(tmp_path: Path) -> None:
 
 
 def test_sixteen_bits(tmp_path: Path) -> None:
-    """Catches 16-bit grey cut off at 255, which turns nearly everything white."""
+    """Catches 16-bit gray cut off at 255, which turns nearly everything white."""
     wide = RANDOM.integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16)
     saved(tmp_path / "x.png", wide)
     image = read_image(view_of(tmp_path / "x.png"))
@@ -70,13 +70,13 @@ def test_sixteen_bits(tmp_path: Path) -> None:
 
 
 def test_masks(tmp_path: Path) -> None:
-    """Catches a mask read as anything but grey, and a mask invented where there is none."""
+    """Catches a mask read as anything but gray, and a mask invented where there is none."""
     image = saved(tmp_path / "x.png", COLOUR)
     assert read_mask(view_of(image)) is None
-    grey = read_mask(view_of(image, saved(tmp_path / "m.png", GREY)))
-    np.testing.assert_array_equal(grey, GREY)
-    coloured = read_mask(view_of(image, saved(tmp_path / "c.png", np.dstack([GREY] * 3))))
-    np.testing.assert_array_equal(coloured, GREY)
+    gray = read_mask(view_of(image, saved(tmp_path / "m.png", GREY)))
+    np.testing.assert_array_equal(gray, GREY)
+    colored = read_mask(view_of(image, saved(tmp_path / "c.png", np.dstack([GREY] * 3))))
+    np.testing.assert_array_equal(colored, GREY)
 
 
 def test_size_mismatch_names_both(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_size_mismatch_names_both(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.6, 0.95])
 def test_truncated_images(tmp_path: Path, suffix: str, kept: float) -> None:
-    """Catches a download that broke off being read as a half-grey image."""
+    """Catches a download that broke off being read as a half-gray image."""
     path = tmp_path / f"x{suffix}"
     big = RANDOM.integers(0, 256, (64, 64, 3), np.uint8)
     saved(path, big)

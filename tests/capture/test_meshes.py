@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stga_addon.capture.meshes import CACHE_BYTES, read_mesh, read_regions, remembered, tracked_meshes
+from stga_addon.capture.meshes import CACHE_BYTES, cached_meshes, read_mesh, read_regions, tracked_meshes
 from stga_addon.capture.rigid import weighted_procrustes, without_head_motion
 from stga_addon.errors import StgaError
 
@@ -47,7 +47,7 @@ def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
 
 
 def test_obj_dialects(tmp_path: Path) -> None:
-    """Catches what exporters really write: colours, texture corners, several materials and objects, quads,
+    """Catches what exporters really write: colors, texture corners, several materials and objects, quads,
     negative indices, Windows line ends, continued lines. trimesh would regroup the triangles by material.
     """
     lines = ["mtllib x.mtl", "o a", *(f"v {i} {i * i} 0 1 0 0" for i in range(5)), "vt 0 0", "vn 0 0 1", "usemtl b"]
@@ -125,16 +125,18 @@ def test_topology_must_not_change(tmp_path: Path) -> None:
     vertices, faces = factory.ball()
     swapped = faces.copy()
     swapped[[7, 8]] = swapped[[8, 7]]
-    files = {0: tmp_path / "0.obj", 1: tmp_path / "1.obj", 2: tmp_path / "2.obj"}
-    for path, triangles in zip(files.values(), (faces, faces[:-1], swapped), strict=True):
-        factory.write_mesh(path, vertices, triangles)
-    mesh = tracked_meshes(files, faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh)
+    files = {number: tmp_path / f"{number}.obj" for number in range(4)}
+    for path, triangles in zip(files.values(), (faces, faces[:-1], swapped, faces), strict=True):
+        factory.write_mesh(path, vertices if path != files[3] else np.vstack([vertices, [0, 0, 0]]), triangles)
+    mesh = tracked_meshes(files, len(vertices), faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh)
     np.testing.assert_allclose(mesh(0), vertices, atol=1e-9)
     with pytest.raises(StgaError, match=r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"):
         mesh(1)
     with pytest.raises(StgaError, match=r"2\.obj: triangle 7 joins vertices"):
         mesh(2)
-    with pytest.raises(StgaError, match="timestep 9 has no tracked mesh; the capture has 0 to 2"):
+    with pytest.raises(StgaError, match=r"3\.obj: has 163 vertices, but .*neutral\.obj has 162"):
+        mesh(3)
+    with pytest.raises(StgaError, match="timestep 9 has no tracked mesh; the capture has 0 to 3"):
         mesh(9)
 
 
@@ -147,7 +149,7 @@ def test_meshes_are_kept_within_bounds() -> None:
         return np.full((4, 3), float(timestep))
 
     vertices = CACHE_BYTES // 24 // 3  # three fit
-    mesh = remembered(read, vertices)
+    mesh = cached_meshes(read, vertices)
     assert [mesh(t)[0, 0] for t in (0, 1, 2, 0, 1, 2)] == [0, 1, 2, 0, 1, 2]
     assert calls == [0, 1, 2]
     mesh(3)
@@ -182,10 +184,10 @@ def test_procrustes_as_scipy_has_it() -> None:
     random = np.random.default_rng(1)
     source, target, weights = random.normal(size=(30, 3)), random.normal(size=(30, 3)), random.random(30)
     rotation, translation = weighted_procrustes(source, target, weights)
-    centres = np.average(source, 0, weights), np.average(target, 0, weights)
-    expected = Rotation.align_vectors(target - centres[1], source - centres[0], weights)[0].as_matrix()
+    centers = np.average(source, 0, weights), np.average(target, 0, weights)
+    expected = Rotation.align_vectors(target - centers[1], source - centers[0], weights)[0].as_matrix()
     np.testing.assert_allclose(rotation, expected, atol=1e-9)
-    np.testing.assert_allclose(rotation @ centres[0] + translation, centres[1], atol=1e-12)
+    np.testing.assert_allclose(rotation @ centers[0] + translation, centers[1], atol=1e-12)
 
 
 def test_moving_jaw_does_not_drag_the_head() -> None:

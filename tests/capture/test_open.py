@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import stga_addon
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.open import open_capture
-from stga_addon.capture.summary import describe, spans
+from stga_addon.capture.summary import format_ranges, summarize_capture
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.model import read_flame
@@ -77,7 +77,7 @@ def test_one_timestep_or_camera(tmp_path: Path, timesteps: tuple[int, ...], came
     capture = open_capture(root, model)
     assert capture.timesteps == timesteps
     assert sum(map(len, capture.views.values())) == len(timesteps) * len(cameras)
-    assert describe(capture)
+    assert summarize_capture(capture)
 
 
 def test_flame_capture(tmp_path: Path) -> None:
@@ -226,8 +226,8 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
-def test_a_head_that_is_not_in_metres(tmp_path: Path, factor: float, says: str | None) -> None:
-    """Catches a capture in millimetres that trains to nonsense, or renders nothing, without a word."""
+def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str | None) -> None:
+    """Catches a capture in millimeters that trains to nonsense, or renders nothing, without a word."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     vertices, faces = factory.ball()
     for path in (root / "meshes").glob("*.obj"):
@@ -239,7 +239,7 @@ def test_a_head_that_is_not_in_metres(tmp_path: Path, factor: float, says: str |
 
 
 def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) -> None:
-    """Catches a check too dull for a real head: the principal point 10 pixels off the centre, of 401."""
+    """Catches a check too dull for a real head: the principal point 10 pixels off the center, of 401."""
     root = tmp_path / "capture"
     root.mkdir()
     for entry in (shared_data / "studio_head").iterdir():
@@ -293,7 +293,7 @@ def test_studio_head_without_head_motion(shared_data: Path) -> None:
 def test_summary(tmp_path: Path) -> None:
     """Catches counts, gaps, offsets or warnings that `info` would show wrong."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
-    lines = dict(describe(open_capture(root, model_file, "opencv")))
+    lines = dict(summarize_capture(open_capture(root, model_file, "opencv")))
     assert lines["layout"] == "flame"
     assert lines["cameras"] == "3: 0–2"
     assert lines["image size"] == "40 x 60"
@@ -304,16 +304,16 @@ def test_summary(tmp_path: Path) -> None:
     assert lines["static offset"] == "up to 0.9 mm"
     assert lines["dynamic offset"] == "none"
     assert "principal point" in lines["warning"]
-    release = dict(describe(open_capture(factory.write_release(tmp_path / "release"))))
+    release = dict(summarize_capture(open_capture(factory.write_release(tmp_path / "release"))))
     assert release["regions"] == "none"
     assert release["given selection"] == "1 timesteps, 0.9% of the triangles on average"
 
 
 def test_spans() -> None:
     """Catches an off-by-one at either end of a gap."""
-    assert spans([4]) == "1: 4"
-    assert spans([0, 1, 2]) == "3: 0–2"
-    assert spans([0, 2, 3, 7]) == "4: 0, 2–3, 7 (gaps 1, 4–6)"
+    assert format_ranges([4]) == "1: 4"
+    assert format_ranges([0, 1, 2]) == "3: 0–2"
+    assert format_ranges([0, 2, 3, 7]) == "4: 0, 2–3, 7 (gaps 1, 4–6)"
 
 
 def test_numpy_alone_is_enough(tmp_path: Path) -> None:
@@ -333,9 +333,9 @@ def test_numpy_alone_is_enough(tmp_path: Path) -> None:
         f"sys.path += [{str(only)!r}, {str(Path(stga_addon.__file__).parents[1])!r}]\n"
         "from pathlib import Path\n"
         "from stga_addon.capture.open import open_capture\n"
-        "from stga_addon.capture.summary import describe\n"
+        "from stga_addon.capture.summary import summarize_capture\n"
         f"capture = open_capture(Path({str(root)!r}))\n"
-        "describe(capture), capture.mesh(3), capture.expression_mesh(3, 'head')\n"
+        "summarize_capture(capture), capture.mesh(3), capture.expression_mesh(3, 'head')\n"
         "from stga_addon.errors import StgaError\n"
         f"try: open_capture(Path({str(ply)!r}))\n"
         "except StgaError as error: print(error)\n"
@@ -458,7 +458,7 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
     with pytest.raises(StgaError, match="is not a capture; expected transforms_"):
         open_capture(tmp_path)
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
-    with pytest.raises(StgaError, match=r"give your FLAME model file .* with --flame, or in the add-on"):
+    with pytest.raises(StgaError, match=r"give the FLAME model file .* with --flame or in the preferences"):
         open_capture(root)
     with pytest.raises(StgaError, match="'left' is not one of vhap, opencv, center"):
         open_capture(root, model_file, "left")

@@ -1,4 +1,4 @@
-"""Scenes that several tests look at, painted once."""
+"""Painted scenes shared by several tests."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Captures of a ball that deforms, painted triangle by triangle, of which it is known what colours depend on."""
+"""Captures of a ball that deforms, painted triangle by triangle, of which it is known what colors depend on."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ NOISE = 1.5  # levels
 
 Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(strain (F, 3), unit direction from the camera (F, 3), unit place on the ball (F, 3)) -> levels (F,) that are added
-to the triangles' own colours."""
+to the triangles' own colors."""
 
 
 def nothing(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class Scene:
-    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, what else colours depend on, the colour
+    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, what else colors depend on, the color
     behind the ball, and how far timesteps deform it."""
 
     cameras: int = 8
@@ -124,9 +124,9 @@ def _draw(mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarra
         cover.polygon(corners, fill=255)
     blocks = (SIZE, SUPERSAMPLED, SIZE, SUPERSAMPLED)
     coverage = np.asarray(mask, float).reshape(blocks).mean((1, 3))
-    colour = np.asarray(picture, float).reshape(*blocks, 3).sum((1, 3))
+    color = np.asarray(picture, float).reshape(*blocks, 3).sum((1, 3))
     weight = np.maximum(coverage / 255 * SUPERSAMPLED**2, 1e-9)
-    return colour / weight[..., None], np.where(coverage > 127, 255, 0).astype(np.uint8)
+    return color / weight[..., None], np.where(coverage > 127, 255, 0).astype(np.uint8)
 
 
 def _keep(folder: Path, t: int, c: int, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> View:

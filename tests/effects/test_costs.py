@@ -1,4 +1,4 @@
-"""What is off costs nothing: no arrays, no calls."""
+"""Cost of effects: one that is off takes no memory and makes no calls; one that is on reaches the training."""
 
 from collections import Counter
 from dataclasses import replace
@@ -6,15 +6,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from training.heads import write_head
 
 from stga_addon.capture.images import read_view
+from stga_addon.capture.model import View
 from stga_addon.effects.plan import plan_effects
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
+from stga_addon.raster import reference
+from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.run import loop
-from stga_addon.training.run.folder import Run, read_checkpoint
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
 
 from .test_rules import unlike_cameras
@@ -62,7 +67,7 @@ def test_off_calls_nothing(painted, tmp_path, monkeypatch):
 
 
 def test_on_calls_all(painted, tmp_path, monkeypatch):
-    """Catches an effect that is on in name only, and with it a test above that counts in vain."""
+    """Catches an effect that is on but not called, which would also make the test above pass."""
     calls, splats = train(painted(), tmp_path, monkeypatch, "on")
     assert set(calls) == set(CALLS)
     assert calls["background"] == ITERATIONS
@@ -72,7 +77,7 @@ def test_on_calls_all(painted, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("choice", ["on", "off"])
 def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
-    """Catches parameters that are read, differentiated or written where nobody asked for it, or not where one did."""
+    """Catches parameters that are refined or written with the effect off, or not refined with it on."""
     capture, _ = write_head(tmp_path / "head")
     settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
     calls: Counter[str] = Counter()
@@ -90,7 +95,7 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
 
 
 def test_exposure_is_taken_away(painted):
-    """Catches gains and offsets applied the wrong way round, to the background, or to a camera they are not of."""
+    """Catches gains and offsets applied inversely, to the background, or to another camera."""
     gain, offset = unlike_cameras()
     rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
     correct = exposure_correction(make_settings(iterations=1, exposure=rows))
@@ -107,12 +112,12 @@ def test_exposure_is_taken_away(painted):
 
 
 def test_no_exposure_is_no_pass():
-    """Catches images that are copied for nothing."""
+    """Catches images that are copied although nothing is corrected."""
     assert exposure_correction(make_settings(iterations=1)) is None
 
 
 def test_no_splats_on_teeth(painted):
-    """Catches splats that are placed, trained and drawn where nothing will ever be seen."""
+    """Catches splats on teeth that are never visible."""
     capture = painted()
     vertices = len(capture.neutral)
     rows = np.zeros((120, 3)) + capture.neutral[0] + np.random.default_rng(0).normal(0, 0.002, (120, 3))
@@ -127,8 +132,34 @@ def test_no_splats_on_teeth(painted):
         assert len(splats) - on_teeth == 6 * len(capture.faces)
 
 
-@pytest.mark.parametrize("choice", ["on", "off"])
-def test_antialiasing_reaches_the_kernels(painted, choice):
-    """Catches an effect that is decided and then forgotten."""
-    settings, _ = plan_effects(painted(), make_settings(iterations=1, effects={"antialiasing": choice}))
-    assert settings.antialiased == (choice == "on")
+def test_antialiasing_reaches_training_and_evaluation(painted):
+    """Catches an effect that is decided and then forgotten: losses and pixels must be those of the reference."""
+    capture, losses, pictures = painted(), [], []
+    view, image, _ = read_view(capture.views["train"][0], 0.4)
+    target = torch.from_numpy(image.transpose(2, 0, 1) / 255)
+    for choice in ("on", "off"):
+        settings, _ = plan_effects(capture, make_settings(iterations=1, effects={"antialiasing": choice}))
+        settings = replace(settings, lattice=0, hull_points=False)
+        small = trainer.Trainer(capture, settings, {})
+        for parameters in (small.state.parameters, small.state.average):
+            parameters.log_scale.sub_(1.5)  # narrower than a pixel
+            parameters.sh[:, 0, 0] = 1.0
+        expected = reference_image(small, view, choice == "on")
+        pictures.append(small.render(view, 0.0))
+        np.testing.assert_allclose(pictures[-1], expected, atol=1e-4)
+        difference, ssim = reference.image_loss(expected, target)
+        weight = settings.ssim_weight
+        losses.append(small.step(view, image, 0.0))
+        expected_loss = (1 - weight) * difference.mean() + weight * (1 - ssim.mean())
+        assert losses[-1] == pytest.approx(float(expected_loss), rel=1e-4)
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.05
+    assert abs(losses[0] - losses[1]) > 1e-3
+
+
+def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> torch.Tensor:
+    """The trainer's splats over white, by the reference renderer in float64."""
+    state = small.state
+    p = Parameters(*(tensor.double() for tensor in state.parameters))
+    placed = reference.embed(p.xyz, p.rotation, p.log_scale, small.frames.of(view.timestep), state.face.long())
+    color, alpha, _ = reference.render(*placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased)
+    return color + 1 - alpha

@@ -1,4 +1,4 @@
-"""The plan's way: decided once, shown, stored with the run, and kept by a run that is resumed."""
+"""Effect plan: decided once, printed, stored with the run and kept on resume."""
 
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     assert read_run(trained) == before
     assert "strain-color  on, as asked" in capsys.readouterr().out
     assert main([*train, "--effect", "strain-color=off"]) == 2
-    assert "this run has decided otherwise" in capsys.readouterr().err
+    assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 def test_info_shows_the_plan(root, capsys):
@@ -84,7 +84,7 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
         again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
         assert main([*again, "--effect", "strain-color=on"]) == 2
-        assert "--effect: " in capsys.readouterr().err
+        assert "--effect cannot be combined with" in capsys.readouterr().err
 
 
 def test_settings_that_ask_for_nothing(root):

@@ -1,4 +1,4 @@
-"""Auto decides right: scenes of which it is known what their colours depend on."""
+"""Rules of effects, on scenes whose colors depend on known causes."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from stga_addon.effects import rules
-from stga_addon.effects.evidence import calm, fit_cameras
-from stga_addon.effects.facts import CaptureFacts
+from stga_addon.effects.evidence import fit_cameras, stable_colors
+from stga_addon.effects.facts import MAX_TIMESTEPS, CaptureFacts
 from stga_addon.effects.plan import plan_effects
-from stga_addon.effects.samples import MOST_VIEWS, sample_views, take_samples
+from stga_addon.effects.samples import MAX_VIEWS, sample_views, take_samples
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 from stga_addon.training.effect_plan import EFFECTS, parse_choices
 from stga_addon.training.settings import TrainingSettings, make_settings
 
@@ -31,13 +32,13 @@ def on(plan):
 
 
 def test_plain(painted):
-    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colours is there."""
+    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there."""
     plan, settings = planned(painted())
     assert on(plan) == {"antialiasing", "background", "density"}
     assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
 
 
-def test_colour_that_follows_strain(painted):
+def test_color_that_follows_strain(painted):
     """Catches wrinkles that are not seen, or are taken for the cameras' doing."""
     plan, settings = planned(painted(paint=wrinkles))
     assert on(plan) == {"antialiasing", "background", "density", "strain-color"}
@@ -45,7 +46,7 @@ def test_colour_that_follows_strain(painted):
     assert float(plan["strain-color"].reason.split("by ")[1].split()[0]) > 5
 
 
-def test_colour_that_follows_the_view(painted):
+def test_color_that_follows_the_view(painted):
     """Catches gloss that is not seen, or is taken for the cameras' exposure."""
     plan, settings = planned(painted(paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density", "view-color"}
@@ -65,7 +66,7 @@ def test_cameras_of_different_exposure(painted):
     assert on(plan) == {"antialiasing", "background", "density", "exposure"}
     rows = np.array(settings.exposure)
     assert rows[:, 0].tolist() == list(range(8))
-    for level in (80, 120, 160):  # what the ball's colours are
+    for level in (80, 120, 160):  # what the ball's colors are
         truth, found = gain * level + offset, rows[:, 1:4] * level + rows[:, 4:]
         assert abs(found - truth).max() < 2.0
     assert abs(gain * 120 + offset - 120).max() > 8.0
@@ -76,7 +77,7 @@ def test_one_camera(painted):
     plan, settings = planned(painted(cameras=1, paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density"}
     for name in ("view-color", "exposure", "hull-points"):
-        with pytest.raises(StgaError, match=f"--effect {name}=on: cannot be, because one camera"):
+        with pytest.raises(StgaError, match=f"--effect {name}=on: is not possible, because a single camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
     assert settings.sh_steps == ()
 
@@ -85,28 +86,28 @@ def test_one_frame(painted):
     """Catches strain that is asked of a single frame, and a static capture that is refused as a whole."""
     plan, _ = planned(painted(timesteps=1, deformed=0.0))
     assert on(plan) == {"antialiasing", "background", "density"}
-    with pytest.raises(StgaError, match="strain-color=on: cannot be, because the mesh has the same shape"):
+    with pytest.raises(StgaError, match="strain-color=on: is not possible, because the mesh has the same shape"):
         planned(painted(timesteps=1, deformed=0.0), strain_color="on")
-    with pytest.raises(StgaError, match="selection=on: cannot be, because no triangle moves"):
+    with pytest.raises(StgaError, match="selection=on: is not possible, because no triangle moves"):
         planned(painted(timesteps=1, deformed=0.0), selection="on")
 
 
 def test_background(painted):
-    """Catches a background that is guessed without masks, and a wrong colour that splats are trained against."""
+    """Catches a background that is guessed without masks, and a wrong color that splats are trained against."""
     plan, settings = planned(painted(background=(0, 0, 0)))
     assert plan["background"].on
     assert settings.background == (0.0, 0.0, 0.0)
     plan, settings = planned(painted(masks=False))
     assert not plan["background"].on
     assert not settings.random_background
-    with pytest.raises(StgaError, match="background=on: cannot be, because not every image has a mask"):
+    with pytest.raises(StgaError, match="background=on: is not possible, because not every image has a mask"):
         planned(painted(masks=False), background="on")
 
 
 def test_a_room_behind_the_head(painted):
-    """Catches a background of many colours that is exchanged as if it had one."""
+    """Catches a background of many colors that is exchanged as if it had one."""
     facts = CaptureFacts(painted(), make_settings(iterations=1))
-    facts.samples = replace(facts.samples, unevenness=np.full(len(facts.samples.camera), 40.0))
+    facts.samples = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
     verdict = rules.background(facts)
     assert (verdict.on, verdict.only) == (False, True)
 
@@ -163,7 +164,7 @@ def with_frames(*frames):
     """Facts of a FLAME capture that has these frames and no teeth."""
     model = SimpleNamespace(v_template=np.zeros((10, 3)))
     flame = SimpleNamespace(timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model)
-    capture = SimpleNamespace(views={"train": ()}, flame=flame)
+    capture = SimpleNamespace(views={"train": ()}, flame=flame, timesteps=flame.timesteps)
     return CaptureFacts(capture, make_settings(iterations=1))
 
 
@@ -194,9 +195,9 @@ def test_dynamic_offsets():
     assert (found.on, found.only) == (True, True)
 
 
-def off_track(capture, metres, device="cpu"):
+def off_track(capture, meters, device="cpu"):
     """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
-    meshes = {timestep: capture.mesh(timestep) + np.array([metres, 0, 0]) for timestep in capture.timesteps}
+    meshes = {timestep: capture.mesh(timestep) + np.array([meters, 0, 0]) for timestep in capture.timesteps}
     facts = CaptureFacts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
     facts.frames = [frame()]
     return facts
@@ -246,7 +247,7 @@ def test_names():
 
 
 def test_samples(painted):
-    """Catches colours that are taken beside their triangle or from one that another hides."""
+    """Catches colors that are taken beside their triangle or from one that another hides."""
     capture = painted()
     samples = take_samples(capture)
     assert samples.seen.any(0).mean() > 0.5
@@ -261,7 +262,7 @@ def test_samples(painted):
 
 
 def test_hidden_triangles(painted):
-    """Catches colours of whatever stands in front, a hand or the nose, that are taken for the triangle's own."""
+    """Catches colors of whatever stands in front, a hand or the nose, that are taken for the triangle's own."""
     capture = painted()
     plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])  # above the ball's equator
     corners = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(capture.neutral)
@@ -286,7 +287,7 @@ def test_views_are_spread():
     """Catches cameras or timesteps that are left out of a long sequence, and more views than there is time for."""
     views = [SimpleNamespace(timestep=t, camera_index=c) for t in range(500) for c in range(16)]
     chosen = sample_views(views)
-    assert len(chosen) == MOST_VIEWS == len({(view.timestep, view.camera_index) for view in chosen})
+    assert len(chosen) == MAX_VIEWS == len({(view.timestep, view.camera_index) for view in chosen})
     counts = np.bincount([view.camera_index for view in chosen], minlength=16)
     assert counts.max() - counts.min() <= 1
     assert {view.timestep for view in chosen} >= {0, 499}
@@ -297,5 +298,34 @@ def test_views_are_spread():
 def test_two_cameras_that_are_alike(painted):
     """Catches a fit that explains noise by cameras."""
     samples = take_samples(painted())
-    found = fit_cameras(samples, calm(samples.color.astype(float)))
+    found = fit_cameras(samples, stable_colors(samples.color.astype(float)))
     assert abs(found.gain * 120 + found.offset - 120).max() < 1.5
+
+
+def test_each_timestep_is_posed_once(painted):
+    """Catches a long capture of which every timestep is posed, or one several times, to decide its effects."""
+    neutral = np.random.default_rng(0).normal(size=(TEMPLATE_VERTICES + TEETH_VERTICES, 3))
+    posed: list[int] = []
+
+    def expression_mesh(timestep, zero_pose):
+        posed.append(timestep)
+        return neutral + 0.01
+
+    flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral))
+    capture = replace(
+        painted(), timesteps=tuple(range(500)), neutral=neutral, expression_mesh=expression_mesh, flame=flame
+    )
+    facts = CaptureFacts(capture, make_settings(iterations=1))
+    assert facts.selected_share == 1
+    assert facts.lip_gap_mm == pytest.approx(0)
+    assert len(posed) == len(set(posed)) == MAX_TIMESTEPS
+    assert {0, 499} <= set(posed)
+
+
+def test_a_sample_without_motion_does_not_forbid_selection(painted):
+    """Catches a choice that is refused because the few timesteps that were posed happen not to move."""
+    capture = painted()
+    still = replace(capture, timesteps=tuple(range(500)), expression_mesh=lambda timestep, zero_pose: capture.neutral)
+    verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
+    assert (verdict.on, verdict.only) == (False, False)
+    assert "any of 64 frames" in verdict.reason

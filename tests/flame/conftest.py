@@ -10,7 +10,7 @@ from stga_addon.flame.model import FlameModel
 
 
 def random_arrays(seed: int = 0, vertices: int = 40, components: int = 12) -> dict[str, np.ndarray]:
-    """The arrays of a FLAME model file, at a head's scale in metres."""
+    """The arrays of a FLAME model file, at a head's scale in meters."""
     rng = np.random.default_rng(seed)
     weights = rng.random((vertices, 5)) ** 4
     regressor = rng.random((5, vertices)) * (rng.random((5, vertices)) < 0.4)
@@ -27,7 +27,7 @@ def random_arrays(seed: int = 0, vertices: int = 40, components: int = 12) -> di
 
 
 def random_frame(seed: int, n_expression: int) -> FlameFrame:
-    """Large poses, so that a transposed rotation or a swapped joint is centimetres off."""
+    """Large poses, so that a transposed rotation or a swapped joint is centimeters off."""
     rng = np.random.default_rng(seed)
     return FlameFrame(
         expr=rng.normal(size=n_expression),

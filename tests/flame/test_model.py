@@ -1,5 +1,6 @@
 """Reading FLAME model files: every pickle dialect they come in, and everything that must be refused."""
 
+import codecs
 import io
 import os
 import pickle
@@ -17,7 +18,7 @@ import scipy.sparse
 from stga_addon.errors import StgaError
 from stga_addon.flame.masks import key_regions
 from stga_addon.flame.model import read_flame
-from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.flame.unpickle import _RestrictedUnpickler, read_pickled_arrays
 
 from .conftest import random_arrays
 
@@ -241,6 +242,7 @@ def test_truncated_and_flipped_bytes(tmp_path: Path) -> None:
         ("weights", np.full((40, 5), "x"), "weights"),
         ("f", np.full((3, 3), 40), "f names vertices 40 to 40, expected 0 to 39"),
         ("f", np.full((3, 3), 0.5), "f holds float64, expected whole numbers"),
+        ("f", np.full((3, 3), 1e30), "f holds float64, expected whole numbers"),
         ("kintree_table", np.array([[0, 4, 1, 1, 1], range(5)]), "kintree_table names the parents"),
         ("n_identity", np.array(13), "n_identity is 13, expected one number from 0 to 12"),
         ("masks/nose", np.array([40]), "mask nose"),
@@ -265,3 +267,18 @@ def test_missing_file(tmp_path: Path) -> None:
     for name in ("none.npz", "none.pkl"):
         with pytest.raises(StgaError, match=name):
             read_flame(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "name", ["_codecs\nencode", "copy_reg\n_reconstructor", "numpy.core.multiarray\n_reconstruct", "__builtin__\nset"]
+)
+@pytest.mark.parametrize("state", [b"}S'left'\nI1\ns", b"N}S'_call'\nI1\ns\x86"])
+def test_functions_cannot_be_changed(tmp_path: Path, name: str, state: bytes) -> None:
+    """Catches a pickle that sets attributes of a function by BUILD, which would outlive its reading."""
+    path = tmp_path / "model.pkl"
+    path.write_bytes(b"\x80\x02c" + name.encode() + b"\n" + state + b"b.")
+    with pytest.raises(StgaError, match="sets attributes of a function"):
+        read_pickled_arrays(path)
+    for method in (vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild", "array_shell", "collect")):
+        assert vars(method) == {}
+    assert not hasattr(codecs.encode, "left")

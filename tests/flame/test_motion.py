@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stga_addon.flame.forward import FlameFrame, flame_forward, neutral_frame
 from stga_addon.flame.model import FlameModel
-from stga_addon.flame.motion import PARTS, ROTATIONS, driven, retimed, strengthened
+from stga_addon.flame.motion import PARTS, ROTATIONS, retimed, strengthened, transferred_motion
 from stga_addon.flame.quaternions import continuous, from_axis_angle, slerp, to_axis_angle
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
 
@@ -117,7 +117,7 @@ def test_driven_by_the_neutral_mesh_alone(tiny_flame: FlameModel) -> None:
     motion = replace(motion, frame=lambda t: replace(random_frame(t, 4), dynamic_offset=np.ones((40, 3))))
     neutral = flame_forward(tiny_flame, shape, neutral_frame(tiny_flame), offset)
     expected = flame_forward(tiny_flame, shape, random_frame(7, 4), offset)
-    np.testing.assert_allclose(sequence_mesh(driven(motion, neutral), 7), expected, atol=1e-12)
+    np.testing.assert_allclose(sequence_mesh(transferred_motion(motion, neutral), 7), expected, atol=1e-12)
 
 
 def test_parts_are_all_the_fields() -> None:

@@ -173,11 +173,11 @@ def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
         ("pose", np.zeros((3, 9)), r"pose has shape \(3, 9\), expected \(timesteps, 6\) or \(timesteps, 15\)"),
         ("pose", np.zeros((0, 6)), "pose has shape"),
         ("pose", np.zeros(6), "pose has shape"),
-        ("timesteps", np.array([0, 1]), "timesteps are no 3 whole numbers"),
-        ("timesteps", np.array([0, 2, 2]), "timesteps are no 3 whole numbers"),
-        ("timesteps", np.array([0.0, 1.0, 2.0]), "timesteps are no 3 whole numbers"),
-        ("timesteps", np.array([0, 1, 2**63 + 1], np.uint64), "timesteps are no 3 whole numbers"),
-        ("timesteps", np.array([0, 1, 2**40]), "timesteps are no 3 whole numbers"),
+        ("timesteps", np.array([0, 1]), "timesteps: expected 3 whole numbers"),
+        ("timesteps", np.array([0, 2, 2]), "timesteps: expected 3 whole numbers"),
+        ("timesteps", np.array([0.0, 1.0, 2.0]), "timesteps: expected 3 whole numbers"),
+        ("timesteps", np.array([0, 1, 2**63 + 1], np.uint64), "timesteps: expected 3 whole numbers"),
+        ("timesteps", np.array([0, 1, 2**40]), "timesteps: expected 3 whole numbers"),
     ],
 )
 def test_malformed_motions(

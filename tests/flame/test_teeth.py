@@ -92,7 +92,7 @@ def test_sides_face_outwards(toothed: FlameModel) -> None:
 
 
 def test_where_the_teeth_stand(toothed: FlameModel) -> None:
-    # Catches a wrong scale or side: behind the lips, inside the mouth's width, upper above lower, in metres.
+    # Catches a wrong scale or side: behind the lips, inside the mouth's width, upper above lower, in meters.
     rows = toothed.v_template[5023:].reshape(8, 15, 3)
     upper, lower = toothed.v_template[list(UPPER_LIP)], toothed.v_template[list(LOWER_LIP)]
     gap = np.linalg.norm(upper - lower, axis=1).mean()

@@ -1,6 +1,6 @@
 """The whole command line on generated arguments and damaged inputs: exit code 0, 2 or 130, one bounded sentence.
 
-STGA_FUZZ_CASES sets the number of cases; case n is the same in every run.
+STGA_FUZZ_CASES sets the number of cases and STGA_FUZZ_FIRST the first one; case n is the same in every run.
 """
 
 import copy
@@ -33,6 +33,7 @@ from stga_addon.training.run.folder import read_run
 pytest.importorskip("torch")
 
 CASES = int(os.environ.get("STGA_FUZZ_CASES", 1500))
+FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
 MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
 REPORTED_FAILURES = 20
@@ -162,7 +163,7 @@ def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(folder / "start")  # relative names of outputs end up in FOLDER
     failures: dict[str, list[str]] = {}
-    for number in range(CASES):
+    for number in range(FIRST_CASE, FIRST_CASE + CASES):
         shutil.rmtree(case, ignore_errors=True)
         shutil.rmtree(scratch, ignore_errors=True)
         shutil.copytree(folder / "template", case)
@@ -244,6 +245,8 @@ def generate_arguments(rng: random.Random, case: Path) -> tuple[list[str], dict[
         variables["STGA_HEAD"] = rng.choice([str(case / "head")] * 3 + [str(case), "a" * 5000, ".", str(case / "none")])
     if rng.random() < 0.05:
         variables["STGA_LPIPS"] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
+    if rng.random() < 0.05:
+        variables["STGA_PYTHON"] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
     variables = {name: value.encode("utf-8", "replace").decode() for name, value in variables.items()}
     return arguments, variables
 
@@ -350,6 +353,11 @@ def demo(rng: random.Random, case: Path) -> list[str]:
     return [*option(rng, 0.5, "--budget", *NUMBERS), *option(rng, 0.5, "--out", some_path(rng, case))]
 
 
+def environment(rng: random.Random, case: Path) -> list[str]:
+    action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
+    return ["--folder", some_path(rng, case, "new"), *action]
+
+
 COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
     "info": (3, info),
     "select": (3, select),
@@ -361,6 +369,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
     "demo": (0.2, demo),
+    "environment": (0.2, environment),
     "x": (0.1, lambda rng, case: []),
 }
 
@@ -390,10 +399,10 @@ def mutate_bytes(rng: random.Random, path: Path) -> str:
 
 def mutate_json(rng: random.Random, path: Path) -> str:
     """Replace, delete, add or copy one value, at any depth."""
-    lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
     try:
-        document = [json.loads(line) for line in lines]
-    except ValueError:  # an earlier damage
+        text = path.read_text(encoding="utf-8")
+        document = [json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])]
+    except (ValueError, RecursionError):  # an earlier damage
         return mutate_bytes(rng, path)
     node: Any = document
     trail: list[Any] = []

@@ -1,7 +1,7 @@
-"""One target a reader: a good file, damaged as hypothesis likes, either loads or raises StgaError.
+"""Fuzzing of every file reader: a file damaged by hypothesis either loads or raises StgaError.
 
-Catches any other exception, a crash, a hang and memory out of proportion, on inputs that nobody thought of. Quick
-in the normal suite; `STGA_FUZZ_SECONDS=600 pytest tests/fuzz` shares that time among the targets.
+Catches any other exception, crashes, hangs and excessive memory. Quick in the normal suite;
+`STGA_FUZZ_SECONDS=600 pytest tests/fuzz` shares that time among the targets.
 """
 
 import json
@@ -39,18 +39,20 @@ from stga_addon.errors import StgaError
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
+from stga_addon.training.run import metrics_log
 
 from .conftest import SECONDS
 
-LONGEST_S, MOST_BYTES = 2.0, 200e6
+MAX_READ_S, MAX_READ_BYTES = 2.0, 200e6
 MODEL = model_of(random_arrays(), 9)
 FACES = np.arange(12).reshape(4, 3)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A file's name, how a good one is written, and its reader."""
+    """File name, writer of a valid file, and reader."""
 
     name: str
     write: Callable[[Path], Any]
@@ -122,7 +124,8 @@ def seen(path: Path) -> None:
 
 def metrics(path: Path) -> None:
     for n in range(3):
-        run_folder.append_metrics(path.parent, {"iteration": n, "psnr": 20.5})
+        times = {"seconds": float(n), "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
+        metrics_log.append_metrics(path.parent, {"iteration": n, **times, "psnr": 20.5, "ssim": 0.9})
 
 
 TARGETS = {
@@ -149,15 +152,15 @@ TARGETS = {
     ),
     "checkpoint": Target(
         "checkpoint.npz",
-        lambda path: run_folder.write_checkpoint(path.parent, make_checkpoint()),
-        lambda path: run_folder.read_checkpoint(path.parent),
+        lambda path: checkpoints.write_checkpoint(path.parent, make_checkpoint()),
+        lambda path: checkpoints.read_checkpoint(path.parent),
     ),
     "selection": Target(
         "selection.npz",
-        lambda path: run_folder.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}),
-        lambda path: run_folder.read_selection(path.parent, 5),
+        lambda path: checkpoints.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}, "a"),
+        lambda path: checkpoints.read_selection(path.parent, 5),
     ),
-    "metrics": Target("metrics.jsonl", metrics, lambda path: run_folder.read_metrics(path.parent)),
+    "metrics": Target("metrics.jsonl", metrics, lambda path: metrics_log.read_metrics(path.parent)),
 }
 
 INTERESTING = [b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\0" * 8, b"-1", b"1e999", b"99999999999", b"NaN", b"[", b"]"]
@@ -184,7 +187,7 @@ def damaged(draw: Callable[[st.SearchStrategy[Any]], Any], content: bytes) -> by
 
 
 def rewrap(draw: Callable[[st.SearchStrategy[Any]], Any], path: Path) -> bytes:
-    """A good archive around damaged arrays: a checksum would otherwise stop nearly all damage."""
+    """A valid archive with damaged arrays: otherwise its checksums detect nearly all damage."""
     out = path.with_suffix(".wrapped")
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(out, "w") as new:
         victim = draw(st.sampled_from(old.namelist()))
@@ -196,7 +199,7 @@ def rewrap(draw: Callable[[st.SearchStrategy[Any]], Any], path: Path) -> bytes:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_reader(tmp_path: Path, name: str) -> None:
-    """Catches what a reader does besides loading and raising StgaError."""
+    """Catches a reader that neither loads a damaged file nor raises StgaError."""
     target = TARGETS[name]
     path, broken = tmp_path / "good" / target.name, tmp_path / "broken" / target.name
     path.parent.mkdir()
@@ -211,7 +214,7 @@ def test_reader(tmp_path: Path, name: str) -> None:
 
 
 def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) -> None:
-    """One profile's worth of examples; `number` seeds those of the bounded run."""
+    """Run the examples of one profile, seeded with `number`."""
 
     @seed(number)
     @settings(settings.get_profile("stga-fuzz" if SECONDS else "stga-quick"))
@@ -227,8 +230,8 @@ def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) ->
             peak = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
-        assert time.monotonic() - begin < LONGEST_S
-        assert peak < MOST_BYTES
+        assert time.monotonic() - begin < MAX_READ_S
+        assert peak < MAX_READ_BYTES
         assert [entry.name for entry in broken.parent.iterdir()] == [broken.name]
 
     once()

@@ -187,8 +187,10 @@ def test_curve_is_read_when_it_grows():
     assert ReadCurve(RUN) in after(second, state=state)[1]
 
 
-def test_unexpected_error_stops_until_the_next_training():
+def test_unexpected_error_stops_until_the_next_start_or_check():
     """Catches a timer that ends without a word, one that repeats the same traceback, and one that never recovers."""
     state, effects = after(Started(RUN), status(WorkerState.WORKING, preview=1), MonitorFailed("a bug"))
     assert (state.error, state.interval_s, effects) == ("a bug", None, [Redraw()])
-    assert after(Started(RUN), status(WorkerState.WORKING), state=state)[0].interval_s == CHECK_INTERVAL_S
+    for restart in (Started(RUN), status(WorkerState.WORKING)):
+        restarted, _ = after(restart, status(WorkerState.WORKING), state=state)
+        assert (restarted.interval_s, restarted.error) == (CHECK_INTERVAL_S, "")

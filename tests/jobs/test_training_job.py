@@ -1,6 +1,7 @@
 """The training job: what is written down, what is refused, and that a worker trains what the same process would."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from stga_addon.files import read_npz, write_json
 from stga_addon.jobs import training_job
 from stga_addon.jobs.delegate import FOLDER
 from stga_addon.jobs.training_job import TrainingJob, job_folder, read_job, run_training_job, write_job
+from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.run.progress import describe_figures
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.launch import start_worker
@@ -70,24 +72,29 @@ def test_the_next_job_forgets_the_last(tmp_path, capture):
 def test_refusals(tmp_path, capture):
     """Catches a run that is overwritten, and one resumed that is not there: both before a worker is started."""
     run = tmp_path / "run"
-    with pytest.raises(StgaError, match=r"holds no run that could be resumed"):
+    with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
         write_job(run, TrainingJob(capture, None, "vhap", None))
     assert not run.exists()
-    write_json(_made(run) / "run.json", {})
+    write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
     with pytest.raises(StgaError, match="already holds a run; resume it, or choose another folder"):
         write_job(run, new_job(capture))
     write_job(run, TrainingJob(capture, None, "vhap", None))
     assert read_job(run).settings is None
+    with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
+        write_job(run, TrainingJob(capture, None, "opencv", None))
     with status_writer(job_folder(run)), pytest.raises(StgaError, match="another worker is running"):
         write_job(run, TrainingJob(capture, None, "vhap", None))
 
 
+HEADER = {"format": "stga-job", "version": 2}
+
+
 @pytest.mark.parametrize(
     "values",
-    [[], {}, {"format": "stga-job", "version": 9}, {"format": "stga-job", "version": 1}]
+    [[], {}, {"format": "stga-job", "version": 1}, {"format": "stga-job", "version": 2}]
     + [
-        {"format": "stga-job", "version": 1, "capture": "c", "flame": None, "principal_point": "vhap", "settings": bad}
-        for bad in ({}, {"strategy": "global"}, 3)
+        {**HEADER, "capture": "c", "flame": None, "principal_point": "vhap", "device": device, "settings": settings}
+        for device, settings in (("cpu", {}), ("cpu", {"strategy": "global"}), ("cpu", 3), ("toaster", None))
     ],
 )
 def test_damaged_jobs(tmp_path, values):
@@ -207,6 +214,36 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     assert seen.state == WorkerState.FAILED
     assert "00003.obj" in seen.status.error
     assert seen.status.traceback == ""
+
+
+@pytest.mark.slow
+def test_closed_stderr_still_leaves_a_status(tmp_path, capture):
+    """Catches a worker without stderr that ends before it writes its status."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    write_job(run, new_job(capture, iterations=2))
+    shell = f'"{sys.executable}" -m stga_addon job "{run}" 2>&-'
+    done = subprocess.run(["sh", "-c", shell], cwd=Path(__file__).parents[2], timeout=300)
+    assert done.returncode == 0
+    assert inspect_worker(job_folder(run)).state == WorkerState.FINISHED
+
+
+@pytest.mark.slow
+def test_interrupted_job_is_cancelled(tmp_path, capture):
+    """Catches Ctrl-C in a worker that is reported as a failure with a traceback."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    write_job(run, new_job(capture))
+
+    def interrupt(progress):
+        if progress.iteration == 3 and progress.message == "Training":
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training_job(run, also=interrupt)
+    assert inspect_worker(job_folder(run)).state == WorkerState.CANCELLED
+    assert (run / "checkpoint.npz").exists()
 
 
 def test_an_interpreter_without_anything_is_named(tmp_path, capture):

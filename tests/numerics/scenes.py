@@ -52,20 +52,18 @@ def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
     """
     tensors = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
     xyz, rotation, log_scale, opacity, _ = tensors
-    view = torch.as_tensor(scene.camera.world_to_camera)
-    points = xyz @ view[:3, :3].T + view[:3, 3]
-    order = torch.argsort(points[:, 2], stable=True)
-    order = order[points[order, 2] >= 0.0099]
-    covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
-    center, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    z = reference.camera_space(xyz, scene.camera)[:, 2]
+    order = torch.argsort(z, stable=True)
+    order = order[z[order] >= 0.0099]
+    center, projected, _, _ = reference.project(xyz[order], rotation[order], log_scale[order], scene.camera)
     shape = (scene.camera.height, scene.camera.width)
     steady, transmittance = torch.ones(shape, dtype=torch.bool), torch.ones(shape, dtype=torch.float64)
     running = torch.ones(shape, dtype=torch.bool)
     # The same with the cut-offs moved by the margin, by making each splat a little more or less opaque.
     logit = torch.sigmoid(opacity[order])
-    kept = reference._alpha(center, projected, logit, scene.camera)
+    kept = reference.splat_alpha(center, projected, logit, scene.camera)
     for other in (logit * (1 - margin), logit * (1 + margin)):
-        moved = reference._alpha(center, projected, other, scene.camera)
+        moved = reference.splat_alpha(center, projected, other, scene.camera)
         steady &= (((moved > 0) == (kept > 0)) & ((moved < 0.999) == (kept < 0.999))).all(0)
     for alpha in kept:
         after = transmittance * (1 - alpha)

@@ -69,7 +69,7 @@ def check(scene: Scene) -> None:
 
 @settings(max_examples=60, **BOUNDED)
 @given(scenes())
-def test_any_scene_is_the_references(scene: Scene) -> None:
+def test_any_scene_is_the_references(back_end: str, scene: Scene) -> None:
     """Catches NaN, infinity and disagreement that no listed scene provokes."""
     check(scene)
 

@@ -133,7 +133,7 @@ def assert_gradients_agree(gradients: dict[str, np.ndarray], expected: dict[str,
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_image_and_gradients_are_the_references(name):
+def test_image_and_gradients_are_the_references(back_end, name):
     """Catches any error in projection, harmonics, tile bounds, blending or their derivatives, one scene a trap."""
     scene = SCENES[name]
     cotangents = random_cotangents(scene.camera)
@@ -145,7 +145,7 @@ def test_image_and_gradients_are_the_references(name):
 
 
 @pytest.mark.parametrize("quantity", [0, 1, 2])
-def test_each_image_alone_has_the_references_gradient(quantity):
+def test_each_image_alone_has_the_references_gradient(back_end, quantity):
     """Catches color, alpha and depth gradients that are only right in sum, or one that is dropped."""
     scene = SCENES["plain"]
     cotangents = [v * (i == quantity) for i, v in enumerate(random_cotangents(scene.camera, 1))]
@@ -157,21 +157,11 @@ def test_each_image_alone_has_the_references_gradient(quantity):
 
 def embed(local: list[torch.Tensor], frames, face: np.ndarray) -> list[torch.Tensor]:
     """World-space splats in torch, so that autograd carries the reference's gradient to the local parameters."""
-    xyz, rotation, log_scale, opacity, sh = local
-    origin, matrix, q, scale = (
-        torch.from_numpy(a[face]) for a in (frames.origin, frames.rotation, frames.quaternion, frames.scale)
-    )
-    w, x, y, z = q.unbind(-1)
-    left = torch.stack(
-        [torch.stack(row, -1) for row in ((w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w))], dim=-2
-    )
-    placed = scale[:, None] * torch.einsum("nij,nj->ni", matrix, xyz) + origin
-    turned = torch.einsum("nij,nj->ni", left, rotation)
-    return [placed, turned, log_scale + scale.log()[:, None], opacity, sh]
+    return [*reference.embed(*local[:3], frames, torch.from_numpy(face).long()), *local[3:]]
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_embedded_splats_render_and_train_in_their_frames(convention):
+def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
     """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on triangles."""
     scene = SCENES["plain"]
     rng = np.random.default_rng(30)
@@ -226,17 +216,12 @@ def test_screen_gradient_is_that_of_the_projected_center():
     """Catches density control fed with pixels, or with the gradient of something else: half images, by both axes."""
     scene = cloud(25, count=40, size=(60, 35))
     xyz, rotation, log_scale, opacity, sh = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
-    view = torch.from_numpy(scene.camera.world_to_camera)
-    points = xyz @ view[:3, :3].T + view[:3, 3]
-    order = torch.argsort(points[:, 2])
-    covariance = view[:3, :3] @ reference._covariance(rotation, log_scale) @ view[:3, :3].T
-    center, projected = reference._project(points[order], covariance[order], scene.camera, 0.3)
+    order = torch.argsort(reference.camera_space(xyz, scene.camera)[:, 2])
+    center, projected, depth, _ = reference.project(xyz[order], rotation[order], log_scale[order], scene.camera)
     center.requires_grad_()
     color = reference.sh_color(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
     opacity = torch.sigmoid(opacity[order])
-    rgb, alpha, _ = reference._composite(
-        reference._alpha(center, projected, opacity, scene.camera), color, points[order, 2]
-    )
+    rgb, alpha, _ = reference.blend(reference.splat_alpha(center, projected, opacity, scene.camera), color, depth)
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
     gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), center)[0]
     expected = np.zeros(40)
@@ -246,7 +231,7 @@ def test_screen_gradient_is_that_of_the_projected_center():
     np.testing.assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
 
 
-def test_color_follows_strain_with_the_right_gradient():
+def test_color_follows_strain_with_the_right_gradient(back_end):
     """Catches strain of the wrong triangle, a coefficient in the wrong unit, and a gradient that misses the clamp."""
     scene, rng = SCENES["dark"], np.random.default_rng(31)
     count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
@@ -276,7 +261,7 @@ def test_color_follows_strain_with_the_right_gradient():
 
 
 @pytest.mark.parametrize("name", ["plain", "smaller than a pixel", "needles", "around the camera", "degree 1"])
-def test_antialiasing_takes_what_the_low_pass_adds(name):
+def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
     """Catches a compensation of the wrong determinant, and gradients that leave it out: scale, rotation, position."""
     scene = SCENES[name]
     cotangents = random_cotangents(scene.camera, 6)
@@ -373,7 +358,7 @@ def test_results_do_not_depend_on_threads():
 
 
 @pytest.mark.parametrize(("count", "behind"), [(0, False), (5, True)])
-def test_nothing_in_view_is_black_and_has_no_gradient(count, behind):
+def test_nothing_in_view_is_black_and_has_no_gradient(back_end, count, behind):
     """Catches empty pair lists, and splats mirrored through the camera."""
     scene = cloud(22, count=count, spread=0.2)
     if behind:
@@ -383,7 +368,7 @@ def test_nothing_in_view_is_black_and_has_no_gradient(count, behind):
         assert not array.any()
 
 
-def test_splats_below_one_255th_are_invisible():
+def test_splats_below_one_255th_are_invisible(back_end):
     """Catches a cut that differs from the reference's where the whole splat lies under it."""
     scene = cloud(23)
     scene.splats["opacity"][:] = np.log(0.0039 / (1 - 0.0039))
@@ -392,7 +377,7 @@ def test_splats_below_one_255th_are_invisible():
         assert not array.any()
 
 
-def test_extreme_parameters_stay_finite():
+def test_extreme_parameters_stay_finite(back_end):
     """Catches overflow and 0/0 in float32: what one broken splat must never do is poison the image or the others."""
     scene = cloud(24, count=40)
     splats = scene.splats

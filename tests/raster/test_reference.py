@@ -85,12 +85,12 @@ def test_color_is_never_negative():
     assert not rgb.any()
 
 
-def test_centerd_frustum_limit_is_1_3_half_fields_of_view():
-    """Catches a limit that is not symmetric on a centerd camera, or ignores an off-center principal point."""
+def test_centered_frustum_limit_is_1_3_half_fields_of_view():
+    """Catches a limit that is not symmetric on a centered camera, or ignores an off-center principal point."""
     slope = torch.tensor([-9.0, 9.0])
-    centerd = reference._clamp_to_frustum(slope, 100, 50.0, 50.0)
-    np.testing.assert_allclose(centerd, [-1.3, 1.3], rtol=1e-6)
-    shifted = reference._clamp_to_frustum(slope, 100, 50.0, 60.0)
+    centered = reference.clamp_to_frustum(slope, 100, 50.0, 50.0)
+    np.testing.assert_allclose(centered, [-1.3, 1.3], rtol=1e-6)
+    shifted = reference.clamp_to_frustum(slope, 100, 50.0, 60.0)
     np.testing.assert_allclose(shifted, [-1.5, 1.1], rtol=1e-6)
 
 

@@ -1,5 +1,6 @@
-"""Layers rendered together, here and by a worker in another interpreter."""
+"""Layers rendered together, in this process and by a render server in another interpreter."""
 
+import io
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +18,7 @@ from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 from stga_addon.raster.render import render
 from stga_addon.raster.render_client import RenderClient
-from stga_addon.raster.render_protocol import pack_layers, unpack_layers
+from stga_addon.raster.render_protocol import pack_layers, receive, unpack_layers
 
 HERE = np.eye(4)
 AHEAD = np.array([0, 0, 1.2])
@@ -50,8 +51,8 @@ def embedded() -> PosedSplats:
     return PosedSplats(replace(splats, xyz=0.05 * splats.xyz, strain_color=colors), frames, HERE, True)
 
 
-def test_one_layer_is_drawn_as_ever():
-    """Catches a second rasterizer that parts from the first."""
+def test_one_layer_gives_the_pixels_of_render():
+    """Catches differences between `compose` and `render`."""
     splats = cloud()
     picture = compose([world(splats)], CAMERA)
     expected = render(splats, CAMERA, (1.0, 0.5, 0.0))
@@ -61,7 +62,7 @@ def test_one_layer_is_drawn_as_ever():
 
 
 def test_layers_are_sorted_together():
-    """Catches layers that are painted one over the other: halves of a cloud make the whole cloud."""
+    """Catches layers that are composited one over the other: two halves of a cloud must make the whole cloud."""
     splats = cloud()
     half = np.arange(len(splats)) % 2 == 0
     whole, halves = (compose(layers, CAMERA, True) for layers in (
@@ -71,7 +72,7 @@ def test_layers_are_sorted_together():
     np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
 
 
-def test_turning_the_scene_turns_nothing():
+def test_moving_scene_and_camera_together_changes_nothing():
     """Catches colors that follow the scene's directions instead of the layer's own."""
     turn = np.eye(4)
     turn[:3, :3] = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
@@ -87,7 +88,7 @@ def test_turning_the_scene_turns_nothing():
 
 
 def test_depth_is_the_mean_of_what_a_pixel_shows():
-    """Catches depth that alpha darkens."""
+    """Catches depth that is not divided by alpha."""
     one = cloud(1)
     splats = replace(one, xyz=np.array([[0, 0, 3]], np.float32), log_scale=np.full((1, 3), -1, np.float32))
     depth = compose([world(splats)], CAMERA, True).depth
@@ -96,8 +97,8 @@ def test_depth_is_the_mean_of_what_a_pixel_shows():
     assert compose([], CAMERA, True).alpha.max() == 0
 
 
-def test_layers_survive_the_wire():
-    """Catches a field that is forgotten on the way to the worker."""
+def test_layers_survive_the_protocol():
+    """Catches a field that is not sent to the server."""
     layers = [embedded(), world(cloud())]
     for layer, back in zip(layers, unpack_layers(pack_layers(layers)), strict=True):
         for name, value in vars(layer.splats).items():
@@ -108,8 +109,8 @@ def test_layers_survive_the_wire():
 
 
 @pytest.mark.slow
-def test_a_worker_draws_the_same(monkeypatch):
-    """Catches a worker that draws something else, forgets its layers, or stays behind."""
+def test_the_server_renders_the_same(monkeypatch):
+    """Catches a server that renders something else, forgets its layers, or is left running."""
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     remote = RenderClient(lambda: sys.executable)
     layers = [embedded(), world(cloud())]
@@ -117,27 +118,45 @@ def test_a_worker_draws_the_same(monkeypatch):
         here, there = compose(layers, camera, True), remote.compose(layers, camera, True)
         for name in ("rgb", "alpha", "depth"):
             np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
-    assert remote._worker is not None
-    _, worker = remote._worker
-    with pytest.raises(StgaError, match="could not draw"):
+    assert remote._server is not None
+    _, server = remote._server
+    with pytest.raises(StgaError, match="could not render"):
         remote.compose(layers, replace(CAMERA, world_to_camera=np.zeros(3)))
-    worker.kill()
-    worker.wait()
-    with pytest.raises(StgaError, match="ended"):
+    server.kill()
+    server.wait()
+    with pytest.raises(StgaError, match="exited unexpectedly"):
         remote.compose(layers, CAMERA)
     assert remote.compose([world(cloud())], CAMERA).alpha.max() > 0
     remote.close()
-    assert subprocess.Popen.poll(worker) is not None
+    assert subprocess.Popen.poll(server) is not None
 
 
-def test_nobody_who_can_draw_is_one_sentence(monkeypatch):
+@pytest.mark.slow
+def test_output_of_libraries_does_not_disturb_the_protocol(tmp_path, monkeypatch):
+    """Catches a server whose replies are mixed with what C code writes to descriptor 1 while packages are imported."""
+    shim = "import os, sys\nos.write(1, b'noise' * 100)\nsys.path.remove({!r})\ndel sys.modules[__name__]\nimport {}\n"
+    (tmp_path / "platformdirs.py").write_text(shim.format(str(tmp_path), "platformdirs"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
+    remote = RenderClient(lambda: sys.executable)
+    np.testing.assert_array_equal(remote.compose([world(cloud())], CAMERA).rgb, compose([world(cloud())], CAMERA).rgb)
+    remote.close()
+
+
+def test_what_is_no_message_is_refused():
+    """Catches a length read from foreign output, for which the client would wait forever."""
+    with pytest.raises(ValueError, match="begins with"):
+        receive(io.BytesIO(b"Loading something, please wait"))
+
+
+def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
     """Catches a traceback where Blender's Python has no numba and there is no training environment."""
 
     def nobody() -> str:
         raise StgaError("no training environment")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
-    with pytest.raises(StgaError, match=r"drawing splats needs numba and platformdirs .*training environment"):
+    with pytest.raises(StgaError, match=r"Rendering splats needs numba and platformdirs .*training environment"):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)

@@ -1,7 +1,7 @@
-"""The Warp kernels on Warp's CPU device: every scene that the CPU's kernels have to pass, and their own promises.
+"""The Warp kernels on Warp's CPU device: what they have beside the tests that both sets of kernels share.
 
-The tests of the other back end run again with `render` exchanged, so both keep the same tolerances. That the code is
-also right on a GPU, these tests cannot say; that it compiles for one, the last of them does.
+Those are the tests with the fixture `back_end`. That the code is also right on a GPU, no test here can say; that it
+compiles for one, the last of them does.
 """
 
 from dataclasses import replace
@@ -12,10 +12,8 @@ import pytest
 import torch
 import trimesh
 import warp as wp
-from numerics import scenes, test_generated, test_projection
 from numerics.meshes import DEGENERATE, WHOLE, mesh_of
 
-from raster import test_gsplat as gsplat
 from raster import test_kernels
 from raster.test_kernels import (
     GRADIENT_TOLERANCE,
@@ -30,13 +28,12 @@ from raster.test_kernels import (
 from stga_addon.avatar.embedding import CONVENTIONS, WORLD, face_frames
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.raster import reference
-from stga_addon.raster.cpu import autograd as cpu
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import adam_rows
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.gpu import blend, embed, image_loss, optimizer, self_test
-from stga_addon.raster.gpu.autograd import render_differentiable, shared
+from stga_addon.raster.gpu.autograd import shared_arrays
 from stga_addon.raster.gpu.rasterize import DeviceFrames, Rasterizer, device_camera
 from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
 from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
@@ -45,115 +42,10 @@ DEVICE = "cpu"
 MODULES = self_test.MODULES
 
 
-@pytest.fixture(autouse=True)
-def other_back_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever test of the CPU's kernels is called from here draws with Warp."""
-    for module in (test_kernels, gsplat, test_projection):
-        monkeypatch.setattr(module, "render_differentiable", render_differentiable)
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_image_and_gradients_are_the_references(name: str) -> None:
-    """Catches any error in projection, harmonics, tile lists, blending or their derivatives, one scene a trap."""
-    test_kernels.test_image_and_gradients_are_the_references(name)
-
-
-@pytest.mark.parametrize("name", test_projection.SCENES)
-def test_hard_scene_is_the_references(name: str) -> None:
-    """Catches formulas that are right on paper and lose their digits in float32."""
-    test_projection.test_hard_scene_is_the_references(name)
-
-
-@pytest.mark.parametrize("norm", [0.0, 1e-38, 1e-13, 1e13, 1e37])
-def test_quaternions_of_any_length(norm: float) -> None:
-    """Catches squares that leave float32's range."""
-    test_projection.test_quaternions_of_any_length(norm)
-
-
-@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_embedded_splats(convention: str) -> None:
-    """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on triangles."""
-    test_kernels.test_embedded_splats_render_and_train_in_their_frames(convention)
-
-
-gsplat_case = gsplat.gsplat_case
-
-
-def test_gsplats_images(gsplat_case) -> None:
-    """Catches a difference of convention from gsplat's images."""
-    gsplat.test_kernels_reproduce_gsplat(gsplat_case)
-
-
-def test_extreme_parameters_stay_finite() -> None:
-    """Catches overflow and 0/0: what one broken splat must never do is poison the image or the others."""
-    test_kernels.test_extreme_parameters_stay_finite()
-
-
-def test_ten_thousand_opaque_layers() -> None:
-    """Catches a backward pass that divides by 1 − alpha beyond the pixel's end."""
-    test_projection.test_ten_thousand_opaque_layers()
-
-
-def test_random_scenes() -> None:
-    """Catches NaN, infinity and disagreement that no listed scene provokes; the same scenes as the CPU's."""
-    test_generated.test_any_scene_is_the_references()
-
-
-@pytest.mark.parametrize(("count", "behind"), [(0, False), (5, True)])
-def test_nothing_in_view(count: int, behind: bool) -> None:
-    """Catches empty lists, and splats mirrored through the camera."""
-    test_kernels.test_nothing_in_view_is_black_and_has_no_gradient(count, behind)
-
-
-@pytest.mark.parametrize("name", test_projection.BROKEN)
-def test_a_broken_splat_is_dropped(name: str) -> None:
-    """Catches NaN that spreads, or that a clamp turns into a plausible number: the others' bits must not change."""
-    scene = scenes.facing(20)
-    field, value = test_projection.BROKEN[name]
-    scene.splats[field][3] = value
-    others = np.arange(20) != 3
-    cotangents = random_cotangents(scene.camera)
-    images, gradients = test_kernels.kernel_gradients(scene, cotangents)
-    expected_images, expected = test_kernels.kernel_gradients(scenes.rows(scene, others), cotangents)
-    for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_array_equal(image, want)
-    for parameter in NAMES:
-        np.testing.assert_array_equal(gradients[parameter][others], expected[parameter], err_msg=parameter)
-        assert not gradients[parameter][3].any(), parameter
-
-
-def strained(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colors per strain (N, 3, 3), and a strain (1, 3) of the one frame."""
-    rng = np.random.default_rng(seed)
-    return rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32), rng.normal(0, 1, (1, 3)).astype(np.float32)
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_strain_color_and_antialiasing_are_the_other_back_ends(antialiased: bool) -> None:
-    """Catches a color that does not follow strain, opacity not compensated, and either left out of the gradient."""
-    scene = cloud(31, log_scale=-4.0)
-    color, strain = strained(60, 0)
-    frames = replace(WORLD, strain=strain)
-    results = []
-    for back_end in (cpu.render_differentiable, render_differentiable):
-        given = [*(scene.splats[name] for name in NAMES), color]
-        tensors = [torch.from_numpy(value).clone().requires_grad_() for value in given]
-        images = back_end(Parameters(*tensors), scene.camera, frames, antialiased=antialiased)
-        cotangents = random_cotangents(scene.camera)
-        loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
-        results.append(([i.detach().numpy() for i in images], torch.autograd.grad(loss, tensors)))
-    (expected, wanted), (images, gradients) = results
-    for image, want in zip(images[:2], expected[:2], strict=True):
-        np.testing.assert_allclose(image, want, atol=IMAGE_TOLERANCE)
-    for name, gradient, want in zip(Parameters._fields, gradients, wanted, strict=True):
-        assert want.abs().max() > 0, name
-        np.testing.assert_allclose(gradient, want, atol=5e-5 * float(want.abs().max()), err_msg=name)
-
-
 class Raw:
     """A scene through the array door: renderings, and gradients whose untouched rows keep `fill`."""
 
-    def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None) -> None:
+    def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None, antialiased: bool = False) -> None:
         self.rasterizer = rasterizer or Rasterizer(DEVICE)
         self.count = len(scene.splats["xyz"])
         tensors = [torch.from_numpy(scene.splats[name]) for name in NAMES]
@@ -168,20 +60,20 @@ class Raw:
                 (camera_frames.strain, wp.float32),
             )
         ]
-        self.frames = DeviceFrames(*arrays, device_camera(scene.camera, scene.degree, 0))
+        self.frames = DeviceFrames(*arrays, device_camera(scene.camera, scene.degree, 0, antialiased=antialiased))
         v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
         self.v_image, self.v_transmittance = v_image.float(), -v_alpha.float()
 
     def forward(self, focus: np.ndarray | None = None, reach: int = 0, **options):
         marked = None if focus is None else wp.array(focus.astype(np.uint8), dtype=wp.uint8, device=DEVICE)
-        splats = shared(self.tensors)
+        splats = shared_arrays(self.tensors)
         return self.rasterizer.forward(splats, self.face, self.frames, focus=marked, reach=reach, **options)
 
     def gradients(self, rendering, fill: float = 0.0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         """Gradients by name, the rows written, and those rows' screen gradient."""
         gradients = Parameters(*(torch.full_like(t, fill) for t in self.tensors))
         screen = self.rasterizer.backward(
-            rendering, shared(self.tensors), self.face, wp.from_torch(self.v_image), shared(gradients),
+            rendering, shared_arrays(self.tensors), self.face, wp.from_torch(self.v_image), shared_arrays(gradients),
             wp.from_torch(self.v_transmittance),
         )  # fmt: skip
         written = np.flatnonzero(rendering.wanted.numpy())

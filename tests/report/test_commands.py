@@ -34,7 +34,7 @@ def test_what_is_timed_is_what_will_train(
     assert main(["presets", str(toy_root), *device]) == 0
     assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
     made = []
-    monkeypatch.setattr("stga_addon.training.run.loop.train", lambda *call: made.append(call[-1]) or tmp_path)
+    monkeypatch.setattr("stga_addon.training.run.loop.train", lambda *call: made.append(call[2].device) or tmp_path)
     monkeypatch.setattr("stga_addon.report.run_summary.report_run", lambda folder: [])
     assert main(["train", str(toy_root), "--preset", "draft", "--out", str(tmp_path), *device]) == 0
     assert timed == ["warp-cpu"] * 7

@@ -20,7 +20,7 @@ def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     ]
 
 
-def test_what_a_person_reads() -> None:
+def test_summary_of_a_run() -> None:
     """Catches the last evaluation given for the best one, and figures that were not measured."""
     lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
     assert lines[0] == (
@@ -31,7 +31,7 @@ def test_what_a_person_reads() -> None:
     assert summarize_run([], None) == []
 
 
-def test_targets_and_levels() -> None:
+def test_targets_and_plateaus() -> None:
     """Catches a target that is reached and said to be missed, or the other way round."""
     assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), 30.0)
     missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
@@ -41,7 +41,7 @@ def test_targets_and_levels() -> None:
     assert "nothing was gained after 20 s" in level[2]
 
 
-def test_a_run_is_concluded(toy: Capture, tmp_path: Path) -> None:
+def test_report_of_a_finished_run(toy: Capture, tmp_path: Path) -> None:
     """Catches metrics that a run writes and the summary cannot read, and a missing picture."""
     train(toy, tmp_path, Run(toy.root, None, "vhap", make_settings(iterations=12, hull_points=False, lattice=0)))
     assert report_run(tmp_path)[0].startswith("held-out views: ")

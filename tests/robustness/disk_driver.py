@@ -16,7 +16,7 @@ from training.toys import quick_settings
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
-from stga_addon.training.run import folder as run_folder
+from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run.folder import Run
 
@@ -47,7 +47,7 @@ def main(disk: Path, root: Path) -> dict[str, Any]:
             return str(error)
         return ""
 
-    found: dict[str, Any] = {"full": message(fill), "kept": run_folder.read_checkpoint(out).iteration}
+    found: dict[str, Any] = {"full": message(fill), "kept": checkpoints.read_checkpoint(out).iteration}
     found["avatar"] = len(read_avatar(out / "avatar.npz").splats)
     found["litter"] = [path.name for path in out.glob(".*")] + [path.name for path in out.glob("run.lock")]
     found["still full"] = message(resume=True)
@@ -55,10 +55,10 @@ def main(disk: Path, root: Path) -> dict[str, Any]:
     remount = ["mount", "-o", "remount,{}", str(disk)]
     subprocess.run([part.format("ro") for part in remount], check=True)
     found["read-only"] = message(resume=True)
-    found["read-only kept"] = run_folder.read_checkpoint(out).iteration
+    found["read-only kept"] = checkpoints.read_checkpoint(out).iteration
     subprocess.run([part.format("rw") for part in remount], check=True)
     found["resumed"] = message(resume=True)
-    found["end"] = run_folder.read_checkpoint(out).iteration
+    found["end"] = checkpoints.read_checkpoint(out).iteration
     return found
 
 

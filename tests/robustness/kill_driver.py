@@ -30,8 +30,10 @@ from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.precompile import precompile_kernels
 from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
 from stga_addon.training.run import loop as run_module
+from stga_addon.training.run import metrics_log
 from stga_addon.training.run.folder import Run
 
 ITERATIONS = 250
@@ -99,18 +101,18 @@ def opened(out: Path, faces: int) -> dict[str, Any]:
         if (out / "run.json").exists():
             run_folder.read_run(out)
         if (out / "checkpoint.npz").exists():
-            run_folder.read_selection(out, faces)
-            found["iteration"] = run_folder.read_checkpoint(out).iteration
+            checkpoints.read_selection(out, faces)
+            found["iteration"] = checkpoints.read_checkpoint(out).iteration
         if (out / "avatar.npz").exists():
             read_avatar(out / "avatar.npz")
-        run_folder.read_metrics(out)
+        metrics_log.read_metrics(out)
     except StgaError as error:
         found["error"] = str(error)
     return found
 
 
 def same_bits(out: Path, expected: Path) -> bool:
-    ours, theirs = (tensors_of(run_folder.read_checkpoint(folder).state) for folder in (out, expected))
+    ours, theirs = (tensors_of(checkpoints.read_checkpoint(folder).state) for folder in (out, expected))
     return all(torch.equal(ours[name].view(torch.uint8), theirs[name].view(torch.uint8)) for name in theirs)
 
 

@@ -17,8 +17,10 @@ from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.run import loop as run_module
-from stga_addon.training.run.folder import Run, append_metrics, locked, read_checkpoint
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run, locked
 from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import append_metrics
 from stga_addon.training.run.progress import Progress
 
 from .disk_driver import FULL_AT, ITERATIONS

@@ -32,13 +32,15 @@ from stga_addon.capture.meshes import read_mesh, read_regions
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
 from stga_addon.capture.release import read_face_ids, read_soup
-from stga_addon.capture.summary import describe
+from stga_addon.capture.summary import summarize_capture
 from stga_addon.capture.transforms import read_transforms
 from stga_addon.files import read_json, read_npz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
+from stga_addon.training.run import metrics_log
 
 from .limits import behaves
 
@@ -83,8 +85,8 @@ NPZ_READERS: dict[str, Callable[[Path], Any]] = {
     "flame model": read_flame,
     "flame frame": lambda path: read_frame(path, MODEL),
     "flame motion": lambda path: read_motion(path, MODEL),
-    "checkpoint": lambda path: run_folder.read_checkpoint(path.parent),
-    "selection": lambda path: run_folder.read_selection(path.parent, 5),
+    "checkpoint": lambda path: checkpoints.read_checkpoint(path.parent),
+    "selection": lambda path: checkpoints.read_selection(path.parent, 5),
 }
 FILE_NAMES = {"checkpoint": "checkpoint.npz", "selection": "selection.npz"}
 
@@ -177,9 +179,9 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "flame npz": ("a.npz", read_flame),
     "masks": ("a.pkl", read_pickled_arrays),
     "run": ("run.json", lambda path: run_folder.read_run(path.parent)),
-    "checkpoint": ("checkpoint.npz", lambda path: run_folder.read_checkpoint(path.parent)),
-    "selection": ("selection.npz", lambda path: run_folder.read_selection(path.parent, 5)),
-    "metrics": ("metrics.jsonl", lambda path: run_folder.read_metrics(path.parent)),
+    "checkpoint": ("checkpoint.npz", lambda path: checkpoints.read_checkpoint(path.parent)),
+    "selection": ("selection.npz", lambda path: checkpoints.read_selection(path.parent, 5)),
+    "metrics": ("metrics.jsonl", lambda path: metrics_log.read_metrics(path.parent)),
     "image": ("a.png", lambda path: read_image(view_of(path, 4, 4))),
 }
 
@@ -277,7 +279,7 @@ FRAME_VALUES: dict[str, Any] = {
 def test_frames(tmp_path: Path, name: str) -> None:
     """Catches values that are valid JSON and nonsense: numbers beyond floats, paths beyond names, jumps in time."""
     root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(FRAME_VALUES[name]))
-    behaves(lambda: describe(open_capture(root)), tmp_path)
+    behaves(lambda: summarize_capture(open_capture(root)), tmp_path)
 
 
 @pytest.mark.parametrize("key", ["canonical_mesh_path", "regions_path"])
@@ -612,22 +614,22 @@ META_VALUES: dict[str, Any] = {
 @pytest.mark.parametrize("key", META_VALUES)
 def test_checkpoints_of_wrong_kinds(tmp_path: Path, key: str) -> None:
     """Catches a checkpoint that loads and then fails, or trains for ever, in the middle of the resumed run."""
-    run_folder.write_checkpoint(tmp_path, make_checkpoint())
+    checkpoints.write_checkpoint(tmp_path, make_checkpoint())
     arrays = read_npz(tmp_path / "checkpoint.npz")
     for value in META_VALUES[key]:
         meta = {**json.loads(arrays["meta"].tobytes()), key: value}
         np.savez(tmp_path / "checkpoint.npz", **{**arrays, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
-        message = behaves(lambda: run_folder.read_checkpoint(tmp_path), tmp_path)
+        message = behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
         assert "checkpoint.npz: " in message, (key, value)
 
 
 @pytest.mark.parametrize("text", ['"text"', "3", "[]", "[" * 100_000, "null"])
 def test_meta_that_is_no_object(tmp_path: Path, text: str) -> None:
     """Catches AttributeError and RecursionError where the header of a checkpoint is other JSON than an object."""
-    run_folder.write_checkpoint(tmp_path, make_checkpoint())
+    checkpoints.write_checkpoint(tmp_path, make_checkpoint())
     arrays = {**read_npz(tmp_path / "checkpoint.npz"), "meta": np.frombuffer(text.encode(), np.uint8)}
     np.savez(tmp_path / "checkpoint.npz", **arrays)
-    assert "checkpoint.npz: " in behaves(lambda: run_folder.read_checkpoint(tmp_path), tmp_path)
+    assert "checkpoint.npz: " in behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -636,9 +638,9 @@ def test_checkpoints_that_are_not_finite(tmp_path: Path, part: str, value: float
     """Catches a broken number that a resumed run would keep for ever."""
     checkpoint = make_checkpoint()
     getattr(checkpoint.state, part).opacity[3] = value
-    run_folder.write_checkpoint(tmp_path, checkpoint)
+    checkpoints.write_checkpoint(tmp_path, checkpoint)
     assert f"{part}/opacity holds a value that is not finite" in behaves(
-        lambda: run_folder.read_checkpoint(tmp_path), tmp_path
+        lambda: checkpoints.read_checkpoint(tmp_path), tmp_path
     )
 
 
@@ -648,8 +650,8 @@ def test_a_checkpoint_of_an_odd_number_of_coefficients(tmp_path: Path) -> None:
     for part in ("parameters", "gradients", "first", "second"):
         old = getattr(checkpoint.state, part)
         setattr(checkpoint.state, part, old._replace(sh=torch.zeros(len(checkpoint.state), 7, 3)))
-    run_folder.write_checkpoint(tmp_path, checkpoint)
-    assert "7 coefficients" in behaves(lambda: run_folder.read_checkpoint(tmp_path), tmp_path)
+    checkpoints.write_checkpoint(tmp_path, checkpoint)
+    assert "7 coefficients" in behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize("name", ["²", "९", "-1", "9" * 5000, "", "1.5"])
@@ -657,9 +659,9 @@ def test_selections_of_odd_timesteps(tmp_path: Path, name: str) -> None:
     """Catches names that Python calls digits and cannot turn into a number."""
     np.savez(tmp_path / "selection.npz", **{name: np.ones(5, bool)})
     if name == "९":
-        assert "९" in behaves(lambda: run_folder.read_selection(tmp_path, 5), tmp_path)
+        assert "९" in behaves(lambda: checkpoints.read_selection(tmp_path, 5), tmp_path)
     else:
-        assert behaves(lambda: run_folder.read_selection(tmp_path, 5), tmp_path)
+        assert behaves(lambda: checkpoints.read_selection(tmp_path, 5), tmp_path)
 
 
 SETTINGS: list[dict[str, Any]] = [
@@ -703,17 +705,18 @@ def test_runs_with_impossible_settings(tmp_path: Path, change: dict[str, Any]) -
     assert "run.json: " in behaves(lambda: run_folder.read_run(tmp_path), tmp_path)
 
 
-METRICS = [b"3\n", b"{}\n", b'{"iteration": "x"}\n', b"\xff\xff\n", b"\0" * 100, b"[" * 100_000, b'{"iteration": null}']
+METRICS = [b"\xff\xff\n", b"\0" * 100, b"[" * 100_000, b'{"iteration": 20, "sec']
+LINE = {"seconds": 1.0, "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
 
 
 @pytest.mark.parametrize("damage", METRICS)
 def test_metrics_after_a_power_cut(tmp_path: Path, damage: bytes) -> None:
     """Catches a run that cannot be resumed because of a line of its log: what was whole before it stays."""
-    run_folder.append_metrics(tmp_path, {"iteration": 10})
+    metrics_log.append_metrics(tmp_path, {"iteration": 10, **LINE})
     with (tmp_path / "metrics.jsonl").open("ab") as out:
         out.write(damage)
-    assert not behaves(lambda: run_folder.read_metrics(tmp_path), tmp_path)
-    assert run_folder.read_metrics(tmp_path) == [{"iteration": 10}]
-    run_folder.cut_metrics(tmp_path, 20)
-    run_folder.append_metrics(tmp_path, {"iteration": 20})
-    assert [line["iteration"] for line in run_folder.read_metrics(tmp_path)] == [10, 20]
+    assert not behaves(lambda: metrics_log.read_metrics(tmp_path), tmp_path)
+    assert metrics_log.read_metrics(tmp_path) == [{"iteration": 10, **LINE}]
+    metrics_log.cut_metrics(tmp_path, 20)
+    metrics_log.append_metrics(tmp_path, {"iteration": 20, **LINE})
+    assert [line["iteration"] for line in metrics_log.read_metrics(tmp_path)] == [10, 20]

@@ -1,4 +1,4 @@
-"""A toy capture that all tests of training share: a ball of 10 cm, of one colour per view, seen by three cameras."""
+"""A toy capture that all tests of training share: a ball of 10 cm, of one color per view, seen by three cameras."""
 
 from pathlib import Path
 

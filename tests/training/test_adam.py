@@ -26,7 +26,7 @@ def set_gradients(state: TrainState, rng: np.random.Generator, scale: float = 1.
 
 
 def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
-    """Each row's parameters as float64 tensors of their own; the view-dependent colour apart."""
+    """Each row's parameters as float64 tensors of their own; the view-dependent color apart."""
     rows = []
     for n in range(len(state)):
         row = {name: t[n].double().clone() for name, t in state.parameters._asdict().items()}
@@ -40,7 +40,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
     """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε, and a
     running average that begins with the initial value, or goes on while its row is frozen.
 
-    With constant colour, other parameters have more columns than `sh`.
+    With constant color, other parameters have more columns than `sh`.
     """
     state = new_state(random_splats(6, 4, seed, degree))
     rng = np.random.default_rng(seed)
@@ -73,8 +73,8 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
             np.testing.assert_allclose(
                 getattr(state.parameters, name)[n], row[name].detach(), rtol=1e-5, atol=25 * RATES[name] * 1e-5
             )
-        colour = torch.cat([row["sh"], row["sh_rest"]]).detach()
-        np.testing.assert_allclose(state.parameters.sh[n], colour, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5)
+        color = torch.cat([row["sh"], row["sh_rest"]]).detach()
+        np.testing.assert_allclose(state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5)
 
 
 def test_frozen_rows_keep_every_bit() -> None:

@@ -41,7 +41,7 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
 
 
 def test_alpha_becomes_the_mask(toy: Capture) -> None:
-    """Catches splats whose opacity no image can tell, because they have the background's colour: a white fringe."""
+    """Catches splats whose opacity no image can tell, because they have the background's color: a white fringe."""
     assert transmittance_error(toy, random_background=True) < 0.6 * transmittance_error(toy, random_background=False)
 
 
@@ -58,7 +58,7 @@ def test_without_a_mask_the_background_stays(toy: Capture) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_backgrounds_depend_on_seed_and_iteration_alone(toy: Capture, seed: int) -> None:
-    """Catches a resumed run that continues with other colours than an unbroken one."""
+    """Catches a resumed run that continues with other colors than an unbroken one."""
     view = toy.views["train"][0]
     states = []
     for _ in range(2):

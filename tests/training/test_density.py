@@ -18,34 +18,34 @@ FACES, COUNT = 6, 40
 FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
-def busy_state(pulled: list[int]) -> TrainState:
-    """Forty splats on six triangles, of which the listed ones are pulled at, the first hardest."""
+def busy_state(listed: list[int]) -> TrainState:
+    """Forty splats on six triangles, of which the listed ones have a screen gradient, the first the largest."""
     state = random_state(COUNT, FACES)
     state.face[:] = torch.arange(COUNT) % FACES
     state.screen_gradient.zero_()
     state.gradient_count.fill_(2.0)
-    for strength, row in enumerate(reversed(pulled), 1):
+    for strength, row in enumerate(reversed(listed), 1):
         state.screen_gradient[row] = float(strength)
     return state
 
 
-def control(state: TrainState, room: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
-    return control_density(state, room, np.random.default_rng(seed), share)
+def control(state: TrainState, budget: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
+    return control_density(state, budget, np.random.default_rng(seed), share)
 
 
 def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
     """Catches moments of one row given to another after splitting, and children without a second moment: both throw
     splats about for many steps."""
-    pulled = [3, 17, 30]
-    state = busy_state(pulled)
+    listed = [3, 17, 30]
+    state = busy_state(listed)
     before = bits(state)
     after = bits(new := control(state))
-    survivors = np.setdiff1d(np.arange(COUNT), pulled)
+    survivors = np.setdiff1d(np.arange(COUNT), listed)
     assert len(new) == COUNT + 3
     for name, old in before.items():
         if name not in ("screen_gradient", "gradient_count"):
             np.testing.assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
-    parents = np.tile(pulled, 2)  # in the order of their screen_gradient
+    parents = np.tile(listed, 2)  # in the order of their screen_gradient
     for name, tensor in tensors_of(new).items():
         if name.startswith("first"):
             assert not tensor[COUNT - 3 :].any()
@@ -60,11 +60,11 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
 
 def test_children_stand_on_either_side_along_the_longest_axis() -> None:
     """Catches a rotation that is transposed or forgotten, an offset in the wrong unit, and a lost triangle."""
-    pulled = [3, 17, 30, 8]
-    state = busy_state(pulled)
+    listed = [3, 17, 30, 8]
+    state = busy_state(listed)
     parents = state.splats()
     children = control(state).splats().rows(np.arange(COUNT - 4, COUNT + 4))
-    for n, row in enumerate(pulled):
+    for n, row in enumerate(listed):
         pair = children.rows(np.array([n, n + 4]))
         assert (pair.face == parents.face[row]).all()
         assert (pair.unbound == parents.unbound[row]).all()
@@ -116,25 +116,25 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
         assert 0.75 < spread[1] / spread[0] < 1.1
 
 
-@pytest.mark.parametrize(("room", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)])
-def test_room_and_share_bound_the_growth(room: int, share: float, split: int) -> None:
-    """Catches growth without end; of those pulled at, the hardest come first, and those not seen never."""
-    pulled = [20, 4, 33, 11, 26]
-    state = busy_state(pulled)
-    gone = {tuple(p) for p in state.splats().xyz[pulled[:split]].tolist()}
-    new = control(state, room, share)
+@pytest.mark.parametrize(("budget", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)])
+def test_budget_and_share_bound_the_growth(budget: int, share: float, split: int) -> None:
+    """Catches unbounded growth, and splits of other splats than those with the largest screen gradient."""
+    listed = [20, 4, 33, 11, 26]
+    state = busy_state(listed)
+    gone = {tuple(p) for p in state.splats().xyz[listed[:split]].tolist()}
+    new = control(state, budget, share)
     assert len(new) == COUNT + split
     left = {tuple(p) for p in new.splats().xyz.tolist()}
     assert not gone & left
-    assert {tuple(p) for p in state.splats().xyz[pulled[split:]].tolist()} <= left
+    assert {tuple(p) for p in state.splats().xyz[listed[split:]].tolist()} <= left
 
 
-def test_the_pull_is_a_mean() -> None:
+def test_the_screen_gradient_is_a_mean() -> None:
     """Catches splats that are split because many cameras see them, not because they are wrong."""
     state = busy_state([])
     state.screen_gradient[5], state.gradient_count[5] = 10.0, 100.0
     state.screen_gradient[6], state.gradient_count[6] = 5.0, 1.0
-    new = control(state, room=1)
+    new = control(state, budget=1)
     left = {tuple(p) for p in new.splats().xyz.tolist()}
     assert tuple(state.parameters.xyz[6].tolist()) not in left
     assert tuple(state.parameters.xyz[5].tolist()) in left
@@ -163,7 +163,7 @@ def test_faint_splats_go_but_no_triangles_last_one() -> None:
     assert int(others.sum()) == sum(n >= 30 and n % FACES != 2 for n in range(COUNT))
 
 
-def test_one_splat_a_triangle_survives_even_when_all_are_faint_and_pulled_at() -> None:
+def test_one_splat_a_triangle_survives_even_when_all_are_transparent_and_have_a_gradient() -> None:
     """Catches pruning and splitting that together empty a triangle."""
     state = busy_state(list(range(0, COUNT, 2)))
     state.parameters.opacity[:] = -20.0

@@ -16,14 +16,14 @@ from stga_addon.training.evaluate.evaluation_views import (
 )
 
 
-def test_watched_views_are_spread(toy: Capture) -> None:
+def test_evaluation_views_are_evenly_spread(toy: Capture) -> None:
     """Catches evaluations while training that cost more than the training, or look at one end of the sequence."""
     view = toy.views["val"][0]
     many = tuple(replace(view, timestep=t) for t in range(100))
-    watched = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
-    assert len(watched) == MAX_EVALUATION_VIEWS
-    assert (watched[0], watched[-1]) == (0, 99)
-    assert set(np.diff(watched)) <= {6, 7}
+    chosen = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
+    assert len(chosen) == MAX_EVALUATION_VIEWS
+    assert (chosen[0], chosen[-1]) == (0, 99)
+    assert set(np.diff(chosen)) <= {6, 7}
     assert list(choose_evaluation_views(toy)) == list(toy.views["val"])
 
 

@@ -1,6 +1,7 @@
 """A run's folder: what is written comes back, and what is damaged is refused in one sentence."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -12,8 +13,10 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import tensors_of
-from stga_addon.training.run import folder
-from stga_addon.training.run.folder import Checkpoint, Run
+from stga_addon.training.run import checkpoint as checkpoint_files
+from stga_addon.training.run import folder, metrics_log
+from stga_addon.training.run.checkpoint import Checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import STRATEGIES, make_settings
 from stga_addon.worker.lock import lock_owner
 
@@ -48,12 +51,15 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, r"run\.json: was written by run format 2, this version reads 1"),
-        ({"version": None}, r"run\.json: was written by run format None"),
+        ({"version": 1}, r"run\.json: has run format version 1, this add-on reads 2"),
+        ({"version": None}, r"run\.json: has run format version None"),
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
         ({"capture": None}, r"run\.json: a field is missing or malformed"),
-        ({"settings": None}, r"run\.json: a field is missing or malformed"),
-        ({"settings": {}}, r"run\.json: a field is missing or malformed .*selection"),
+        ({"settings": None}, r"run\.json: settings: fields are missing"),
+        ({"settings": {}}, r"run\.json: settings: fields are missing or unknown \(antialiased, "),
+        ({"device": "toaster"}, r"run\.json: .*device is 'toaster'"),
+        ({"principal_point": "corner"}, r"run\.json: .*principal_point is 'corner'"),
+        ({"identity": {"faces": 5}}, r"run\.json: a field is missing or malformed"),
     ],
 )
 def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -64,7 +70,7 @@ def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> N
         folder.read_run(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"format": "stga-run", "version": 1}'])
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"format": "stga-run", "version": 2}'])
 def test_run_files_that_are_none(tmp_path: Path, text: str) -> None:
     """Catches a traceback for a run.json cut off by a full disk."""
     with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
@@ -78,27 +84,27 @@ def test_selection_round_trip(tmp_path: Path) -> None:
     """Catches timesteps mixed up or masks that lose their kind, and a selection made for another mesh."""
     rng = np.random.default_rng(0)
     selection = {t: rng.random(FACES) < 0.5 for t in (0, 3, 123456)}
-    folder.write_selection(tmp_path, selection)
-    again = folder.read_selection(tmp_path, FACES)
+    checkpoint_files.write_selection(tmp_path, selection, "a")
+    again = checkpoint_files.read_selection(tmp_path, FACES)
     assert list(again) == list(selection)
     for timestep, faces in selection.items():
         np.testing.assert_array_equal(again[timestep], faces)
         assert again[timestep].dtype == bool
     with pytest.raises(StgaError, match=r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"):
-        folder.read_selection(tmp_path, FACES + 1)
-    folder.write_selection(tmp_path, {0: np.ones(FACES, np.float32)})
+        checkpoint_files.read_selection(tmp_path, FACES + 1)
+    checkpoint_files.write_selection(tmp_path, {0: np.ones(FACES, np.float32)}, "a")
     with pytest.raises(StgaError, match="float32"):
-        folder.read_selection(tmp_path, FACES)
+        checkpoint_files.read_selection(tmp_path, FACES)
     np.savez(tmp_path / "selection.npz", mouth=selection[0])
     with pytest.raises(StgaError, match="'mouth'"):
-        folder.read_selection(tmp_path, FACES)
+        checkpoint_files.read_selection(tmp_path, FACES)
 
 
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
     """Catches a moment or a count that resumption would lose."""
     checkpoint = make_checkpoint()
-    folder.write_checkpoint(tmp_path, checkpoint)
-    again = folder.read_checkpoint(tmp_path)
+    checkpoint_files.write_checkpoint(tmp_path, checkpoint)
+    again = checkpoint_files.read_checkpoint(tmp_path)
     theirs = tensors_of(again.state)
     for name, tensor in tensors_of(checkpoint.state).items():
         if name.startswith("gradients/"):
@@ -113,19 +119,19 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 def test_checkpoint_before_any_evaluation(tmp_path: Path) -> None:
     """Catches −inf and None, which plain JSON does not know, lost on their way."""
     checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, -np.inf, 0, [])
-    folder.write_checkpoint(tmp_path, checkpoint)
-    again = folder.read_checkpoint(tmp_path)
+    checkpoint_files.write_checkpoint(tmp_path, checkpoint)
+    again = checkpoint_files.read_checkpoint(tmp_path)
     assert (again.best_psnr, again.last_timestep) == (-np.inf, None)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.2, 0.9, 0.999])
 def test_truncated_checkpoints(tmp_path: Path, kept: float) -> None:
     """Catches half a checkpoint taken for a whole one."""
-    folder.write_checkpoint(tmp_path, make_checkpoint())
+    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
     with pytest.raises(StgaError, match=r"checkpoint\.npz"):
-        folder.read_checkpoint(tmp_path)
+        checkpoint_files.read_checkpoint(tmp_path)
 
 
 def changed(arrays: dict[str, np.ndarray], name: str, value: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -133,7 +139,11 @@ def changed(arrays: dict[str, np.ndarray], name: str, value: np.ndarray | None) 
 
 
 def meta(**changes: Any) -> np.ndarray:
-    values = {"version": 1, **{k: v for k, v in vars(make_checkpoint()).items() if k != "state"}, **changes}
+    values = {
+        "version": 2,
+        **{k: v for k, v in vars(make_checkpoint()).items() if k not in ("state", "tracking")},
+        **changes,
+    }
     return np.frombuffer(json.dumps(values).encode(), np.uint8)
 
 
@@ -144,8 +154,14 @@ DAMAGES: dict[str, tuple[str, np.ndarray | None]] = {
     "shorter array": ("first/xyz", np.zeros((11, 3), np.float32)),
     "scalar": ("opacity", np.zeros((), np.float32)),
     "meta is no JSON": ("meta", np.frombuffer(b"hello", np.uint8)),
-    "another version": ("meta", meta(version=2)),
-    "unknown count": ("meta", meta(colour=3)),
+    "another version": ("meta", meta(version=1)),
+    "unknown count": ("meta", meta(color=3)),
+    "negative iteration": ("meta", meta(iteration=-1)),
+    "endless time": ("meta", meta(elapsed_s=math.inf)),
+    "quality that is no number": ("meta", meta(best_psnr=math.nan)),
+    "negative timestep": ("meta", meta(last_timestep=-1)),
+    "losses that are no list": ("meta", meta(losses=5)),
+    "identity that is no text": ("meta", meta(identity=None)),
     "wrong width": ("parameters/rotation", np.zeros((12, 3), np.float32)),
     "wrong kind": ("parameters/xyz", np.zeros((12, 3), np.float64)),
     "moment of another shape": ("first/sh", np.zeros((12, 1, 3), np.float32)),
@@ -155,36 +171,72 @@ DAMAGES: dict[str, tuple[str, np.ndarray | None]] = {
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
     """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check."""
-    folder.write_checkpoint(tmp_path, make_checkpoint())
+    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as data:
         arrays = dict(data)
     np.savez(path, **changed(arrays, *DAMAGES[name]))
     with pytest.raises(StgaError, match=r"checkpoint\.npz: "):
-        folder.read_checkpoint(tmp_path)
+        checkpoint_files.read_checkpoint(tmp_path)
 
 
 def test_missing_checkpoint(tmp_path: Path) -> None:
     """Catches a traceback where a run stopped before its first checkpoint."""
     with pytest.raises(StgaError, match=r"checkpoint\.npz: cannot be read"):
-        folder.read_checkpoint(tmp_path)
+        checkpoint_files.read_checkpoint(tmp_path)
+
+
+def line(iteration: int, **changes: Any) -> dict[str, Any]:
+    """A line of metrics with the fields that every line has."""
+    times = {"seconds": 0.5 * iteration, "splats": 80, "evaluation_s": 0.1, "wall_s": float(iteration)}
+    return {"iteration": iteration, **times, **changes}
 
 
 def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
-    """Catches a run that cannot go on because a kill cut its last line, and lines lost before that one."""
-    assert folder.read_metrics(tmp_path) == []
-    lines = [{"iteration": n, "psnr": 20.0 + n} for n in (10, 20, 30)]
-    for line in lines:
-        folder.append_metrics(tmp_path, line)
-    assert folder.read_metrics(tmp_path) == lines
+    """Catches a run that cannot be resumed because a kill cut its last line, and lines lost before that one."""
+    assert metrics_log.read_metrics(tmp_path) == []
+    lines = [line(n, psnr=20.0 + n, ssim=0.9) for n in (10, 20, 30)]
+    for written in lines:
+        metrics_log.append_metrics(tmp_path, written)
+    assert metrics_log.read_metrics(tmp_path) == lines
     path = tmp_path / "metrics.jsonl"
     path.write_text(path.read_text()[:-5])
-    assert folder.read_metrics(tmp_path) == lines[:2]
-    folder.cut_metrics(tmp_path, 20)
-    folder.append_metrics(tmp_path, {"iteration": 25})
-    assert folder.read_metrics(tmp_path) == [*lines[:2], {"iteration": 25}]
-    folder.cut_metrics(tmp_path, 15)
-    assert folder.read_metrics(tmp_path) == lines[:1]
+    assert metrics_log.read_metrics(tmp_path) == lines[:2]
+    metrics_log.cut_metrics(tmp_path, 20)
+    metrics_log.append_metrics(tmp_path, line(25))
+    assert metrics_log.read_metrics(tmp_path) == [*lines[:2], line(25)]
+    metrics_log.cut_metrics(tmp_path, 15)
+    assert metrics_log.read_metrics(tmp_path) == lines[:1]
+
+
+FORECAST = {"seconds": 1.0, "psnr": 30.0, "error": 0.1, "ahead": 5.0, "gain": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("damaged", "message"),
+    [
+        (5, "is no object"),
+        ({"iteration": 10}, "seconds is None"),
+        (line(10, seconds="1"), "seconds is '1'"),
+        (line(10, seconds=math.inf), "seconds is inf"),
+        (line(10, wall_s=-1.0), "wall_s is -1.0"),
+        ({**line(10), "iteration": 1.5}, r"iteration is 1\.5"),
+        (line(10, evaluation_s=None), "evaluation_s is None"),
+        (line(10, psnr="high"), "psnr is 'high'"),
+        (line(10, loss=10**400), "loss is 1000"),
+        (line(10, psnr=30.0), "psnr has no ssim"),
+        (line(10, forecast=5), "forecast is 5"),
+        (line(10, psnr=3.0, ssim=1.0, forecast={**FORECAST, "gain": None}), "forecast is"),
+        (line(10, forecast=FORECAST), "forecast has no psnr"),
+    ],
+)
+def test_damaged_metrics(tmp_path: Path, damaged: Any, message: str) -> None:
+    """Catches a traceback in resume, curve or summary for a line that lacks a field or has a wrong one."""
+    for written in (line(5), damaged, line(20)):
+        metrics_log.append_metrics(tmp_path, written)
+    with pytest.raises(StgaError, match=rf"metrics\.jsonl: line 2: {message}") as caught:
+        metrics_log.read_metrics(tmp_path)
+    assert len(str(caught.value)) < 400
 
 
 def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_horizon() -> None:
     assert forecast_horizon(1000, 4) is None
 
 
-def test_level_since() -> None:
+def test_plateau_start() -> None:
     """Catches a run called finished while it rises, and one that falls and is not."""
     assert plateau_start(curve(TIMES, rising(TIMES))) is None
     fell = np.where(TIMES < 50, rising(TIMES), rising(np.array([48.0])) - (TIMES - 50) / 100)
@@ -164,3 +164,11 @@ def test_forecasts_read_as_people_speak() -> None:
     """Catches a sign that is lost."""
     assert str(Forecast(240.0, 30.3, 0.12, 120.0, 0.31)) == "another 2 min: about +0.3 dB (±0.1)"
     assert str(Forecast(240.0, 30.3, 0.12, 20.0, -0.31)) == "another 20 s: about -0.3 dB (±0.1)"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_curve_that_starts_at_zero_has_no_forecast() -> None:
+    """Catches a warning about a division by zero in the summary of a run of a few milliseconds."""
+    seconds = np.arange(5.0)
+    assert forecast(curve(seconds, seconds + 20), 5.0) is None
+    assert "too few evaluations" in explain_missed_target(curve(seconds, seconds + 20), 40)

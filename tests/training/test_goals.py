@@ -15,8 +15,10 @@ from stga_addon.errors import StgaError
 from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import loop as run_module
-from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import EVALUATION_SHARE, train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 
 from .toys import quick_settings

@@ -1,6 +1,7 @@
 """The iteration on a Warp device, which here is Warp's CPU device, against the CPU's: states, freezing, whole runs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
-from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
@@ -94,15 +97,15 @@ def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
         assert off.mean() < 2e-3 if name.startswith("parameters/") else not off.any(), name
 
 
-def test_losses_are_the_cpus_and_told_two_iterations_late(toy: Capture) -> None:
-    """Catches a loss of another iteration, of a local one, or told twice."""
+def test_losses_are_the_cpus_and_returned_two_iterations_late(toy: Capture) -> None:
+    """Catches a loss of another iteration, of a local one, or returned twice."""
     settings = settings_of()
     cpu, warp = pair(toy, settings)
     parts = [(1, None), (3, None), (1, toy.regions["mouth"]), (3, None), (1, None), (3, None)]
     batches = [batch_of(toy, settings, timestep, selected=part) for timestep, part in parts]
-    expected, told = ([step.step(batch) for batch in batches] for step in (cpu, warp))
-    assert [loss is None for loss in told] == [True, True, False, False, True, False]
-    assert [told[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
+    expected, losses = ([step.step(batch) for batch in batches] for step in (cpu, warp))
+    assert [loss is None for loss in losses] == [True, True, False, False, True, False]
+    assert [losses[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
@@ -190,7 +193,8 @@ def runs(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Callable[[st
     """Folders of the same run, from start to end, by device."""
     folder = tmp_path_factory.mktemp("runs")
     for device in ("cpu", "warp-cpu"):
-        train(toy, folder / device, make_run(toy, "selective", iterations=40, strain_color=True), device=device)
+        run = make_run(toy, "selective", iterations=40, strain_color=True)
+        train(toy, folder / device, replace(run, device=device))
     return lambda device: folder / device
 
 
@@ -207,8 +211,8 @@ def test_a_run_reaches_the_cpus_quality(runs: Callable[[str], Path]) -> None:
 @pytest.mark.slow
 def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, runs: Callable[[str], Path], tmp_path: Path) -> None:
     """Catches anything queued that a checkpoint misses, and sums that depend on chance: every bit must agree."""
-    run: Run = make_run(toy, "selective", iterations=40, strain_color=True)
-    train(toy, tmp_path, run, report=stop_at(17), device="warp-cpu")
+    run: Run = replace(make_run(toy, "selective", iterations=40, strain_color=True), device="warp-cpu")
+    train(toy, tmp_path, run, report=stop_at(17))
     assert read_checkpoint(tmp_path).iteration == 17
-    train(toy, tmp_path, run, resume=True, device="warp-cpu")
+    train(toy, tmp_path, run, resume=True)
     assert_same_state(tmp_path, runs("warp-cpu"))

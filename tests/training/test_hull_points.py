@@ -1,4 +1,4 @@
-"""Hull seeds of an analytic scene: a ball beside the mesh, seen in masks from all around."""
+"""Hull points of an analytic scene: a ball beside the mesh, seen in masks from all around."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.training.optimize.hull_points import CLEARANCE, VOXEL, hull_points
+from stga_addon.training.optimize.hull_points import MIN_MESH_DISTANCE_M, VOXEL_SIZE_M, hull_points
 
 SIZE, FOCAL, FAR = 120, 300.0, 1.0
 CENTRE, RADIUS = np.array([0.06, 0.075, 0.02]), 0.03
@@ -68,73 +68,75 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return scene(tmp_path_factory.mktemp("beside"))
 
 
-def in_world(capture: Capture, seeds, convention: str = "stga"):
+def in_world(capture: Capture, points, convention: str = "stga"):
     frames = face_frames(capture.mesh(TIMESTEP), capture.faces, capture.neutral, convention)
-    return to_world(seeds, frames)
+    return to_world(points, frames)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_seeds_stand_on_the_balls_surface(beside: Capture, convention: str) -> None:
-    """Catches swapped image axes, an ignored principal point, seeds in the wrong frame, and a filled or holed shell."""
-    seeds = hull_points(beside, beside.views["train"], convention, 1)
-    world = in_world(beside, seeds, convention)
+def test_points_stand_on_the_balls_surface(beside: Capture, convention: str) -> None:
+    """Catches swapped image axes, an ignored principal point, points in the wrong frame, and a shell with holes."""
+    points = hull_points(beside, beside.views["train"], convention, 1)
+    world = in_world(beside, points, convention)
     height = np.linalg.norm(world.xyz - CENTRE, axis=1) - RADIUS
     assert len(world) > 300
     # The hull of twenty views is a little larger than the ball; the grid point lies within a voxel of its surface.
-    assert height.min() > -2 * VOXEL
-    assert height.max() < 2 * VOXEL
-    # Around the mesh's bounding box the grid ends, and near the mesh no seeds are wanted.
+    assert height.min() > -2 * VOXEL_SIZE_M
+    assert height.max() < 2 * VOXEL_SIZE_M
+    # Around the mesh's bounding box the grid ends, and near the mesh no points are wanted.
     sphere = CENTRE + RADIUS * np.array(trimesh.creation.icosphere(3).vertices)
     low, high = beside.mesh(TIMESTEP).min(0), beside.mesh(TIMESTEP).max(0)
-    margin = 0.25 * np.linalg.norm(high - low) - 2 * VOXEL
+    margin = 0.25 * np.linalg.norm(high - low) - 2 * VOXEL_SIZE_M
     head = np.linalg.norm(sphere - beside.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
-    wanted = ((sphere > low - margin) & (sphere < high + margin)).all(axis=1) & (head > CLEARANCE + 2 * VOXEL)
+    wanted = ((sphere > low - margin) & (sphere < high + margin)).all(axis=1) & (
+        head > MIN_MESH_DISTANCE_M + 2 * VOXEL_SIZE_M
+    )
     assert wanted.mean() > 0.7
     gaps = np.linalg.norm(sphere[wanted][:, None] - world.xyz[None], axis=2).min(axis=1)
-    assert gaps.max() < 2.5 * VOXEL
+    assert gaps.max() < 2.5 * VOXEL_SIZE_M
 
 
-def test_seeds_are_loose_grey_and_bound_to_the_nearest_triangle(beside: Capture) -> None:
+def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside: Capture) -> None:
     """Catches limits that would pull hair onto the skin, and hair that follows a far part of the face."""
-    seeds = hull_points(beside, beside.views["train"], "stga", 2)
-    assert seeds.unbound.all()
-    assert seeds.sh.shape == (len(seeds), 9, 3)
-    assert not seeds.sh.any()
-    assert not seeds.opacity.any()
-    world = in_world(beside, seeds)
-    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL / 2, rtol=1e-5)
+    points = hull_points(beside, beside.views["train"], "stga", 2)
+    assert points.unbound.all()
+    assert points.sh.shape == (len(points), 9, 3)
+    assert not points.sh.any()
+    assert not points.opacity.any()
+    world = in_world(beside, points)
+    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
     centroids = beside.mesh(TIMESTEP)[beside.faces].mean(1)
-    some = np.arange(0, len(seeds), 7)
+    some = np.arange(0, len(points), 7)
     distances = np.linalg.norm(world.xyz[some, None] - centroids[None], axis=2)
-    bound = distances[np.arange(len(some)), seeds.face[some]]
+    bound = distances[np.arange(len(some)), points.face[some]]
     # The nearest triangle need not have the nearest centroid, but on this even mesh it nearly does.
     np.testing.assert_allclose(bound, distances.min(axis=1), atol=3e-4)
 
 
 def test_masks_that_are_missing_are_read_from_white(beside: Capture) -> None:
-    """Catches captures without masks left without seeds; the light colour stands 5 under white in one channel only."""
+    """Catches captures without masks left without points; the light color stands 5 under white in one channel only."""
     views = [replace(view, mask=None) for view in beside.views["train"]]
     bare, masked = (hull_points(beside, v, "stga", 0) for v in (views, beside.views["train"]))
     np.testing.assert_array_equal(bare.xyz, masked.xyz)
 
 
 def test_nothing_near_the_mesh(tmp_path: Path) -> None:
-    """Catches seeds on the skin itself, where the mesh's own splats are; here the ball is half inside the head."""
+    """Catches points on the skin itself, where the mesh's own splats are; here the ball is half inside the head."""
     capture = scene(tmp_path, np.array([0.04, 0.04, 0.02]), 0.04)
     world = in_world(capture, hull_points(capture, capture.views["train"], "stga", 0))
     head = np.linalg.norm(world.xyz - capture.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     assert len(world) > 100
     # The clearance is measured to vertices and centroids, 2 mm from any point of a triangle of this mesh.
-    assert np.abs(head).min() > CLEARANCE - 0.002
-    assert np.abs(head).min() < CLEARANCE + VOXEL
+    assert np.abs(head).min() > MIN_MESH_DISTANCE_M - 0.002
+    assert np.abs(head).min() < MIN_MESH_DISTANCE_M + VOXEL_SIZE_M
 
 
 def test_empty_masks_give_no_seeds(tmp_path: Path) -> None:
     """Catches a crash where nothing lies outside the mesh, which is the best of captures."""
     capture = scene(tmp_path, CENTRE, 0.0)
-    seeds = hull_points(capture, capture.views["train"], "stga", 1)
-    assert len(seeds) == 0
-    assert seeds.sh.shape == (0, 4, 3)
+    points = hull_points(capture, capture.views["train"], "stga", 1)
+    assert len(points) == 0
+    assert points.sh.shape == (0, 4, 3)
 
 
 def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> None:

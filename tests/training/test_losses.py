@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import conv2d
 
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
 from stga_addon.raster.cpu.layout import TILE
+from stga_addon.raster.reference import image_loss
 from stga_addon.training.optimize.losses import image_gradient, similarity, tile_rectangles, whole_image
 
 # float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.
@@ -29,17 +29,7 @@ def reference(image: np.ndarray, target: np.ndarray, weight: float) -> tuple[np.
     x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     # The 8-bit value as the float32 it is compared as, so that equal pixels are equal here too.
     y = torch.tensor(target * np.float32(1 / 255), dtype=torch.float64).permute(2, 0, 1)
-    line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=torch.float64) ** 2) / (2 * 1.5**2))
-    window = torch.outer(line, line) / line.sum() ** 2
-
-    def blur(a: torch.Tensor) -> torch.Tensor:
-        return conv2d(a[:, None], window[None, None], padding=5)[:, 0]
-
-    mx, my = blur(x), blur(y)
-    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    ssim = (2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
-    absolute = (x - y).abs()
+    absolute, ssim = image_loss(x, y)
     ((1 - weight) * absolute.mean() + weight * (1 - ssim.mean())).backward()
     return x.grad.numpy(), absolute.detach(), ssim.detach()
 

@@ -16,8 +16,10 @@ from stga_addon.errors import StgaError
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import loop as run_module
-from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics, read_run, read_selection
+from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
+from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import STRATEGIES
 

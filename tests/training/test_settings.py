@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from typing import Any
 
 import pytest
@@ -36,33 +37,84 @@ def test_nested_settings_round_trip() -> None:
     assert from_json(json.loads(json.dumps(to_json(settings)))) == settings
 
 
-@pytest.mark.parametrize("change", [{"colour": 1}, {"rates": {"xyz": 1, "abc": 2}}, {"selection": {}}, {"rates": None}])
+@pytest.mark.parametrize(
+    "change", [{"colour": 1}, {"rates": {"xyz": 1, "abc": 2}}, {"selection": {}}, {"rates": None}, {"effects": 5}]
+)
 def test_unknown_or_missing_fields(change: dict[str, Any]) -> None:
-    """Catches a misspelt field that is dropped in silence."""
-    with pytest.raises((TypeError, KeyError)):
+    """Catches a misspelt field that is dropped without a message."""
+    with pytest.raises(StgaError, match=next(iter(change))):
         from_json({**to_json(TrainingSettings(iterations=5)), **change})
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"strategy": "best", "iterations": 5}, "--strategy: 'best' is not one of selective, global"),
-        ({"schedule": "fast", "iterations": 5}, "--schedule: 'fast' is not one of default, paper"),
-        ({}, "one of the two"),
-        ({"seconds": 5.0, "iterations": 5}, "one of the two"),
-        ({"seconds": 0.0}, "more than nothing"),
-        ({"iterations": 0}, "more than nothing"),
-        ({"iterations": -3}, "more than nothing"),
-        ({"seconds": float("nan")}, "more than nothing"),
+        ({"strategy": "best", "iterations": 5}, "setting strategy: expected one of selective, global"),
+        ({"schedule": "fast", "iterations": 5}, "setting schedule: expected one of default, paper"),
+        ({"preset": "best", "iterations": 5}, "setting preset: expected one of draft, standard, final, got 'best'"),
+        ({"preset": [], "iterations": 5}, "setting preset: "),
+        ({}, "either in seconds or in iterations"),
+        ({"seconds": 5.0, "iterations": 5}, "either in seconds or in iterations"),
+        ({"iterations": -3}, "setting iterations: expected a whole number from 1 up to 2147483647, got -3"),
+        ({"effects": {"jaw": "on"}, "schedule": "paper"}, "--effect cannot be combined with --schedule paper"),
     ],
 )
 def test_impossible_settings(arguments: dict[str, Any], message: str) -> None:
-    """Catches a budget of nothing or of two kinds, and names that are not known."""
+    """Catches a budget of two kinds, unknown names, and settings at odds with each other."""
     with pytest.raises(StgaError, match=message):
-        make_settings(**arguments)
+        make_settings(**{"iterations": 5, **arguments} if "effects" in arguments else arguments)
 
 
-def test_the_papers_letter() -> None:
+NO_NUMBERS: tuple[Any, ...] = ("5", True, None, [1], math.nan, math.inf, -math.inf, 10**400)
+REFUSED: list[tuple[str, Any]] = [
+    *[("seconds", value) for value in (0.0, -1.0, float("9" * 400), math.nan, "5", True)],
+    *[("iterations", value) for value in (0, 5.0, math.inf, 1 << 31, 10**400, "5", True)],
+    *[(name, value) for name in ("scale_limit", "growth", "ema_share") for value in NO_NUMBERS],
+    *[("seed", value) for value in (-1, 1.5, 1 << 63, None)],
+    *[("lattice", value) for value in (17, -1, 2.0)],
+    *[("sh_degree", value) for value in (4, -1)],
+    *[("sh_steps", value) for value in ([0.1], (0.1, "0.2"), (-1.0,), 0.5)],
+    *[("density_span", value) for value in ((0.1,), (0.1, 0.2, 0.3), (0.1, -1.0), (0.1, math.inf))],
+    *[("background", value) for value in ((1.0, 1.0), (2.0, 0.0, 0.0), "white")],
+    *[("exposure", value) for value in (((0.0, 1.0),), ((0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0),), (5,), [[1.0] * 7])],
+    *[("target_psnr", value) for value in (0.0, -1.0, 201.0, math.nan, "30")],
+    *[("effects", value) for value in (5, {"jaw": "maybe"}, {"chin": "on"}, {1: "on"})],
+    *[("hull_points", value) for value in (1, None, "yes")],
+    *[("rates", value) for value in (None, 5, Rates(end=-1.0), Rates(xyz=math.inf), Rates(sh="5"))],  # type: ignore[arg-type]
+    ("selection", SelectionOptions(threshold=math.nan)),
+    ("selection", SelectionOptions(threshold=-1.0)),
+    ("selection", SelectionOptions(zero_pose="neck")),
+    ("selection", SelectionOptions(regions=("nose", 5))),  # type: ignore[arg-type]
+    ("scale", 2.0),
+    ("scale", 0.01),
+    ("growth", 101.0),
+    ("convention", "x"),
+    ("global_unit", "x"),
+    ("global_interval", 0),
+    ("density_interval", -1),
+    ("stray_reset_interval", -1),
+    ("warm_up_share", 1.5),
+    ("distance_weight", 10**30),
+    ("ssim_weight", 1.5),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), REFUSED)
+def test_one_schema_for_new_and_stored_settings(name: str, value: Any) -> None:
+    """Catches a setting that begins a run which cannot be read again, or a stored one that breaks training."""
+    budget = {} if name == "seconds" else {"iterations": 5}
+    with pytest.raises(StgaError, match=f"^setting {name}") as caught:
+        make_settings(**{**budget, name: value})
+    assert len(str(caught.value)) < 400
+    stored = {**to_json(make_settings(iterations=5)), "iterations": budget.get("iterations")}
+    plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value
+    if isinstance(value, list):
+        return  # JSON's lists become tuples
+    with pytest.raises(StgaError, match=name):
+        from_json({**stored, name: plain})
+
+
+def test_paper_schedule() -> None:
     """Catches a schedule that does not reach the settings: the figures are the paper's own."""
     paper = make_settings(schedule="paper", iterations=5)
     assert (paper.global_interval, paper.global_unit, paper.warm_up_share) == (20, "iteration", 0.0)

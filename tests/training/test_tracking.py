@@ -22,7 +22,8 @@ from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.tracking import Tracking, frame_gradient, refinable_tracking, with_refined_tracking
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.run.folder import Run, read_checkpoint, read_run
+from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
+from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.schedule import view_order
@@ -232,10 +233,15 @@ def test_stopped_and_resumed_is_the_unbroken_run(lost: Made, run_folder: Path, t
 
 
 def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_path: Path) -> None:
-    """Catches a run that goes on with the tracked meshes after having been trained on others."""
-    shutil.copytree(run_folder, tmp_path / "run")
-    with pytest.raises(StgaError, match="its refined tracking is not of this capture"):
-        train(lost[0], tmp_path / "run", make_run(lost[0], tracking=False), resume=True)
+    """Catches a run that continues with the tracked meshes after having been trained on refined ones."""
+    run = shutil.copytree(run_folder, tmp_path / "run")
+    with pytest.raises(StgaError, match="was begun with other settings"):
+        train(lost[0], run, make_run(lost[0], tracking=False), resume=True)
+    checkpoint = read_checkpoint(run)
+    checkpoint.tracking = None
+    write_checkpoint(run, checkpoint)
+    with pytest.raises(StgaError, match="its checkpoint's refined tracking does not fit"):
+        train(lost[0], run, make_run(lost[0]), resume=True)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +268,9 @@ def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_fo
     capture, _ = lost
     checkpoint = read_checkpoint(run_folder)
     trainer = Trainer(capture, make_run(capture).settings, {}, checkpoint.state)
-    trainer.continue_from(checkpoint)
+    assert trainer.tracking is not None
+    assert checkpoint.tracking is not None
+    trainer.tracking.state = checkpoint.tracking
     shown = with_refined_tracking(capture, run_folder)
     for timestep in TIMESTEPS[:-1]:
         np.testing.assert_allclose(shown.mesh(timestep), trainer.frames.mesh(timestep), atol=1e-12)
@@ -313,7 +321,7 @@ def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
     """Catches a traceback for a file that was written by something else."""
     arrays = read_npz(run_folder / "tracking.npz")
     for name, value, says in (
-        ("timesteps", np.arange(2), "timesteps are no 5 whole numbers"),
+        ("timesteps", np.arange(2), "timesteps: expected 5 whole numbers"),
         ("tracked", np.zeros((2, 20)), r"tracked has shape \(2, 20\), expected 5 timesteps first"),
     ):
         write_npz(tmp_path / "tracking.npz", {**arrays, name: value})
@@ -330,14 +338,14 @@ def test_a_run_that_refines_nothing_leaves_nothing(lost: Made, run_folder: Path,
 
 def test_where_it_cannot_work(toy: Capture, lost: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a traceback where there are no parameters, and a GPU that trains on while nothing is refined."""
-    with pytest.raises(StgaError, match="was not tracked with FLAME"):
+    with pytest.raises(StgaError, match="is not tracked with FLAME"):
         Trainer(toy, quick_settings("global", tracking=True), {})
-    with pytest.raises(StgaError, match="is made for the embedding 'stga'"):
+    with pytest.raises(StgaError, match="needs the embedding convention 'stga'"):
         Trainer(lost[0], quick_settings("gaussian-avatars", tracking=True), {})
-    with pytest.raises(StgaError, match=r"effect tracking: .* on the CPU only, not on warp-cpu"):
+    with pytest.raises(StgaError, match=r"effect tracking=on: .* on the CPU only, not on warp-cpu"):
         Trainer(lost[0], quick_settings("global", tracking=True), {}, device="warp-cpu")
     root = lost[0].root
     train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "warp-cpu", "--iterations", "2"]
     assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2
-    assert "tracking=on: cannot be, because FLAME's parameters are refined on the CPU only" in capsys.readouterr().err
+    assert "FLAME's parameters are refined on the CPU only" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

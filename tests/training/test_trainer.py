@@ -199,7 +199,7 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     assert float(trainer.state.parameters.xyz.norm(dim=1).max()) < 0.5
 
 
-def test_pull_is_gathered_by_global_iterations_only(toy: Capture) -> None:
+def test_screen_gradients_are_accumulated_by_global_iterations_only(toy: Capture) -> None:
     """Catches selected regions that are split more because they are drawn more often, not because they are worse."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
@@ -208,8 +208,8 @@ def test_pull_is_gathered_by_global_iterations_only(toy: Capture) -> None:
         assert trainer.state.gradient_count.max() == expected
 
 
-def test_initial_splats_with_hull_seeds(tmp_path: Path) -> None:
-    """Catches seeds that are mixed up with the lattice, which would be exempt from its limits then."""
+def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
+    """Catches hull points that are mixed up with the lattice, which would be exempt from its limits then."""
     hairy = open_capture(factory.write_mesh_capture(tmp_path / "hairy"))
     rows, columns = np.mgrid[: factory.HEIGHT, : factory.WIDTH] + 0.5
     mask = np.hypot(columns - factory.CX, rows - factory.CY) < 29  # the ball itself: 20 pixels
@@ -225,13 +225,13 @@ def test_initial_splats_with_hull_seeds(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
 
 
-def test_nothing_beside_the_mesh_gives_no_seeds(toy: Capture) -> None:
+def test_nothing_beside_the_mesh_gives_no_hull_points(toy: Capture) -> None:
     """Catches the hull's phantom volumes behind the head, which few cameras on one side cannot contradict."""
     full = initial_splats(toy, quick_settings(lattice=2, hull_points=True))
     assert not full.unbound.any()
 
 
-def test_draw_shows_the_average(toy: Capture) -> None:
+def test_render_shows_the_average(toy: Capture) -> None:
     """Catches evaluations of other splats than those that the avatar is made of."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
@@ -242,8 +242,8 @@ def test_draw_shows_the_average(toy: Capture) -> None:
     assert trainer.render(view).min() == 1
 
 
-def test_draw_is_a_copy(toy: Capture) -> None:
-    """Catches pictures that change when the next one is drawn, since buffers are used again."""
+def test_render_returns_a_copy(toy: Capture) -> None:
+    """Catches pictures that change when the next one is rendered, because buffers are reused."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
     picture = trainer.render(view)

@@ -38,7 +38,7 @@ def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> Trai
 
 
 def quick_settings(strategy: str = "selective", **changes: Any) -> TrainingSettings:
-    """Without hull seeds, which have tests of their own."""
+    """Without hull points, which have tests of their own."""
     return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
 
 

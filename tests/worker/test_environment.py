@@ -52,21 +52,21 @@ FOUND = {
         ("cuda", "14.1", "cuda"),
     ],
 )
-def test_the_device_fits_the_driver(device, driver, chosen):
+def test_device_fits_the_driver(device, driver, chosen):
     """Catches GPU packages where the driver is too old for them, and none where there is a GPU."""
     assert choose_device(device, SMI.format(driver) if driver else None) == chosen
 
 
-def test_cuda_that_cannot_be_is_refused():
-    """Catches gigabytes that are downloaded in vain."""
+def test_unusable_cuda_is_refused():
+    """Catches gigabytes downloaded for a GPU that cannot be used."""
     with pytest.raises(StgaError, match=r"supports CUDA 11\.4, training needs CUDA 12 or newer"):
         choose_device("cuda", SMI.format("11.4"))
     with pytest.raises(StgaError, match="finds no NVIDIA GPU"):
         choose_device("cuda", None)
 
 
-def test_steps(tmp_path):
-    """Catches a site's own index passed over, a network that offline steps would need, and what is never installed."""
+def test_install_steps(tmp_path):
+    """Catches pip's configured index ignored, offline steps that need a network, and packages left out."""
     looking, making, small, rest = install_steps(tmp_path, "/python", "cuda", None, "linux")
     assert making.command == ["/python", "-m", "venv", str(tmp_path)]
     assert rest.command[0] == small.command[0] == str(venv_python(tmp_path))
@@ -84,8 +84,8 @@ def test_steps(tmp_path):
 
 
 @pytest.mark.parametrize(("newest", "status"), [((3, 11), 0), ((99, 0), 1)])
-def test_an_old_python_is_refused_at_once(newest, status, tmp_path, monkeypatch):
-    """Catches gigabytes that are downloaded for a Python that cannot use them."""
+def test_old_python_is_refused_first(newest, status, tmp_path, monkeypatch):
+    """Catches gigabytes downloaded for a Python that cannot use them."""
     monkeypatch.setattr(environment, "MIN_PYTHON", newest)
     looking = install_steps(tmp_path, sys.executable, "cpu", None)[0]
     done = subprocess.run(looking.command, capture_output=True, text=True)
@@ -93,8 +93,8 @@ def test_an_old_python_is_refused_at_once(newest, status, tmp_path, monkeypatch)
     assert ("ERROR: Python 3." in done.stderr) == bool(status)
 
 
-def test_what_an_interpreter_says():
-    """Catches a training environment that is called good and cannot train."""
+def test_check_is_described():
+    """Catches an interpreter reported as usable that cannot train."""
     assert describe_check("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
     old = {**FOUND, "python": "3.9.1"}
     with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
@@ -104,16 +104,16 @@ def test_what_an_interpreter_says():
         describe_check("p", bare)
 
 
-def test_a_bare_interpreter_is_tested(tmp_path):
-    """Catches a test that needs what it tests for: this one has nothing at all installed."""
+def test_bare_interpreter_is_checked(tmp_path):
+    """Catches a check that itself needs a package: this interpreter has none."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = str(venv_python(tmp_path / "venv"))
     with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*matplotlib; install"):
         check_python(python)
 
 
-def test_what_is_no_interpreter(tmp_path):
-    """Catches tracebacks where a path leads to nothing, or to another program."""
+def test_other_programs_are_refused(tmp_path):
+    """Catches a traceback where the path is missing or that of another program."""
     with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
         check_python(str(tmp_path / "python"))
     with pytest.raises(StgaError, match=r"is not a Python that runs this add-on \(exit status 1\)"):
@@ -121,8 +121,8 @@ def test_what_is_no_interpreter(tmp_path):
 
 
 @pytest.mark.slow
-def test_this_interpreter_can_train(tmp_path):
-    """Catches a probe that misses what is there, and a worker that does not tell."""
+def test_check_in_a_worker(tmp_path):
+    """Catches a check that misses installed packages, and a worker without a status."""
     pytest.importorskip("torch")
     folder = status_folder(tmp_path)
     prepare_status_folder(folder)
@@ -135,7 +135,7 @@ def test_this_interpreter_can_train(tmp_path):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """Only the environment and this package's probe: what pip would do is not this test's."""
+    """An installation of the virtual environment alone, without pip."""
     monkeypatch.setattr(environment, "nvidia_smi", lambda: None)
     monkeypatch.setattr(environment, "SIZES_GB", {"cpu": 0.0, "cuda": 0.0})
     made = [sys.executable, "-m", "venv", "--without-pip"]
@@ -145,7 +145,7 @@ def tiny(monkeypatch):
 
 
 def test_environment_is_made(tiny, tmp_path, monkeypatch):
-    """Catches a training environment that is used before it has passed the test, or not found afterwards."""
+    """Catches an environment used before it passed the check, or not found afterwards."""
     monkeypatch.setattr(environment, "check_python", lambda python: f"good {Path(python).exists()}")
     python = venv_python(tmp_path / "venv-1")
     python.parent.mkdir(parents=True)
@@ -159,7 +159,7 @@ def test_environment_is_made(tiny, tmp_path, monkeypatch):
 
 
 def test_failed_environment_is_removed(tiny, tmp_path):
-    """Catches half an environment that is taken for a training environment the next time."""
+    """Catches an incomplete environment that is used the next time."""
     with pytest.raises(StgaError, match="lacks numpy, torch"):
         make_environment(tmp_path, sys.executable)
     assert made_python(tmp_path) is None
@@ -168,7 +168,7 @@ def test_failed_environment_is_removed(tiny, tmp_path):
 
 
 def test_failed_attempt_keeps_the_environment(tiny, tmp_path, monkeypatch):
-    """Catches an artist who can train, tries a newer training environment without a network, and can train no more."""
+    """Catches a working environment lost when making a newer one fails."""
     with monkeypatch.context() as patched:
         patched.setattr(environment, "check_python", lambda python: "good")
         make_environment(tmp_path, sys.executable)
@@ -197,8 +197,8 @@ def test_failed_attempt_keeps_the_environment(tiny, tmp_path, monkeypatch):
         ("bye", "exit status 1$"),
     ],
 )
-def test_a_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypatch):
-    """Catches pip's message lost in a log that nobody opens, and one that says nothing to an artist."""
+def test_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypatch):
+    """Catches pip's reason left in the log, or shown as pip words it."""
     log = status_folder(tmp_path) / LOG_FILE
     script = f"import sys; open({str(log)!r}, 'a').write({printed + chr(10)!r}); sys.exit(1)"
     monkeypatch.setattr(
@@ -208,8 +208,8 @@ def test_a_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkey
         make_environment(tmp_path, sys.executable)
 
 
-def test_an_optional_step_may_fail(tiny, tmp_path, monkeypatch):
-    """Catches no training environment at all where pytorch.org cannot be reached, and PyPI can."""
+def test_optional_step_may_fail(tiny, tmp_path, monkeypatch):
+    """Catches a failure where pytorch.org cannot be reached, but PyPI can."""
     monkeypatch.setattr(environment, "check_python", lambda python: "good")
     failing = InstallStep("failing", [sys.executable, "-c", "raise SystemExit(1)"], optional=True)
     making = environment.install_steps
@@ -217,8 +217,8 @@ def test_an_optional_step_may_fail(tiny, tmp_path, monkeypatch):
     assert make_environment(tmp_path, sys.executable) == "good"
 
 
-def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
-    """Catches a cancel that waits for a download to end, or leaves half an environment."""
+def test_cancel_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
+    """Catches a cancel that waits for a download, or leaves an incomplete environment."""
     folder = status_folder(tmp_path)
     script = f"import pathlib, time; pathlib.Path({str(folder / 'cancel')!r}).touch(); time.sleep(600)"
     steps = [
@@ -233,15 +233,15 @@ def test_cancelling_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
     assert not list(tmp_path.glob("venv*"))
 
 
-def test_a_disk_too_small_is_refused(tmp_path, monkeypatch):
+def test_small_disk_is_refused(tmp_path, monkeypatch):
     """Catches a full disk after half an hour of downloading."""
     monkeypatch.setattr(environment.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
     with pytest.raises(StgaError, match=r"has 0\.1 GB free, the environment needs 1\.5 GB"):
         make_environment(tmp_path, sys.executable, "cpu")
 
 
-def test_the_probe_runs_by_itself():
-    """Catches a probe that prints something else than one JSON object last."""
+def test_check_prints_json():
+    """Catches a check whose last line is not one JSON object."""
     done = subprocess.run(
         [sys.executable, "-m", "stga_addon.worker.environment_check"], capture_output=True, text=True, check=True
     )

@@ -4,11 +4,15 @@ import os
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
+from stga_addon.worker import lock
 from stga_addon.worker.lock import hold_lock, is_locked, lock_owner
 
 HOLD = (
@@ -58,31 +62,36 @@ def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     assert target.read_text() == "mine"
 
 
-def test_probes_do_not_disturb_each_other(tmp_path: Path) -> None:
+@contextmanager
+def probed(path: Path) -> Iterator[None]:
+    """Hold the lock for a moment in another thread, as a probe of another process does, while the block runs."""
+    begun = threading.Event()
+
+    def hold() -> None:
+        with FileLock(path):
+            begun.set()
+            time.sleep(0.1)
+
+    path.touch()
+    thread = threading.Thread(target=hold)
+    thread.start()
+    begun.wait(10)
+    yield
+    thread.join()
+
+
+def test_probes_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a free lock that one probe reports as held because another probe has it for a moment."""
-    path = tmp_path / "worker.lock"
-    path.touch()
-    with ThreadPoolExecutor(2) as threads:
-        assert not any(threads.map(lambda _: is_locked(path), range(100)))
+    monkeypatch.setattr(lock, "PROBE_TIMEOUT_S", 10.0)
+    with probed(tmp_path / "worker.lock"):
+        assert not is_locked(tmp_path / "worker.lock")
 
 
-def test_probes_do_not_keep_a_holder_out(tmp_path: Path) -> None:
+def test_probes_do_not_keep_a_holder_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a worker that fails to start while its folder is watched."""
-    path, stop = tmp_path / "worker.lock", threading.Event()
-    path.touch()
-
-    def probe() -> None:
-        while not stop.is_set():
-            is_locked(path)
-
-    with ThreadPoolExecutor(2) as threads:
-        threads.submit(probe)
-        try:
-            for _ in range(20):
-                with hold_lock(path):
-                    pass
-        finally:
-            stop.set()
+    monkeypatch.setattr(lock, "ACQUIRE_TIMEOUT_S", 10.0)
+    with probed(tmp_path / "worker.lock"), hold_lock(tmp_path / "worker.lock"):
+        pass
 
 
 @pytest.mark.skipif(os.name == "nt", reason="named pipes are files on POSIX systems only")

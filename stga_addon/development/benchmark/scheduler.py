@@ -80,7 +80,8 @@ class _Worker:
 
     def start(self) -> None:
         """Start the process and wait until it is ready to train."""
-        write_run(self._run.out, self._run.run)
+        if not (self._run.out / "run.json").exists():
+            write_run(self._run.out, self._run.run)
         # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
         with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:
             self._process = subprocess.Popen(

@@ -9,19 +9,16 @@ stdin means save and end. Each line, and the start, is answered by a line of JSO
 
 import json
 import sys
+from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-from ...avatar.file import read_avatar
-from ...capture.open import open_capture
 from ...errors import StgaError
 from ...files import write_json
-from ...report.preset_timing import seconds_per_iteration
-from ...training.evaluate.metrics import evaluate_avatar
-from ...training.optimize.tracking import with_refined_tracking
-from ...training.run.folder import read_run
-from ...training.run.loop import train
-from ...training.run.progress import Progress
+from ...worker.stdout import claim_stdout
+
+if TYPE_CHECKING:
+    from ...training.run.progress import Progress
 
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
@@ -40,7 +37,7 @@ class Turns:
         self._until = 0.0
         self.stopped = False
 
-    def report(self, progress: Progress) -> bool:
+    def report(self, progress: "Progress") -> bool:
         """Call after every iteration; True where the run is to stop."""
         if progress.iteration == 0 or self._until > progress.share or progress.share >= 1:
             return False
@@ -57,10 +54,17 @@ class Turns:
 
 def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
     """Train the folder's run in turns and measure its avatar."""
+    from ...avatar.file import read_avatar
+    from ...report.preset_timing import seconds_per_iteration
+    from ...training.evaluate.metrics import evaluate_avatar
+    from ...training.optimize.tracking import with_refined_tracking
+    from ...training.run.loop import train
+    from ...training.run.open_run import open_run
+
     turns = Turns(requests, replies)
     try:
-        run = read_run(folder)
-        capture = open_capture(run.capture, run.flame, run.principal_point)
+        opened = open_run(folder)
+        run, capture = opened.run, opened.capture
         seconds_per_iteration(capture, run.settings, WARM_UP_S)
         avatar = read_avatar(train(capture, folder, run, resume=True, report=turns.report))
         if not turns.stopped:
@@ -74,4 +78,4 @@ def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
 
 
 if __name__ == "__main__":
-    work(Path(sys.argv[1]), sys.stdin, sys.stdout)
+    work(Path(sys.argv[1]), sys.stdin, TextIOWrapper(claim_stdout(), encoding="utf-8"))

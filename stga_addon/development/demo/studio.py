@@ -7,14 +7,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
 from ...capture.camera import Camera
+from ...scene.arrays import flat_floats, triangle_mesh
+from ...scene.cameras import set_intrinsics
+from ...scene.compat import enable_nodes
+from ...scene.display.node_builder import Nodes, new_material
+from ...scene.display.splat_attributes import write_attributes
 
-SENSOR_MM = 36.0
 # Soft boxes around the head: azimuth and elevation in degrees (0, 0 is straight ahead), watts.
 SOFT_BOXES = ((-50, 32, 8.0), (48, 36, 6.0), (0, -20, 2.0))
 BOX_DISTANCE, BOX_SIZE = 1.2, 0.6  # meters
@@ -51,7 +56,7 @@ def render_poses(
     """
     with _studio(subject, samples, seed) as (scene, head, camera), TemporaryDirectory() as folder:
         for index, vertices in enumerate(poses):
-            head.data.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
+            head.data.vertices.foreach_set("co", flat_floats(vertices))
             head.data.update()
             for number, view in enumerate(cameras):
                 place_camera(scene, camera, view)
@@ -61,11 +66,7 @@ def render_poses(
 def place_camera(scene: bpy.types.Scene, camera: bpy.types.Object, view: Camera) -> None:
     """Give a Blender camera and the scene's image the intrinsics and pose of `view` (pixels must be square)."""
     scene.render.resolution_x, scene.render.resolution_y = view.width, view.height
-    camera.data.sensor_fit, camera.data.sensor_width = "HORIZONTAL", SENSOR_MM
-    camera.data.lens = SENSOR_MM * view.fl_x / view.width
-    # Shifts are in image widths and move the frame, so the principal point goes the other way.
-    camera.data.shift_x = (view.width / 2 - view.cx) / view.width
-    camera.data.shift_y = (view.cy - view.height / 2) / view.width
+    set_intrinsics(camera.data, view)
     camera.matrix_world = Matrix(view.camera_to_world_gl.tolist())
 
 
@@ -129,9 +130,7 @@ def _scene(samples: int, seed: int) -> bpy.types.Scene:
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
     scene.view_settings.view_transform = "Standard"
     world = bpy.data.worlds.new("studio")
-    if world.node_tree is None:  # Blender 4: a new world has no tree
-        world.use_nodes = True
-    background = world.node_tree.nodes["Background"]
+    background = enable_nodes(world).nodes["Background"]
     background.inputs["Color"].default_value = (1, 1, 1, 1)
     background.inputs["Strength"].default_value = AMBIENT
     scene.world = world
@@ -149,61 +148,50 @@ def _soft_box(scene: bpy.types.Scene, azimuth: float, elevation: float, watts: f
 
 
 def _head(scene: bpy.types.Scene, subject: StudioHead) -> bpy.types.Object:
-    mesh = bpy.data.meshes.new("subject")
-    mesh.from_pydata(subject.rest.tolist(), [], subject.faces.tolist())
-    mesh.polygons.foreach_set("use_smooth", np.ones(len(subject.faces), bool))
-    for name, kind, key, values in (
-        ("rest", "FLOAT_VECTOR", "vector", subject.rest),
-        ("tint", "FLOAT_VECTOR", "vector", subject.tint),
-        ("roughness", "FLOAT", "value", subject.roughness),
-        ("grain", "FLOAT", "value", subject.grain),
-    ):
-        attribute = mesh.attributes.new(name, kind, "POINT")
-        attribute.data.foreach_set(key, np.ascontiguousarray(values, np.float32).ravel())
-    mesh.materials.append(_surface())
+    mesh = triangle_mesh("subject", subject.rest, subject.faces)
+    attributes = {
+        "rest": ("FLOAT_VECTOR", "vector", flat_floats(subject.rest)),
+        "tint": ("FLOAT_VECTOR", "vector", flat_floats(subject.tint)),
+        "roughness": ("FLOAT", "value", flat_floats(subject.roughness)),
+        "grain": ("FLOAT", "value", flat_floats(subject.grain)),
+    }
+    write_attributes(mesh, attributes, "POINT")
+    mesh.materials.append(new_material("subject", _skin_shader))
     head = bpy.data.objects.new("subject", mesh)
     scene.collection.objects.link(head)
     return head
 
 
-def _surface() -> bpy.types.Material:
+def _skin_shader(nodes: Nodes) -> bpy.types.NodeSocket:
     """Tint times fine noise, and pores as bumps, both fixed to the rest position and faded by `grain`."""
-    material = bpy.data.materials.new("subject")
-    if material.node_tree is None:  # Blender 4: a new material has no tree
-        material.use_nodes = True
-    nodes, link = material.node_tree.nodes, material.node_tree.links.new
-    surface = nodes["Principled BSDF"]
+    rest, tint = (_attribute(nodes, name)["Vector"] for name in ("rest", "tint"))
+    grain, roughness = (_attribute(nodes, name)["Fac"] for name in ("grain", "roughness"))
+    inputs = {
+        "Base Color": nodes.scale(tint, _mottle(nodes, rest, grain)),
+        "Roughness": roughness,
+        "Normal": _pores(nodes, rest, grain),
+    }
+    return nodes.out("ShaderNodeBsdfPrincipled", inputs)
 
-    def attribute(name: str) -> bpy.types.Node:
-        node = nodes.new("ShaderNodeAttribute")
-        node.attribute_name = name
-        return node
 
-    rest, grain = attribute("rest"), attribute("grain")
-    mottle = nodes.new("ShaderNodeTexNoise")
-    mottle.inputs["Scale"].default_value, mottle.inputs["Detail"].default_value = 260.0, 4.0
-    link(rest.outputs["Vector"], mottle.inputs["Vector"])
-    shade = nodes.new("ShaderNodeMapRange")
-    shade.inputs["From Min"].default_value, shade.inputs["From Max"].default_value = 0.3, 0.7
-    shade.inputs["To Min"].default_value, shade.inputs["To Max"].default_value = 0.88, 1.12
-    link(mottle.outputs["Fac"], shade.inputs["Value"])
-    tinted = nodes.new("ShaderNodeVectorMath")
-    tinted.operation = "SCALE"
-    link(attribute("tint").outputs["Vector"], tinted.inputs[0])
-    amount = nodes.new("ShaderNodeMix")
-    amount.inputs["A"].default_value = 1.0
-    link(grain.outputs["Fac"], amount.inputs["Factor"])
-    link(shade.outputs["Result"], amount.inputs["B"])
-    link(amount.outputs["Result"], tinted.inputs["Scale"])
-    link(tinted.outputs["Vector"], surface.inputs["Base Color"])
-    link(attribute("roughness").outputs["Fac"], surface.inputs["Roughness"])
+def _mottle(nodes: Nodes, position: bpy.types.NodeSocket, grain: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Factor on the tint: 0.88 to 1.12 where grain is 1, 1 where it is 0."""
+    noise = _noise(nodes, position, scale=260.0, detail=4.0)
+    ranges = {"From Min": 0.3, "From Max": 0.7, "To Min": 0.88, "To Max": 1.12}
+    shade = nodes.out("ShaderNodeMapRange", {"Value": noise, **ranges})
+    return nodes.out("ShaderNodeMix", {"Factor": grain, "A": 1.0, "B": shade})
 
-    pores = nodes.new("ShaderNodeTexNoise")
-    pores.inputs["Scale"].default_value, pores.inputs["Detail"].default_value = 700.0, 3.0
-    link(rest.outputs["Vector"], pores.inputs["Vector"])
-    bump = nodes.new("ShaderNodeBump")
-    bump.inputs["Distance"].default_value = 0.0006
-    link(pores.outputs["Fac"], bump.inputs["Height"])
-    link(grain.outputs["Fac"], bump.inputs["Strength"])
-    link(bump.outputs["Normal"], surface.inputs["Normal"])
-    return material
+
+def _pores(nodes: Nodes, position: bpy.types.NodeSocket, grain: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Normals of bumps of up to 0.6 mm."""
+    noise = _noise(nodes, position, scale=700.0, detail=3.0)
+    return nodes.out("ShaderNodeBump", {"Strength": grain, "Distance": 0.0006, "Height": noise})
+
+
+def _noise(nodes: Nodes, position: bpy.types.NodeSocket, scale: float, detail: float) -> bpy.types.NodeSocket:
+    inputs = {"Vector": position, "Scale": scale, "Detail": detail}
+    return nodes.add("ShaderNodeTexNoise", inputs).outputs[0]
+
+
+def _attribute(nodes: Nodes, name: str) -> Any:
+    return nodes.add("ShaderNodeAttribute", attribute_name=name).outputs

@@ -1,8 +1,8 @@
-"""Numba kernels: the only code here written for a machine first and a reader second.
+"""CPU rasterizer: Numba kernels and their driver; `layout.py` documents the arrays that they exchange.
 
-Rules that keep LLVM vectorizing the inner loops: they run over contiguous float32, hold no branch (selects
-instead), use float32 constants only, and address several per-pixel values as offsets into one flat array, so
-that no run-time alias checks are needed.
+The kernels are written for speed. LLVM vectorizes an inner loop that runs over contiguous float32, has no branch
+(selects instead), uses float32 constants only, and addresses several per-pixel values as offsets into one flat array,
+so that no alias checks are needed at run time.
 """
 
 import os
@@ -26,18 +26,20 @@ KERNEL_CACHE_FOLDER = os.environ.get("NUMBA_CACHE_DIR") or str(
 
 def _cached(**options: Any) -> Any:
     def decorate(function: Any) -> Any:
-        before = vars(config)["CACHE_DIR"]
-        vars(config)["CACHE_DIR"] = KERNEL_CACHE_FOLDER  # read while decorating; other users of Numba keep their own
+        previous = vars(config)["CACHE_DIR"]
+        vars(config)["CACHE_DIR"] = (
+            KERNEL_CACHE_FOLDER  # read by the decorator; other users of Numba keep their setting
+        )
         try:
             return numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True, **options)(function)
         finally:
-            vars(config)["CACHE_DIR"] = before
+            vars(config)["CACHE_DIR"] = previous
 
     return decorate
 
 
 jit = _cached(nogil=True)
-# What other kernels call. Without forcing LLVM to inline it, a process that compiles calls the function as it was
-# optimized alone, and one that loads the kernel from the cache calls the copy in there, whose last bits differ.
+# For functions that kernels call. Unless LLVM inlines them, a process that compiles the kernel calls the function as
+# compiled alone, and one that loads it from the cache calls the copy in there, whose last bits differ.
 part_jit = _cached(forceinline=True)
 inline_jit = numba.njit(fastmath=FASTMATH, error_model="numpy", inline="always")

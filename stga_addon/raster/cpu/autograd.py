@@ -1,4 +1,4 @@
-"""Splats as torch tensors to an image that torch differentiates: the functional door to the kernels."""
+"""Differentiable rendering of torch tensors by the CPU kernels."""
 
 from typing import Any
 

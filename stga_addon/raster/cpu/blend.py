@@ -19,21 +19,21 @@ LOG2E = np.float32(1.4426950408889634)
 
 # A tile is two halves, eight pixels wide, stored one after the other row by row: a vector of sixteen pixels holds two
 # short rows, and where a splat only grazes one half, little of that half is computed.
-HALF = TILE // 2
+HALF_WIDTH = TILE // 2
 HALF_PIXELS = PIXELS // 2
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
 # around in Python, and the test for it keeps LLVM from vectorizing (12 times slower).
 ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, WEIGHT, V_POWER = (np.uint64(n * PIXELS) for n in range(1, 10))
 BEHIND, V_RED, V_GREEN, V_BLUE = ALIVE, SUM_RED, SUM_GREEN, SUM_BLUE
-STATE = 10 * PIXELS
+STATE_SIZE = 10 * PIXELS
 
 # A tile's splats are copied a batch at a time: memory is asked for many of them at once instead of one after the other,
-# and the rows that they reach are computed in vectors. Column c of splat q lies at c·BATCH + q of a flat array.
-BATCH = 32
+# and the rows that they reach are computed in vectors. Column c of splat q lies at c·BATCH_PAIRS + q of a flat array.
+BATCH_PAIRS = 32
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN, AT_BLUE, AT_EXTENT_Y,
- AT_FIRST, AT_PAST, AT_FIRST_RIGHT, AT_PAST_RIGHT) = (np.uint64(n * BATCH) for n in range(14))  # fmt: skip
-COLUMNS = 14 * BATCH
+ AT_FIRST, AT_PAST, AT_FIRST_RIGHT, AT_PAST_RIGHT) = (np.uint64(n * BATCH_PAIRS) for n in range(14))  # fmt: skip
+BATCH_SIZE = 14 * BATCH_PAIRS
 
 
 @inline_jit
@@ -70,7 +70,7 @@ def _find_rows(count, batch, low, high, low_right, high_right):
     low, high: first and past-the-last row of the left half that may be rendered on; low_right, high_right: of the
     right.
     """
-    two, rows, width = np.float32(2.0), np.float32(TILE), np.float32(HALF)
+    two, rows, width = np.float32(2.0), np.float32(TILE), np.float32(HALF_WIDTH)
     for q in range(np.uint64(count)):
         ellipse = outline(
             batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_PRECISION_X + q], batch[AT_SHEAR + q],
@@ -102,8 +102,8 @@ def _set_coordinates(s):
     """Write the centers of a tile's pixels, relative to its corner."""
     for p in range(np.uint64(PIXELS)):
         half, within = np.int64(p) // HALF_PIXELS, np.int64(p) % HALF_PIXELS
-        s[X + p] = np.float32(half * HALF + within % HALF) + np.float32(0.5)
-        s[Y + p] = np.float32(within // HALF) + np.float32(0.5)
+        s[X + p] = np.float32(half * HALF_WIDTH + within % HALF_WIDTH) + np.float32(0.5)
+        s[Y + p] = np.float32(within // HALF_WIDTH) + np.float32(0.5)
 
 
 @parallel(lambda tiles, *_: len(tiles))
@@ -116,7 +116,7 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, back
     start, pair_splat, projected, extent_y = lists.start, lists.pair_splat, projection.columns, projection.extent_y
     image, transmittance, last, pair_rows = blended.image, blended.transmittance, blended.last, blended.pair_rows
     height, width = last.shape
-    s, batch = np.empty(STATE, np.float32), np.empty(COLUMNS, np.float32)
+    s, batch = np.empty(STATE_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
     _set_coordinates(s)
     for k in range(first_tile, past_tile):
         tile = tiles[k]
@@ -125,12 +125,12 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, back
             s[p] = s[ALIVE + p] = np.float32(1.0)
             s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
         begin, end = start[tile], start[tile + 1]
-        for batch_begin in range(begin, end, BATCH):
+        for batch_begin in range(begin, end, BATCH_PAIRS):
             low, high = _rows_alive(s, 0)
             low_right, high_right = _rows_alive(s, 1)
             if low == high and low_right == high_right:
                 break
-            count = min(BATCH, end - batch_begin)
+            count = min(BATCH_PAIRS, end - batch_begin)
             _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
             for q in range(np.uint64(count)):
                 batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
@@ -147,7 +147,10 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, back
                 order = np.float32(np.int64(j) - begin + 1)
                 for half in range(2):
                     first, past = half * HALF_PIXELS, half * HALF_PIXELS
-                    first, past = first + pair_rows[j, 2 * half] * HALF, past + pair_rows[j, 2 * half + 1] * HALF
+                    first, past = (
+                        first + pair_rows[j, 2 * half] * HALF_WIDTH,
+                        past + pair_rows[j, 2 * half + 1] * HALF_WIDTH,
+                    )
                     if past <= first:
                         continue
                     for p in range(np.uint64(first), np.uint64(past)):
@@ -158,18 +161,22 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, back
                         a = a * s[ALIVE + p] if a >= MIN_ALPHA else np.float32(0.0)
                         t = s[p]
                         after = t * (np.float32(1.0) - a)
-                        goes_on = after > MIN_TRANSMITTANCE
-                        weight = a * t if goes_on else np.float32(0.0)
-                        s[ALIVE + p] = s[ALIVE + p] if goes_on else np.float32(0.0)
-                        s[p] = after if goes_on else t
+                        continues = after > MIN_TRANSMITTANCE
+                        weight = a * t if continues else np.float32(0.0)
+                        s[ALIVE + p] = s[ALIVE + p] if continues else np.float32(0.0)
+                        s[p] = after if continues else t
                         s[SUM_RED + p] += weight * red
                         s[SUM_GREEN + p] += weight * green
                         s[SUM_BLUE + p] += weight * blue
                         s[LAST + p] = order if weight > np.float32(0.0) else s[LAST + p]
         for half in range(2):
             for row in range(min(TILE, height - top)):
-                first, x0, y = np.uint64(half * HALF_PIXELS + row * HALF), left + half * HALF, np.uint64(top + row)
-                for column in range(np.uint64(max(0, min(HALF, width - x0)))):
+                first, x0, y = (
+                    np.uint64(half * HALF_PIXELS + row * HALF_WIDTH),
+                    left + half * HALF_WIDTH,
+                    np.uint64(top + row),
+                )
+                for column in range(np.uint64(max(0, min(HALF_WIDTH, width - x0)))):
                     p, x = first + column, np.uint64(x0) + column
                     image[0, y, x] = s[SUM_RED + p] + s[p] * background[0]
                     image[1, y, x] = s[SUM_GREEN + p] + s[p] * background[1]
@@ -193,7 +200,7 @@ def blend_backward(
     start, pair_splat, grads = lists.start, lists.pair_splat, pair_gradients
     transmittance, last, pair_rows = blended.transmittance, blended.last, blended.pair_rows
     height, width = last.shape
-    s, batch = np.empty(STATE, np.float32), np.empty(COLUMNS, np.float32)
+    s, batch = np.empty(STATE_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
     _set_coordinates(s)
     for k in range(first_tile, past_tile):
         tile = tiles[k]
@@ -205,8 +212,12 @@ def blend_backward(
         deepest = np.int64(0)
         for half in range(2):
             for row in range(min(TILE, height - top)):
-                first, x0, y = np.uint64(half * HALF_PIXELS + row * HALF), left + half * HALF, np.uint64(top + row)
-                for column in range(np.uint64(max(0, min(HALF, width - x0)))):
+                first, x0, y = (
+                    np.uint64(half * HALF_PIXELS + row * HALF_WIDTH),
+                    left + half * HALF_WIDTH,
+                    np.uint64(top + row),
+                )
+                for column in range(np.uint64(max(0, min(HALF_WIDTH, width - x0)))):
                     p, x = first + column, np.uint64(x0) + column
                     t = transmittance[y, x]
                     s[p] = t
@@ -223,7 +234,7 @@ def blend_backward(
             nearest += 1
         batch_end = begin + deepest
         while batch_end > nearest:
-            batch_begin = max(nearest, batch_end - BATCH)
+            batch_begin = max(nearest, batch_end - BATCH_PAIRS)
             count = batch_end - batch_begin
             _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
             for n in range(count):
@@ -238,7 +249,10 @@ def blend_backward(
                 g0 = gx = gy = gxx = gxy = gyy = gr = gg = gb = np.float32(0.0)
                 for half in range(2):
                     first, past = half * HALF_PIXELS, half * HALF_PIXELS
-                    first, past = first + pair_rows[j, 2 * half] * HALF, past + pair_rows[j, 2 * half + 1] * HALF
+                    first, past = (
+                        first + pair_rows[j, 2 * half] * HALF_WIDTH,
+                        past + pair_rows[j, 2 * half + 1] * HALF_WIDTH,
+                    )
                     if past <= first:
                         continue
                     for p in range(np.uint64(first), np.uint64(past)):

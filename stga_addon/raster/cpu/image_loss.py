@@ -10,13 +10,13 @@ import numpy as np
 from . import inline_jit, jit, part_jit
 from .threads import parallel
 
-RADIUS = 5
-LOSS_REACH_PX = 2 * RADIUS
+WINDOW_RADIUS_PX = 5
+LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
 """A pixel's gradient depends on image pixels up to this far away."""
-RING = 2 * RADIUS + 1
+RING_ROWS = 2 * WINDOW_RADIUS_PX + 1
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
-_window = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
-W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in (_window / _window.sum())[: RADIUS + 1])
+_window = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1) / 1.5) ** 2)
+W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in (_window / _window.sum())[: WINDOW_RADIUS_PX + 1])
 ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 
@@ -30,7 +30,8 @@ def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
 
 @part_jit
 def _blur_row(source, offset, out, at, count):
-    """Horizontal blur of source[offset + RADIUS : …] to out[at : at + count]; the source row is padded by RADIUS."""
+    """Horizontal blur of source[offset + WINDOW_RADIUS_PX : …] to out[at : at + count]; the source row is padded by
+    WINDOW_RADIUS_PX."""
     for x in range(np.uint64(count)):
         i = np.uint64(offset) + x
         one = np.uint64(1)
@@ -50,18 +51,18 @@ def _blur_row(source, offset, out, at, count):
 @part_jit
 def _blur_column(ring, plane, stride, row, out, at, count):
     """Vertical blur of the ring's eleven rows around `row` to out[at : at + count]."""
-    base = plane * RING
-    r0 = np.uint64((base + (row - 5) % RING) * stride)
-    r1 = np.uint64((base + (row - 4) % RING) * stride)
-    r2 = np.uint64((base + (row - 3) % RING) * stride)
-    r3 = np.uint64((base + (row - 2) % RING) * stride)
-    r4 = np.uint64((base + (row - 1) % RING) * stride)
-    r5 = np.uint64((base + row % RING) * stride)
-    r6 = np.uint64((base + (row + 1) % RING) * stride)
-    r7 = np.uint64((base + (row + 2) % RING) * stride)
-    r8 = np.uint64((base + (row + 3) % RING) * stride)
-    r9 = np.uint64((base + (row + 4) % RING) * stride)
-    r10 = np.uint64((base + (row + 5) % RING) * stride)
+    base = plane * RING_ROWS
+    r0 = np.uint64((base + (row - 5) % RING_ROWS) * stride)
+    r1 = np.uint64((base + (row - 4) % RING_ROWS) * stride)
+    r2 = np.uint64((base + (row - 3) % RING_ROWS) * stride)
+    r3 = np.uint64((base + (row - 2) % RING_ROWS) * stride)
+    r4 = np.uint64((base + (row - 1) % RING_ROWS) * stride)
+    r5 = np.uint64((base + row % RING_ROWS) * stride)
+    r6 = np.uint64((base + (row + 1) % RING_ROWS) * stride)
+    r7 = np.uint64((base + (row + 2) % RING_ROWS) * stride)
+    r8 = np.uint64((base + (row + 3) % RING_ROWS) * stride)
+    r9 = np.uint64((base + (row + 4) % RING_ROWS) * stride)
+    r10 = np.uint64((base + (row + 5) % RING_ROWS) * stride)
     for x in range(np.uint64(count)):
         out[np.uint64(at) + x] = _blur(
             ring, r0 + x, r1 + x, r2 + x, r3 + x, r4 + x, r5 + x, r6 + x, r7 + x, r8 + x, r9 + x, r10 + x
@@ -81,40 +82,40 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
     for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
         r, c = job // 3, job % 3
         x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
-        # Columns [left, right) hold everything that matters; each row buffer is padded by RADIUS zeros.
+        # Columns [left, right) hold everything that matters; each row buffer is padded by WINDOW_RADIUS_PX zeros.
         left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
         span = right - left
-        stride = span + 2 * RADIUS
-        wanted = np.zeros(RING * stride, np.float32)  # the target's last rows, as floats
+        stride = span + 2 * WINDOW_RADIUS_PX
+        wanted = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
         source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
-        first = np.zeros(4 * RING * stride, np.float32)
+        first = np.zeros(4 * RING_ROWS * stride, np.float32)
         moments = np.zeros(4 * stride, np.float32)
         slopes = np.zeros(3 * stride, np.float32)
-        second = np.zeros(3 * RING * stride, np.float32)
+        second = np.zeros(3 * RING_ROWS * stride, np.float32)
         blurred = np.zeros(3 * stride, np.float32)
         difference, similarity = 0.0, 0.0
         for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
             # 1. horizontal blur of this row's four values
             inside = 0 <= row < height
             if inside:
-                keep = (row % RING) * stride
+                keep = (row % RING_ROWS) * stride
                 for n in range(span):
                     wanted[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
                 for n in range(np.uint64(span)):
                     x, y = image[c, row, np.uint64(left) + n], wanted[np.uint64(keep) + n]
-                    source[np.uint64(RADIUS) + n] = x
-                    source[np.uint64(stride + RADIUS) + n] = y
-                    source[np.uint64(2 * stride + RADIUS) + n] = x * x + y * y
-                    source[np.uint64(3 * stride + RADIUS) + n] = x * y
+                    source[np.uint64(WINDOW_RADIUS_PX) + n] = x
+                    source[np.uint64(stride + WINDOW_RADIUS_PX) + n] = y
+                    source[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = x * x + y * y
+                    source[np.uint64(3 * stride + WINDOW_RADIUS_PX) + n] = x * y
             for plane in range(4):
-                into = (plane * RING + row % RING) * stride
+                into = (plane * RING_ROWS + row % RING_ROWS) * stride
                 if inside:
                     _blur_row(source, plane * stride, first, into, span)
                 else:
                     first[into : into + span] = ZERO
             # 2. SSIM of the row five above, and its slopes blurred horizontally
-            middle = row - RADIUS
-            if middle < y0 - RADIUS:
+            middle = row - WINDOW_RADIUS_PX
+            if middle < y0 - WINDOW_RADIUS_PX:
                 continue
             inside = 0 <= middle < height
             if inside:
@@ -137,27 +138,27 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                     by_product = TWO * luminance * over_e
                     by_squares = -ssim * over_e
                     by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
-                    slopes[np.uint64(RADIUS) + n] = by_mean
-                    slopes[np.uint64(stride + RADIUS) + n] = by_squares
-                    slopes[np.uint64(2 * stride + RADIUS) + n] = by_product
+                    slopes[np.uint64(WINDOW_RADIUS_PX) + n] = by_mean
+                    slopes[np.uint64(stride + WINDOW_RADIUS_PX) + n] = by_squares
+                    slopes[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = by_product
                     held = (n + np.uint64(left) >= np.uint64(x0)) and (n + np.uint64(left) < np.uint64(x1))
                     total += ssim if held else ZERO
                 if counted:
                     similarity += total
             for plane in range(3):
-                into = (plane * RING + middle % RING) * stride
+                into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                 if inside:
                     _blur_row(slopes, plane * stride, second, into, span)
                 else:
                     second[into : into + span] = ZERO
             # 3. gradient of the row five above that
-            out = middle - RADIUS
+            out = middle - WINDOW_RADIUS_PX
             if out < y0 or out >= y1 or out < 0 or out >= height:
                 continue
             for plane in range(3):
                 _blur_column(second, plane, stride, out, blurred, plane * stride, span)
             absolute = ZERO
-            keep = (out % RING) * stride
+            keep = (out % RING_ROWS) * stride
             for n in range(np.uint64(x0 - left), np.uint64(x1 - left)):
                 x, y = image[c, out, np.uint64(left) + n], wanted[np.uint64(keep) + n]
                 sign = ONE if x > y else (-ONE if x < y else ZERO)

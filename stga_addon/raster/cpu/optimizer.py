@@ -1,4 +1,4 @@
-"""Per-row work of training: Adam on listed rows only, and the scale limit."""
+"""Optimizer kernels: Adam on listed rows only, and the limits of scale and distance."""
 
 import math
 
@@ -8,9 +8,9 @@ from . import jit, part_jit
 from .threads import parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-CHUNK = 256
+ROWS_PER_BLOCK = 256
 MAX_GRADIENT = np.float32(1e18)
-"""A gradient beyond this counts as broken: its square would make the second moment infinite, and the row NaN."""
+"""A row with a larger gradient is skipped: its square would make the second moment infinite, and the row NaN."""
 
 
 @parallel(lambda rows, *_: len(rows))
@@ -23,15 +23,19 @@ def adam_rows(
 
     parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
     (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
-    `newest`, or 4 / (steps + 3) where that is more: the first steps are long, and soon to be forgotten. Rows that are
+    `newest`, or 4 / (steps + 3) where that is more, because the first steps are long. Rows that are
     not listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that
     parameter, its moments and its average.
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
-    correct1, correct2, blend = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
-    for begin in range(first_row, past_row, CHUNK):
-        end = min(past_row, begin + CHUNK)
+    correct1, correct2, blend = (
+        np.empty(ROWS_PER_BLOCK, np.float32),
+        np.empty(ROWS_PER_BLOCK, np.float32),
+        np.empty(ROWS_PER_BLOCK, np.float32),
+    )
+    for begin in range(first_row, past_row, ROWS_PER_BLOCK):
+        end = min(past_row, begin + ROWS_PER_BLOCK)
         for n in range(begin, end):
             steps[rows[n]] += 1
             count = np.float64(steps[rows[n]])
@@ -53,10 +57,10 @@ def _adam_block(
     width = parameter.shape[1]
     for n in range(len(rows)):
         i = rows[n]
-        unsound = ZERO
+        invalid = ZERO
         for c in range(width):
-            unsound += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
-        if unsound != ZERO:
+            invalid += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
+        if invalid != ZERO:
             continue
         scale1, scale2, share = correct1[n], correct2[n], blend[n]
         for c in range(width):
@@ -74,7 +78,7 @@ def _adam_block(
 def scale_limit(rows, log_scale, face, unbound, limit, weight, gradient):
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
 
-    limit (F,) per triangle, in the unit of the splats' local scale. Loose splats have no limit. Returns the norm.
+    limit (F,) per triangle, in the unit of the splats' local scale. Unbound splats have no limit. Returns the norm.
     """
     total = 0.0
     for n in range(len(rows)):
@@ -99,7 +103,7 @@ def scale_limit(rows, log_scale, face, unbound, limit, weight, gradient):
 def distance_limit(rows, xyz, face, unbound, limit, weight, gradient):
     """weight · ‖ReLU(|xyz| − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
 
-    limit (F,) per triangle in local units. Loose splats have no limit. Returns the norm.
+    limit (F,) per triangle in local units. Unbound splats have no limit. Returns the norm.
     """
     total = 0.0
     for n in range(len(rows)):

@@ -11,13 +11,13 @@ ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 @part_jit
 def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
-    """What `rows_within` wants to know of a projected splat; the names are its columns' (see `layout.py`).
+    """Coefficients of a projected splat's outline for `rows_within`; the arguments are its columns (see `layout.py`).
 
     On its outline the squares that make the exponent add up to precision_y·extent_y².
     """
     shrink = ONE / (precision_x * shear * shear + precision_y)
     chord = precision_y * extent_y * extent_y * shrink
-    # Rounding, of differences of squares above all, must not cost a pixel.
+    # Slack, so that rounding (of differences of squares above all) does not lose a pixel.
     slack = np.float32(0.01) + np.float32(1e-3) * math.sqrt(chord) + np.float32(1e-6) * extent_y
     lean, rate = shear * extent_y, precision_x * shear * shrink
     return mean_x - HALF, mean_y - HALF, extent_y, lean, rate, chord, precision_x * precision_y * shrink * shrink, slack

@@ -15,11 +15,11 @@ from .threads import parallel
 LOW_PASS_PX2 = np.float32(0.3)
 """Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
 NEAR_M = np.float32(0.01)
-BLOCK = 64
-"""So many splats' gradients are gathered at a time."""
-LIFT = np.float32(2.0**90)
+SUM_BLOCK_SPLATS = 64
+"""Splats whose pair gradients are summed at a time."""
+QUATERNION_LIFT = np.float32(2.0**90)
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
-SH = np.array(
+SH_CONSTANTS = np.array(
     [
         0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396,
         0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277,
@@ -47,7 +47,7 @@ def _unit(q0, q1, q2, q3):
     power of two. 1 / norm only serves the gradient, whose square must stay in range too: it ends at 1e12.
     """
     size = abs(q0) + abs(q1) + abs(q2) + abs(q3)
-    lift = LIFT if size < np.float32(1e-12) else (ONE / LIFT if size > np.float32(1e12) else ONE)
+    lift = QUATERNION_LIFT if size < np.float32(1e-12) else (ONE / QUATERNION_LIFT if size > np.float32(1e12) else ONE)
     q0, q1, q2, q3 = q0 * lift, q1 * lift, q2 * lift, q3 * lift
     rn = ONE / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     if size == ZERO:
@@ -59,23 +59,23 @@ def _unit(q0, q1, q2, q3):
 @part_jit
 def _basis(degree, x, y, z, b):
     """Real spherical harmonics of the unit direction (x, y, z), written to b (16,)."""
-    b[0] = SH[0]
+    b[0] = SH_CONSTANTS[0]
     if degree > 0:
-        b[1], b[2], b[3] = -SH[1] * y, SH[1] * z, -SH[1] * x
+        b[1], b[2], b[3] = -SH_CONSTANTS[1] * y, SH_CONSTANTS[1] * z, -SH_CONSTANTS[1] * x
     if degree > 1:
-        b[4], b[5] = SH[2] * x * y, -SH[2] * y * z
-        b[6] = SH[3] * (TWO * z * z - x * x - y * y)
-        b[7], b[8] = -SH[2] * x * z, SH[4] * (x * x - y * y)
+        b[4], b[5] = SH_CONSTANTS[2] * x * y, -SH_CONSTANTS[2] * y * z
+        b[6] = SH_CONSTANTS[3] * (TWO * z * z - x * x - y * y)
+        b[7], b[8] = -SH_CONSTANTS[2] * x * z, SH_CONSTANTS[4] * (x * x - y * y)
     if degree > 2:
         xx, yy, zz = x * x, y * y, z * z
         three, four = np.float32(3.0), np.float32(4.0)
-        b[9] = -SH[5] * y * (three * xx - yy)
-        b[10] = SH[6] * x * y * z
-        b[11] = -SH[7] * y * (four * zz - xx - yy)
-        b[12] = SH[8] * z * (TWO * zz - three * xx - three * yy)
-        b[13] = -SH[7] * x * (four * zz - xx - yy)
-        b[14] = SH[9] * z * (xx - yy)
-        b[15] = -SH[5] * x * (xx - three * yy)
+        b[9] = -SH_CONSTANTS[5] * y * (three * xx - yy)
+        b[10] = SH_CONSTANTS[6] * x * y * z
+        b[11] = -SH_CONSTANTS[7] * y * (four * zz - xx - yy)
+        b[12] = SH_CONSTANTS[8] * z * (TWO * zz - three * xx - three * yy)
+        b[13] = -SH_CONSTANTS[7] * x * (four * zz - xx - yy)
+        b[14] = SH_CONSTANTS[9] * z * (xx - yy)
+        b[15] = -SH_CONSTANTS[5] * x * (xx - three * yy)
 
 
 @part_jit
@@ -83,23 +83,39 @@ def _basis_gradient(degree, x, y, z, w):
     """Gradient with respect to (x, y, z) of Σ w[k]·basis[k], for w (16,)."""
     gx, gy, gz = ZERO, ZERO, ZERO
     if degree > 0:
-        gx, gy, gz = -SH[1] * w[3], -SH[1] * w[1], SH[1] * w[2]
+        gx, gy, gz = -SH_CONSTANTS[1] * w[3], -SH_CONSTANTS[1] * w[1], SH_CONSTANTS[1] * w[2]
     if degree > 1:
-        gx += SH[2] * (y * w[4] - z * w[7]) - TWO * SH[3] * x * w[6] + TWO * SH[4] * x * w[8]
-        gy += SH[2] * (x * w[4] - z * w[5]) - TWO * SH[3] * y * w[6] - TWO * SH[4] * y * w[8]
-        gz += -SH[2] * (y * w[5] + x * w[7]) + np.float32(4.0) * SH[3] * z * w[6]
+        gx += (
+            SH_CONSTANTS[2] * (y * w[4] - z * w[7])
+            - TWO * SH_CONSTANTS[3] * x * w[6]
+            + TWO * SH_CONSTANTS[4] * x * w[8]
+        )
+        gy += (
+            SH_CONSTANTS[2] * (x * w[4] - z * w[5])
+            - TWO * SH_CONSTANTS[3] * y * w[6]
+            - TWO * SH_CONSTANTS[4] * y * w[8]
+        )
+        gz += -SH_CONSTANTS[2] * (y * w[5] + x * w[7]) + np.float32(4.0) * SH_CONSTANTS[3] * z * w[6]
     if degree > 2:
         xx, yy, zz = x * x, y * y, z * z
         three, four, six, eight = np.float32(3.0), np.float32(4.0), np.float32(6.0), np.float32(8.0)
-        gx += -SH[5] * six * x * y * w[9] + SH[6] * y * z * w[10] + SH[7] * TWO * x * y * w[11]
-        gx += -SH[8] * six * x * z * w[12] - SH[7] * (four * zz - three * xx - yy) * w[13]
-        gx += SH[9] * TWO * x * z * w[14] - SH[5] * three * (xx - yy) * w[15]
-        gy += -SH[5] * three * (xx - yy) * w[9] + SH[6] * x * z * w[10]
-        gy += -SH[7] * (four * zz - xx - three * yy) * w[11] - SH[8] * six * y * z * w[12]
-        gy += SH[7] * TWO * x * y * w[13] - SH[9] * TWO * y * z * w[14] + SH[5] * six * x * y * w[15]
-        gz += SH[6] * x * y * w[10] - SH[7] * eight * y * z * w[11]
-        gz += SH[8] * (six * zz - three * xx - three * yy) * w[12] - SH[7] * eight * x * z * w[13]
-        gz += SH[9] * (xx - yy) * w[14]
+        gx += (
+            -SH_CONSTANTS[5] * six * x * y * w[9]
+            + SH_CONSTANTS[6] * y * z * w[10]
+            + SH_CONSTANTS[7] * TWO * x * y * w[11]
+        )
+        gx += -SH_CONSTANTS[8] * six * x * z * w[12] - SH_CONSTANTS[7] * (four * zz - three * xx - yy) * w[13]
+        gx += SH_CONSTANTS[9] * TWO * x * z * w[14] - SH_CONSTANTS[5] * three * (xx - yy) * w[15]
+        gy += -SH_CONSTANTS[5] * three * (xx - yy) * w[9] + SH_CONSTANTS[6] * x * z * w[10]
+        gy += -SH_CONSTANTS[7] * (four * zz - xx - three * yy) * w[11] - SH_CONSTANTS[8] * six * y * z * w[12]
+        gy += (
+            SH_CONSTANTS[7] * TWO * x * y * w[13]
+            - SH_CONSTANTS[9] * TWO * y * z * w[14]
+            + SH_CONSTANTS[5] * six * x * y * w[15]
+        )
+        gz += SH_CONSTANTS[6] * x * y * w[10] - SH_CONSTANTS[7] * eight * y * z * w[11]
+        gz += SH_CONSTANTS[8] * (six * zz - three * xx - three * yy) * w[12] - SH_CONSTANTS[7] * eight * x * z * w[13]
+        gz += SH_CONSTANTS[9] * (xx - yy) * w[14]
     return gx, gy, gz
 
 
@@ -195,7 +211,7 @@ def project_forward(
         x1 = np.int32(min(limit_x, max(ZERO, np.ceil((mean_x + ex) / size_))))
         y0 = np.int32(min(limit_y, max(ZERO, np.floor((mean_y - ey) / size_))))
         y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
-        if not _any_drawn(rendered, x0, y0, x1, y1):
+        if not _any_rendered(rendered, x0, y0, x1, y1):
             continue
         rd = ONE / math.sqrt(x * x + y * y + z * z)
         dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
@@ -228,7 +244,7 @@ def project_forward(
 
 
 @part_jit
-def _any_drawn(rendered, x0, y0, x1, y1):
+def _any_rendered(rendered, x0, y0, x1, y1):
     for y in range(y0, y1):
         for x in range(x0, x1):
             if rendered[y, x]:
@@ -265,7 +281,8 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
 
 @part_jit
 def _sum_pairs(splats, lists, pair_gradients, sums):
-    """Sum the gradients of each splat's pairs to sums (BLOCK, 9): a short loop asks memory for many of them at once."""
+    """Sum the gradients of each splat's pairs to sums (SUM_BLOCK_SPLATS, 9): a short loop asks memory for many of them
+    at once."""
     first_pair, pairs, splat_pairs, grads = lists.first_pair, lists.pairs, lists.splat_pairs, pair_gradients
     for n in range(len(splats)):
         i = splats[n]
@@ -301,12 +318,12 @@ def project_backward(
     strains = min(strain.shape[1], strain_color.shape[1])
     low_x, high_x, low_y, high_y = _tan_limits(fx, fy, cx, cy, size[0], size[1])
     basis, weight = np.empty(16, np.float32), np.empty(16, np.float32)
-    sums = np.empty((BLOCK, PROJECTED), np.float32)
+    sums = np.empty((SUM_BLOCK_SPLATS, PROJECTED), np.float32)
     for n in range(begin, end):
         i = visible[n]
-        if (n - begin) % BLOCK == 0:
-            _sum_pairs(visible[n : min(end, n + BLOCK)], lists, pair_gradients, sums)
-        g = sums[(n - begin) % BLOCK]
+        if (n - begin) % SUM_BLOCK_SPLATS == 0:
+            _sum_pairs(visible[n : min(end, n + SUM_BLOCK_SPLATS)], lists, pair_gradients, sums)
+        g = sums[(n - begin) % SUM_BLOCK_SPLATS]
         v_sh[i, :, :] = ZERO
         v_strain_color[i, :, :] = ZERO
         half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]

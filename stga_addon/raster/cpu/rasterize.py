@@ -12,7 +12,7 @@ from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
 from .threads import PIECES_PER_THREAD, threads
-from .tiles import PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, mark_tiles
+from .tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, mark_tiles
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
 
@@ -141,7 +141,7 @@ def render_backward(
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients` that belong to a
-    visible splat, one in focus if the output has a focus, and leaves all others as they are.
+    visible splat, one in focus if the output has a focus, and leaves all others unchanged.
     Returns the rows written (M,) int32, and screen_gradient (N,): for those rows, the length of the gradient with
     respect to the projected center in units of half the image.
     """
@@ -193,7 +193,7 @@ def sort_into_tiles(projection: Projection, tiles_x: int, tiles_y: int, buffers:
     visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
     order = depth_order(depth, visible)
     first_pair, pairs = (buffers.get(name, depth.shape, np.int32) for name in ("first_pair", "pairs"))
-    counts = buffers.get("counts", (PARTS, tiles_x * tiles_y), np.int32)
+    counts = buffers.get("counts", (SORT_PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts, pairs)
     start = compute_offsets(visible, pairs, counts, first_pair)
     splat_pairs, pair_splat = (buffers.get(name, (start[-1],), np.int32) for name in ("splat_pairs", "pair_splat"))

@@ -1,4 +1,4 @@
-"""Kernels on several threads: they release Python's lock, so Python's own threads do.
+"""Running kernels on several Python threads, which works because kernels release the GIL.
 
 Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image loss), hold the lock
 while they run, so that Blender's window waits for a picture rendered in its background, and crash where two threads
@@ -13,7 +13,7 @@ from threading import Thread
 from typing import Any
 
 PIECES_PER_THREAD = 8
-"""Pieces of work a thread: what one thread is late with, another takes over."""
+"""More pieces than threads, so that a thread which finishes early takes over work."""
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -61,10 +61,10 @@ def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> No
         for begin in begins:
             kernel(begin, min(begin + size, units), *arguments)
 
-    def help_out() -> None:
+    def assist() -> None:
         try:
             work()
-        except BaseException as error:  # belongs to the caller, who must not wait for ever
+        except BaseException as error:  # is raised in the calling thread, which waits for this one
             finished.put(error)
         else:
             finished.put(None)
@@ -72,7 +72,7 @@ def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> No
     helpers = min(_threads, -(-units // size)) - 1
     _start(helpers)
     for _ in range(helpers):
-        _tasks.put(help_out)
+        _tasks.put(assist)
     try:
         work()
     finally:
@@ -83,14 +83,14 @@ def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> No
 
 
 def _start(count: int) -> None:
-    """Have at least `count` threads waiting for work."""
+    """Make sure that at least `count` threads wait for work."""
     global _waiting
     while _waiting < count:
         _waiting += 1
-        Thread(target=_serve, name="stga kernels", daemon=True).start()
+        Thread(target=_run_tasks, name="stga kernels", daemon=True).start()
 
 
-def _serve() -> None:
+def _run_tasks() -> None:
     while True:
         _tasks.get()()
 

@@ -1,4 +1,4 @@
-"""Which splats touch which tile, front to back."""
+"""Sorting of projected splats into tiles, front to back."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from . import jit
 from .threads import parallel
 
 RADIX_BITS = 11
-PARTS = 16
-"""Equal parts of the splats, near to far, whose pairs are counted and listed side by side."""
+SORT_PARTS = 16
+"""Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
 
 
 @jit
@@ -38,16 +38,17 @@ def depth_order(depth, candidates):
     return values
 
 
-@parallel(lambda *_: PARTS)
+@parallel(lambda *_: SORT_PARTS)
 @jit
 def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
     """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
 
-    rect (N, 4) int32 tile bounds. Writes counts (PARTS, tiles) int32 and pairs (N,) int32, of the splats in `order`.
+    rect (N, 4) int32 tile bounds. Writes counts (SORT_PARTS, tiles) int32 and pairs (N,) int32, of the splats in
+    `order`.
     """
     for k in range(part, past_part):
         counts[k, :] = 0
-        for n in range(k * len(order) // PARTS, (k + 1) * len(order) // PARTS):
+        for n in range(k * len(order) // SORT_PARTS, (k + 1) * len(order) // SORT_PARTS):
             i = order[n]
             x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
             pairs[i] = (x1 - x0) * (y1 - y0)
@@ -58,9 +59,9 @@ def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
 
 @jit
 def compute_offsets(visible, pairs, counts, first_pair):
-    """Turn the counts of `count_pairs` into the places where each part's pairs begin.
+    """Turn the counts of `count_pairs` into the offset of each part's pairs in each tile's list.
 
-    visible (M,) int32: the splats in the order in which their pairs are to be found: splat i's from first_pair[i] on.
+    visible (M,) int32. Writes first_pair (N,): where each of these splats' pairs begin in `splat_pairs`.
     Returns start (tiles + 1,) int64: where each tile's list begins.
     """
     found = 0
@@ -70,7 +71,7 @@ def compute_offsets(visible, pairs, counts, first_pair):
     start = np.zeros(counts.shape[1] + 1, np.int64)
     for tile in range(counts.shape[1]):
         place = start[tile]
-        for k in range(PARTS):
+        for k in range(SORT_PARTS):
             count = counts[k, tile]
             counts[k, tile] = place
             place += count
@@ -78,16 +79,16 @@ def compute_offsets(visible, pairs, counts, first_pair):
     return start
 
 
-@parallel(lambda *_: PARTS)
+@parallel(lambda *_: SORT_PARTS)
 @jit
 def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
-    """Write every tile's pairs front to back, from the places of `compute_offsets` on, which move along.
+    """Write every tile's pairs front to back; `place` holds the offsets of `compute_offsets` and is advanced.
 
     pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat stand, its first at
     first_pair[i].
     """
     for k in range(part, past_part):
-        for n in range(k * len(order) // PARTS, (k + 1) * len(order) // PARTS):
+        for n in range(k * len(order) // SORT_PARTS, (k + 1) * len(order) // SORT_PARTS):
             i = order[n]
             x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
             found = first_pair[i]

@@ -1,4 +1,4 @@
-"""The rasterizer's second back end: Warp kernels for NVIDIA GPUs, and on Warp's CPU device for tests.
+"""GPU rasterizer: Warp kernels for NVIDIA GPUs, which also run on Warp's CPU device for tests.
 
 Formulas, constants and results are those of `cpu/`. One thread a pixel, splat or coefficient; nothing here depends
 on the order in which threads run, so the same input gives the same bits (there is no faster, unordered mode). Warp
@@ -12,8 +12,8 @@ import os
 import warp as wp
 from platformdirs import user_cache_path
 
-# Beside Numba's, and for the same reason: one folder per package name in the user's cache.
+# Beside Numba's cache and for the same reason: one folder per package name in the user's cache.
 wp.config.kernel_cache_dir = os.environ.get("WARP_CACHE_PATH") or str(
     user_cache_path("stga", appauthor=False) / "kernels" / __name__
 )
-wp.config.log_level = wp.LOG_ERROR  # what device there is, and what is compiled, is said in our own words
+wp.config.log_level = wp.LOG_ERROR  # the training status reports the device and the compilation

@@ -1,4 +1,4 @@
-"""The Warp kernels as a differentiable function of torch tensors, whose memory they share."""
+"""Differentiable rendering of torch tensors by the Warp kernels, which share the tensors' memory."""
 
 from typing import Any
 
@@ -21,9 +21,9 @@ def render_differentiable(
     degree: int = 3,
     antialiased: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Differentiable rendering of float32 torch tensors on a CUDA device, or on the CPU, whose memory is shared.
+    """Differentiable rendering of float32 torch tensors on a CUDA device, or on the CPU, whose memory is shared_arrays.
 
-    Everything else as in `raster.autograd.render`.
+    Everything else as in `cpu.autograd.render_differentiable`.
     """
     device = str(splats.xyz.device)
     camera_frames, count = frames_in_camera(frames, camera), len(splats.xyz)
@@ -47,7 +47,7 @@ def render_differentiable(
     return rgb, 1 - transmittance, depth[0]
 
 
-def shared(tensors: Parameters) -> Parameters:
+def shared_arrays(tensors: Parameters) -> Parameters:
     """Contiguous torch tensors as Warp arrays of `PARAMETER_TYPES` that share their memory."""
     return Parameters(*(_share(tensor.detach(), kind) for tensor, kind in zip(tensors, PARAMETER_TYPES, strict=True)))
 
@@ -72,7 +72,7 @@ class _Blend(torch.autograd.Function):
         device = tensors[0].device
         kept = [tensor.detach().contiguous() for tensor in tensors]
         with _stream(device):
-            rasterizer, splats = Rasterizer(str(device)), shared(Parameters(*kept))
+            rasterizer, splats = Rasterizer(str(device)), shared_arrays(Parameters(*kept))
             rendering = rasterizer.forward(splats, face, frames)
         ctx.saved = kept, splats, face, rasterizer, rendering
         return wp.to_torch(rendering.image), wp.to_torch(rendering.transmittance)
@@ -83,7 +83,7 @@ class _Blend(torch.autograd.Function):
         gradients = Parameters(*(torch.zeros_like(tensor) for tensor in kept))
         with _stream(kept[0].device):
             rasterizer.backward(
-                rendering, splats, face, wp.from_torch(v_image.contiguous()), shared(gradients),
+                rendering, splats, face, wp.from_torch(v_image.contiguous()), shared_arrays(gradients),
                 wp.from_torch(v_transmittance.contiguous()),
             )  # fmt: skip
         return None, None, *gradients

@@ -6,7 +6,7 @@ summed over the warp's registers, and each half has a row of its own to write it
 later, in order. So no two threads write one place and no sum depends on chance.
 
 On Warp's CPU device, where threads run one after the other, a warp is a single lane: `_warp_sum` and its like return
-what they are given, every lane counts as the leading one, and rows are added to, in the order of lanes.
+their argument, every lane counts as the leading one, and rows are added to, in the order of lanes.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE = (
     wp.constant(float(c)) for c in (cpu.MAX_ALPHA, cpu.MIN_ALPHA, cpu.MIN_TRANSMITTANCE)
 )
 WARP_LANES = wp.constant(32)
-PARTS = wp.constant(2)
+WARPS_PER_TILE = wp.constant(2)
 """Warps a tile has in the backward, and rows a pair: more warps fill a GPU better, fewer add up less."""
 PIXELS_PER_LANE = layout.PIXELS // (32 * 2)
 
@@ -135,13 +135,14 @@ def blend_backward(
     v_transmittance: wp.array2d[wp.float32],
     rows: wp.array[Projected],
 ):
-    """Add the gradient of every wanted pair of the touched tiles to its rows, slot · PARTS and on, which are zero.
+    """Add the gradient of every wanted pair of the touched tiles to its rows, slot · WARPS_PER_TILE and on, which are
+    zero.
 
-    Launched over PARTS · WARP_LANES threads a tile. v_transmittance may have no rows, which means zero.
+    Launched over WARPS_PER_TILE · WARP_LANES threads a tile. v_transmittance may have no rows, which means zero.
     """
     n = wp.tid()
-    lane, part = n % WARP_LANES, (n // WARP_LANES) % PARTS
-    tile = n // (WARP_LANES * PARTS)
+    lane, part = n % WARP_LANES, (n // WARP_LANES) % WARPS_PER_TILE
+    tile = n // (WARP_LANES * WARPS_PER_TILE)
     if touched[tile] == UNMARKED:
         return
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -149,7 +150,7 @@ def blend_backward(
     v_red, v_green, v_blue = LaneFloats(), LaneFloats(), LaneFloats()
     until = LaneInts()
     deepest = int(0)
-    base = part * (PIXELS // PARTS) + lane  # neighboring lanes have neighboring pixels
+    base = part * (PIXELS // WARPS_PER_TILE) + lane  # neighboring lanes have neighboring pixels
     for k in range(wp.static(PIXELS_PER_LANE)):
         p = base + k * WARP_LANES
         column, line = left + p % TILE, top + p // TILE
@@ -215,7 +216,7 @@ def blend_backward(
             total[c] = _warp_sum(total[c])
         if _is_warp_leader():
             by_x = row[PRECISION_X] * total[1]
-            at = pair_slot[j] * PARTS + part
+            at = pair_slot[j] * WARPS_PER_TILE + part
             rows[at] = rows[at] + Projected(
                 by_x, row[PRECISION_Y] * total[2] - row[SHEAR] * by_x, -0.5 * total[3], row[PRECISION_X] * total[4],
                 -0.5 * total[5], total[0] / row[OPACITY], total[6], total[7], total[8],

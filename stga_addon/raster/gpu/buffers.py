@@ -1,4 +1,4 @@
-"""Device memory that lives on between iterations."""
+"""Device memory that is reused between iterations."""
 
 from typing import Any
 
@@ -25,9 +25,9 @@ class DeviceBufferPool:
             return wp.empty(shape, dtype, device=self.device)
         buffer = self._buffers.get(name)
         if buffer is None or buffer.size < size:
-            wp.synchronize()  # what runs may still use the memory that goes
+            wp.synchronize()  # running kernels may still use the memory that is freed
             self._views.pop(name, None)
-            # An eighth to spare, so that a count that creeps upwards does not allocate every time.
+            # An eighth to spare, so that a slowly growing count does not allocate every time.
             buffer = self._buffers[name] = wp.empty(size + size // 8, dtype, device=self.device, pinned=self._pinned)
         view = self._views[name] = buffer[:size].reshape(shape)
         return view

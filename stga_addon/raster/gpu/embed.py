@@ -1,4 +1,4 @@
-"""Camera-space frames of a posed mesh's triangles, and their strain; what `avatar.embedding` and `avatar.strain` do.
+"""Camera-space frames and strain of a posed mesh's triangles, as `avatar.embedding` and `avatar.strain` compute them.
 
 In float64 like them, because a head may be far from the origin and strain is a difference of squares: for some ten
 thousand triangles that costs a GPU nothing, while the host would need longer for it than the GPU for an iteration.
@@ -15,8 +15,10 @@ from .buffers import DeviceBufferPool
 
 wp.set_module_options({"enable_backward": False})
 
-SLIVER, UPRIGHT, TINY = (wp.constant(wp.float64(c)) for c in (embedding.SLIVER, embedding.UPRIGHT, embedding.TINY))
-GAIN, LIMIT = wp.constant(wp.float64(strain.GAIN)), wp.constant(wp.float64(strain.LIMIT))
+MIN_AREA_RATIO, UPRIGHT_COSINE, MIN_DIVISOR = (
+    wp.constant(wp.float64(c)) for c in (embedding.MIN_AREA_RATIO, embedding.UPRIGHT_COSINE, embedding.MIN_DIVISOR)
+)
+STRAIN_GAIN, MAX_STRAIN = wp.constant(wp.float64(strain.STRAIN_GAIN)), wp.constant(wp.float64(strain.MAX_STRAIN))
 ZERO, ONE, TWO, THREE = (wp.constant(wp.float64(n)) for n in range(4))
 
 Tensor = wp.types.vector(length=6, dtype=wp.float64)
@@ -26,9 +28,9 @@ Tensor = wp.types.vector(length=6, dtype=wp.float64)
 @wp.func
 def _perpendicular(first: wp.vec3d, normal: wp.vec3d, longest: wp.float64) -> wp.vec3d:
     """The unit normal beside a unit axis; any perpendicular where the triangle is a line."""
-    if wp.length(normal) <= TWO * SLIVER * longest:
+    if wp.length(normal) <= TWO * MIN_AREA_RATIO * longest:
         other = wp.vec3d(ZERO, ZERO, ONE)
-        if wp.abs(first[2]) > UPRIGHT:
+        if wp.abs(first[2]) > UPRIGHT_COSINE:
             other = wp.vec3d(ONE, ZERO, ZERO)
         normal = wp.cross(first, other)
     normal = normal - wp.dot(normal, first) * first
@@ -56,7 +58,7 @@ def compose_frames(
     p0, p1, p2 = vertices[corners[0]], vertices[corners[1]], vertices[corners[2]]
     e1, e2, e3 = p1 - p0, p2 - p0, p2 - p1
     longest = wp.max(wp.dot(e1, e1), wp.max(wp.dot(e2, e2), wp.dot(e3, e3)))
-    least = SLIVER * wp.sqrt(longest)
+    least = MIN_AREA_RATIO * wp.sqrt(longest)
     raw_normal = wp.cross(e1, e2)
     first = e1
     if area_scales:
@@ -77,7 +79,7 @@ def compose_frames(
         axes = wp.matrix_from_cols(first, wp.cross(normal, first), normal)
         scale = ONE
         if neutral_area[f] > ZERO:
-            scale = wp.sqrt(wp.length(raw_normal) / TWO / wp.max(neutral_area[f], TINY))
+            scale = wp.sqrt(wp.length(raw_normal) / TWO / wp.max(neutral_area[f], MIN_DIVISOR))
     m = scale * (turn * axes)
     o = turn * ((p0 + p1 + p2) / THREE) + shift
     origin[f] = wp.vec3(float(o[0]), float(o[1]), float(o[2]))
@@ -125,7 +127,7 @@ def strain_in_plane(
     corners = faces[f]
     mean = (at_vertex[corners[0]] + at_vertex[corners[1]] + at_vertex[corners[2]]) / THREE
     for k in range(out.shape[1]):
-        out[f, k] = float(wp.clamp(GAIN * wp.dot(mean, to_plane[f, k]), -LIMIT, LIMIT))
+        out[f, k] = float(wp.clamp(STRAIN_GAIN * wp.dot(mean, to_plane[f, k]), -MAX_STRAIN, MAX_STRAIN))
 
 
 class Embedding:
@@ -174,7 +176,7 @@ class Embedding:
             return origin, matrix, wp.empty((n, 0), wp.float32, device=device)
         gram, to_tensor, to_plane, start, touching = self._strain
         tensor, at_vertex = array("tensor", n, Tensor), array("at_vertex", vertices.size, Tensor)
-        out = array("strain", (n, strain.STRAINS))
+        out = array("strain", (n, strain.STRAIN_COMPONENTS))
         wp.launch(strain_faces, n, [vertices, self._faces, gram, to_tensor], [tensor], device=device)
         wp.launch(average_at_vertices, vertices.size, [tensor, start, touching], [at_vertex], device=device)
         wp.launch(strain_in_plane, n, [at_vertex, self._faces, to_plane], [out], device=device)

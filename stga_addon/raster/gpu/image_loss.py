@@ -13,11 +13,11 @@ from .tiles import TILE, UNMARKED
 
 wp.set_module_options({"enable_backward": False})
 
-RADIUS = wp.constant(cpu.RADIUS)
-WIDTH = 2 * cpu.RADIUS + 1
+WINDOW_RADIUS_PX = wp.constant(cpu.WINDOW_RADIUS_PX)
+WINDOW_WIDTH_PX = 2 * cpu.WINDOW_RADIUS_PX + 1
 C1, C2 = wp.constant(float(cpu.C1)), wp.constant(float(cpu.C2))
 _half = [float(w) for w in (cpu.W0, cpu.W1, cpu.W2, cpu.W3, cpu.W4, cpu.W5)]
-Window = wp.types.vector(length=WIDTH, dtype=wp.float32)
+Window = wp.types.vector(length=WINDOW_WIDTH_PX, dtype=wp.float32)
 WINDOW = wp.constant(Window(*_half, *_half[-2::-1]))
 BYTE = wp.constant(float(np.float32(1 / 255)))
 
@@ -40,8 +40,8 @@ def blur_rows(
     if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     total = wp.vec4()
-    for k in range(wp.static(WIDTH)):
-        column = x + k - RADIUS
+    for k in range(wp.static(WINDOW_WIDTH_PX)):
+        column = x + k - WINDOW_RADIUS_PX
         if column >= 0 and column < image.shape[2]:
             total += WINDOW[k] * _moments(image[c, y, column], float(target[y, column, c]) * BYTE)
     out[c, y, x] = total
@@ -66,8 +66,8 @@ def find_slopes(
     if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     m = wp.vec4()
-    for k in range(wp.static(WIDTH)):
-        row = y + k - RADIUS
+    for k in range(wp.static(WINDOW_WIDTH_PX)):
+        row = y + k - WINDOW_RADIUS_PX
         if row >= 0 and row < image.shape[1]:
             m += WINDOW[k] * blurred[c, row, x]
     mxy, mm = m[0] * m[1], m[0] * m[0] + m[1] * m[1]
@@ -92,8 +92,8 @@ def blur_slopes(
     if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     total = wp.vec3()
-    for k in range(wp.static(WIDTH)):
-        column = x + k - RADIUS
+    for k in range(wp.static(WINDOW_WIDTH_PX)):
+        column = x + k - WINDOW_RADIUS_PX
         if column >= 0 and column < slopes.shape[2]:
             total += WINDOW[k] * slopes[c, y, column]
     out[c, y, x] = total
@@ -114,8 +114,8 @@ def image_gradient(
     if touched[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
         return
     s = wp.vec3()
-    for k in range(wp.static(WIDTH)):
-        row = y + k - RADIUS
+    for k in range(wp.static(WINDOW_WIDTH_PX)):
+        row = y + k - WINDOW_RADIUS_PX
         if row >= 0 and row < image.shape[1]:
             s += WINDOW[k] * blurred[c, row, x]
     a, b = image[c, y, x], float(target[y, x, c]) * BYTE

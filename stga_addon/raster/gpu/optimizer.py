@@ -1,4 +1,4 @@
-"""Per-row work of training, counterpart of `cpu/optimizer.py`. A row is stepped, or not, by its mark in `wanted`."""
+"""Optimizer kernels, the counterpart of `cpu/optimizer.py`; the rows to step are marked in `wanted`."""
 
 import warp as wp
 

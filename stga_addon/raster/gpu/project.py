@@ -16,18 +16,20 @@ from ..cpu.layout import TILE as _TILE
 wp.set_module_options({"enable_backward": False})  # gradients are kernels of their own
 
 TILE = wp.constant(_TILE)
-LOW_PASS_PX2, NEAR_M, LIFT = (wp.constant(float(c)) for c in (cpu.LOW_PASS_PX2, cpu.NEAR_M, cpu.LIFT))
-S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (wp.constant(float(c)) for c in cpu.SH)
+LOW_PASS_PX2, NEAR_M, QUATERNION_LIFT = (
+    wp.constant(float(c)) for c in (cpu.LOW_PASS_PX2, cpu.NEAR_M, cpu.QUATERNION_LIFT)
+)
+S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (wp.constant(float(c)) for c in cpu.SH_CONSTANTS)
 BASIS = 16
 
 Projected = wp.types.vector(length=_PROJECTED, dtype=wp.float32)
-"""A projected splat, or the gradient of one (tile, splat) pair, with the columns of `cpu/blend.py`."""
+"""A projected splat, or the gradient of one (tile, splat) pair, with the columns of `cpu/layout.py`."""
 Basis = wp.types.vector(length=BASIS, dtype=wp.float32)
 
 
 @wp.struct
 class DeviceCamera:
-    """A camera: intrinsics and size in pixels, camera to world rotation, and how to draw."""
+    """A camera: intrinsics and size in pixels, camera to world rotation, and rendering options."""
 
     fx: wp.float32
     fy: wp.float32
@@ -66,7 +68,7 @@ class CameraSplat:
 def _unit(q: wp.vec4):
     """Unit quaternion and 1 / norm, as `cpu/project.py` takes them."""
     size = wp.abs(q[0]) + wp.abs(q[1]) + wp.abs(q[2]) + wp.abs(q[3])
-    lift = wp.where(size < 1.0e-12, LIFT, wp.where(size > 1.0e12, 1.0 / LIFT, 1.0))
+    lift = wp.where(size < 1.0e-12, QUATERNION_LIFT, wp.where(size > 1.0e12, 1.0 / QUATERNION_LIFT, 1.0))
     q = q * lift
     inverse = 1.0 / wp.sqrt(wp.dot(q, q))
     if size == 0.0:

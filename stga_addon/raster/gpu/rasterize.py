@@ -1,4 +1,4 @@
-"""Splats and a camera to an image, and its gradient back to the splats, on a Warp device."""
+"""Rendering on a Warp device: splats and a camera to an image, and its gradient back to the splats."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +22,7 @@ PARAMETER_TYPES = Parameters(wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.
 
 @dataclass(frozen=True)
 class DeviceFrames:
-    """Camera-space frames and strain of the triangles, as in `CameraFrames`, with how to draw."""
+    """Camera-space frames and strain of the triangles, as in `CameraFrames`, with the camera and rendering options."""
 
     origin: wp.array
     matrix: wp.array
@@ -60,7 +60,7 @@ class DeviceRenderOutput:
 class Rasterizer:
     """Renders on one device, forward and backward, into buffers of its own.
 
-    The host never waits for the device in `backward`, and in `forward` only if it is told to.
+    The host never waits for the device in `backward`, and in `forward` only with `wait`.
     """
 
     def __init__(self, device: str) -> None:
@@ -147,16 +147,16 @@ class Rasterizer:
         """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
         v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the rows of `gradients` that the rendering
-        wants and leaves all others as they are. Returns screen (N,): for those rows, the length of the gradient with
+        wants and leaves all others unchanged. Returns screen (N,): for those rows, the length of the gradient with
         respect to the projected center in units of half the image.
         """
         array, lens = self.buffers.get, rendering.frames.lens
-        rows = array("rows", rendering.pair_splat.size * blend.PARTS, Projected)
+        rows = array("rows", rendering.pair_splat.size * blend.WARPS_PER_TILE, Projected)
         rows.zero_()
         if v_transmittance is None:
             v_transmittance = array("nothing", (0, 0))
         self.launch(
-            blend.blend_backward, rendering.touched.size * blend.PARTS * blend.WARP_LANES,
+            blend.blend_backward, rendering.touched.size * blend.WARPS_PER_TILE * blend.WARP_LANES,
             lens.tiles_x, rendering.touched, rendering.first, rendering.pair_splat, rendering.pair_slot,
             rendering.wanted, rendering.projected, rendering.background, rendering.transmittance, rendering.last,
             v_image, v_transmittance, rows,
@@ -165,7 +165,7 @@ class Rasterizer:
         self.launch(
             project_backward, face.size,
             *splats, face, frames.origin, frames.matrix, frames.strain, lens, rendering.projected, rendering.wanted,
-            rendering.slot_start, rendering.slot_count, blend.PARTS, rows, *gradients, screen,
+            rendering.slot_start, rendering.slot_count, blend.WARPS_PER_TILE, rows, *gradients, screen,
         )  # fmt: skip
         return screen
 

@@ -1,4 +1,4 @@
-"""Whether a device computes what it should, found out before anything depends on it."""
+"""Self-test: whether a device renders and differentiates correctly, checked before training on it."""
 
 import math
 
@@ -22,7 +22,7 @@ def compile_kernels(device: str) -> None:
 
 
 def passes(device: str) -> bool:
-    """Draw one gray splat over several tiles, and image_loss_gradient the sum of the image.
+    """Render one gray splat over several tiles, and image_loss_gradient the sum of the image.
 
     Both are known: the middle pixel is gray times opacity, and the gradient with respect to the opacity's logit is
     (1 − opacity) times the sum. The latter comes out right only if no thread's part is lost or counted twice.

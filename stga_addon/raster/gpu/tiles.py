@@ -1,4 +1,4 @@
-"""Which splats touch which tile, front to back; the counterpart of `cpu/tiles.py`.
+"""Sorting of projected splats into tiles, front to back; the counterpart of `cpu/tiles.py`.
 
 The splats are sorted by depth, write their (tile, splat) pairs in that order, and a stable sort by tile alone keeps
 it: two short sorts (32 bits of N depths, a dozen bits of the pairs) instead of a long one.

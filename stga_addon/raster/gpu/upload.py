@@ -1,4 +1,4 @@
-"""Arrays on their way from the host to the device, while the device still computes with the ones before."""
+"""Asynchronous copies from host to device, while the device still computes with the previous arrays."""
 
 from typing import Any
 

@@ -4,7 +4,7 @@ from math import pi, sqrt
 from typing import Any
 
 from ...avatar.splats import SH_C0
-from ...avatar.strain import GAIN, LIMIT, STRAINS
+from ...avatar.strain import MAX_STRAIN, STRAIN_COMPONENTS, STRAIN_GAIN
 from .node_builder import NodeGroup, Nodes
 from .splat_attributes import FACE, GRAM, PLANE, SH, STRAIN_COLOR, TENSOR, TENSOR_HALVES
 
@@ -65,7 +65,7 @@ def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
     mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
     changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
     for half in TENSOR_HALVES:
-        columns = (nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR") for k in range(STRAINS))
+        columns = (nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR") for k in range(STRAIN_COMPONENTS))
         tensor = nodes.sum(*(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True)))
         mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
     return mesh
@@ -76,11 +76,11 @@ def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
     # Faces to points and back: the mean over the triangles that touch a triangle.
     means = [nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT") for half in TENSOR_HALVES]
     strains = []
-    for index in range(STRAINS):
+    for index in range(STRAIN_COMPONENTS):
         plane = (nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES)
         products = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)]
-        strain = nodes.math("MULTIPLY", nodes.math("ADD", *products), GAIN)
-        strains.append(nodes.math("MAXIMUM", nodes.math("MINIMUM", strain, LIMIT), -LIMIT))
+        strain = nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN)
+        strains.append(nodes.math("MAXIMUM", nodes.math("MINIMUM", strain, MAX_STRAIN), -MAX_STRAIN))
     mesh = nodes.store(mesh, _STRAIN, nodes.combine(*strains), "FLOAT_VECTOR", "FACE")
     return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 
-from ...avatar.embedding import SLIVER, UPRIGHT
+from ...avatar.embedding import MIN_AREA_RATIO, UPRIGHT_COSINE
 from .display_modes import WORLD_ROTATION, WORLD_SCALE
 from .node_builder import NodeGroup, Nodes
 from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, XYZ
@@ -96,12 +96,14 @@ def _axes_to_rotation(
     normal = nodes.vector("CROSS_PRODUCT", edge, side)
     lengths = [nodes.vector("LENGTH", v) for v in (edge, side, nodes.vector("SUBTRACT", edge, side))]
     longest = nodes.math("MAXIMUM", nodes.math("MAXIMUM", lengths[0], lengths[1]), lengths[2])
-    no_first = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", first), nodes.math("MULTIPLY", longest, SLIVER))
-    limit = nodes.math("MULTIPLY", nodes.math("MULTIPLY", longest, longest), 2 * SLIVER)
+    no_first = nodes.compare(
+        "LESS_EQUAL", nodes.vector("LENGTH", first), nodes.math("MULTIPLY", longest, MIN_AREA_RATIO)
+    )
+    limit = nodes.math("MULTIPLY", nodes.math("MULTIPLY", longest, longest), 2 * MIN_AREA_RATIO)
     no_normal = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", normal), limit)
     first = nodes.switch("VECTOR", no_first, nodes.vector("NORMALIZE", first), (1, 0, 0))
     z = nodes.math("ABSOLUTE", nodes.vector("DOT_PRODUCT", first, (0, 0, 1)))
-    helper = nodes.switch("VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT), (0, 0, 1), (1, 0, 0))
+    helper = nodes.switch("VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT_COSINE), (0, 0, 1), (1, 0, 0))
     second = nodes.vector("CROSS_PRODUCT", first, helper)
     second = nodes.switch("VECTOR", no_normal, nodes.vector("NORMALIZE", normal), second)
     axes = {"Primary Axis": first, "Secondary Axis": second}

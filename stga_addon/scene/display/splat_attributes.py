@@ -9,7 +9,7 @@ import numpy as np
 from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
-from ...avatar.strain import STRAINS, StrainBasis, strain_basis
+from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 from ..arrays import flat_floats, read_values
 from .colors import srgb_to_linear
 
@@ -127,6 +127,6 @@ def _strain_vectors(basis: StrainBasis) -> Iterator[tuple[str, np.ndarray]]:
     """What the color nodes need to compute strain: name and vector (F, 3)."""
     yield GRAM, basis.gram
     for name, tensors in ((TENSOR, basis.to_tensor), (PLANE, basis.to_plane)):
-        for index in range(STRAINS):
+        for index in range(STRAIN_COMPONENTS):
             for start, half in zip((0, 3), TENSOR_HALVES, strict=True):
                 yield name.format(index, half), tensors[:, index, start : start + 3]

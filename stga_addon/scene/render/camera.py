@@ -55,7 +55,7 @@ def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Cam
 
 
 def _perspective_of_orthographic(projection: np.ndarray) -> tuple[np.ndarray, float]:
-    """A perspective projection (4, 4) that nearly equals an orthographic one, and how many metres to step back."""
+    """A perspective projection (4, 4) that nearly equals an orthographic one, and how many meters to step back."""
     distance = ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
     perspective = np.zeros((4, 4))
     perspective[0, 0], perspective[1, 1] = projection[0, 0] * distance, projection[1, 1] * distance

@@ -21,7 +21,7 @@ from .scene_splats import SplatCache, visible_layers
 from .viewport import RenderRequest, ViewportImage, ViewportRenderer
 
 ENGINE = "STGA_SPLATS"
-BACKGROUND_DEPTH = 1e10  # metres: what Blender's engines write where a pixel shows nothing
+BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
 MIN_DEPTH_ALPHA = 1 / 255  # pixels with less show nothing
 # Blender's panels that are for some engines only and apply to this one too.
 SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")

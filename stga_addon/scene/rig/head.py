@@ -8,7 +8,7 @@ import numpy as np
 from ...capture.model import Capture
 from .. import tags
 from ..animation import write_triangle_curves
-from ..arrays import has_triangles, triangle_mesh
+from ..arrays import flat_floats, has_triangles, triangle_mesh
 from ..objects import Warn, capture_root, log_warning, place, reset
 from .flame_rig import add_rig, remove_rig
 
@@ -16,13 +16,12 @@ from .flame_rig import add_rig, remove_rig
 def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warning, correctives: str = "all") -> Any:
     """The capture's head as a mesh object, animated so that Blender's frame number is the capture's timestep.
 
-    A FLAME capture becomes a rig (see `rig.add_rig`); any other gets one shape key a timestep, `t00012`, which is 1 at
-    its own frame, so that the evaluated mesh of that frame is the timestep's mesh; between frames the two neighbours
-    blend. Object coordinates are the capture's (metres, y-up). Regions become boolean face attributes
-    `stga_region_<name>`. Importing the same folder or file again replaces what the last import made; vertex groups and
-    materials stay where the triangles are the same. Raises StgaError
-    where a timestep cannot be read; the scene is then unchanged. `warn` receives one sentence for each thing worth
-    knowing. correctives: see `rig.add_rig`.
+    A FLAME capture becomes a rig (see `flame_rig.add_rig`); any other gets one shape key per timestep, `t00012`, with
+    value 1 at its own frame, so that the evaluated mesh of that frame is the timestep's mesh; frames between two
+    timesteps blend them. Object coordinates are the capture's (meters, y-up). Regions become boolean face attributes
+    `stga_region_<name>`. Importing the same folder or file again replaces the last import; vertex groups and materials
+    are kept if the triangles are the same. `warn` receives one sentence per problem. correctives: see `add_rig`.
+    Raises StgaError where a timestep cannot be read; the scene is then unchanged.
     """
     sequence = capture.flame
     if sequence is not None:
@@ -43,7 +42,7 @@ def _place_head(capture: Capture, name: str | None) -> Any:
     root = capture_root(capture.root, name)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
     if head is not None and has_triangles(head.data, capture.faces):
-        _renew_mesh(head, capture)
+        _update_mesh(head, capture)
     else:
         title = f"{root.name} head"
         head = place(root, tags.HEAD, title, triangle_mesh(title, capture.neutral, capture.faces), head)
@@ -55,15 +54,15 @@ def _place_head(capture: Capture, name: str | None) -> Any:
     return head
 
 
-def _renew_mesh(head: Any, capture: Capture) -> None:
-    """The same triangles again: what an artist painted, and the selection that was made, stay on them."""
+def _update_mesh(head: Any, capture: Capture) -> None:
+    """Import into a mesh with the same triangles, which keeps its materials, vertex groups and painted attributes."""
     reset(head)
     mesh = head.data
-    mesh.vertices.foreach_set("co", capture.neutral.astype(np.float32).ravel())
+    mesh.vertices.foreach_set("co", flat_floats(capture.neutral))
     mesh.update()
     for name in [name for name in mesh.attributes.keys() if name.startswith(tags.REGION_PREFIX)]:  # noqa: SIM118
         mesh.attributes.remove(mesh.attributes[name])
-    for group in reversed(list(head.vertex_groups)):  # the last first: removal renumbers those behind
+    for group in reversed(list(head.vertex_groups)):  # last first: removing a group renumbers those after it
         timestep = tags.group_timestep(group.name)
         if timestep is not None and timestep not in capture.timesteps:
             head.vertex_groups.remove(group)

@@ -1,4 +1,4 @@
-"""Motion of a FLAME head: another person's put onto it, and its own as it plays in the scene."""
+"""Motion of a FLAME head: applied from another recording, and sampled as it plays in the scene."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -13,25 +13,16 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.motion import PARTS
 from ...flame.quaternions import to_axis_angle
 from ...flame.sequence import FlameSequence
-from .. import compat
-from ..arrays import evaluated_vertices
+from ..arrays import evaluated_vertices, read_values
+from ..compat import copy_action, push_down_action
 from ..objects import Warn, log_warning
 from ..timeline import iterate_frames
-from .flame_rig import (
-    EXPRESSION_KEY,
-    animated_by,
-    expression_key,
-    is_of_parts,
-    joint_bone,
-    key_motion,
-    key_tracked_offsets,
-    key_zero_offsets,
-    offset_keys,
-    rig_of,
-    slider_components,
-)
+from .flame_rig import rig_of
+from .keyframes import animated_by, key_motion, key_tracked_offsets, key_zero_offsets
+from .names import EXPRESSION_KEY, expression_key, is_of_parts, offset_keys, parent_bone, slider_components
 
-SAME_MESH = 1e-4  # metres that the mesh in the scene may be off from what FLAME makes of its parameters
+MESH_TOLERANCE = 1e-4
+"""Metres that the mesh in the scene may differ from FLAME's forward pass of the sampled parameters."""
 
 
 def apply_motion(
@@ -44,130 +35,133 @@ def apply_motion(
     warn: Warn = log_warning,
     tracked: tuple[FlameSequence, Sequence[float]] | None = None,
 ) -> None:
-    """Animate the chosen parts of a FLAME head by `frames`, one a Blender frame from `start` on.
+    """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
 
-    What moved it before is not lost. As an action, the new one is a copy of the old in which the parts are exchanged,
-    and the old action stays in the file. As a strip, both lie in the NLA editor, and the new one counts only where it
-    lasts. tracked: the sequence that the head was imported from, and the Blender frame of each of its timesteps, where
-    its per-frame offsets are to play along; they stay zero without. Raises StgaError where the head has no rig, or one
-    that cannot take the motion; nothing is changed then.
+    The previous animation is kept. As an action, the new one is a copy of the old in which the parts are replaced, and
+    the old action stays in the file. As a strip, both are in the NLA editor, and the new one has effect only where it
+    lasts. tracked: the sequence that the head was imported from and the Blender frame of each of its timesteps, where
+    its per-frame offsets are to play along; without, they stay zero. Raises StgaError where the head has no rig, or
+    one that cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
-    _require_fitting(head, rig, frames, parts)
+    _check_rig(head, rig, frames, parts)
     frames = [replace(frame, expr=_for_all_sliders(head, frame.expr)) for frame in frames]
     owners = animated_by(head, rig, parts)
     for owner in owners:
-        title = f"{owner.name} {name}"
-        if as_strip:
-            compat.push_down_action(owner)
-            (owner.animation_data or owner.animation_data_create()).action = bpy.data.actions.new(title)
-        else:
-            curves = compat.copy_action(owner, title)
-            for curve in [curve for curve in curves if is_of_parts(curve.data_path, parts)]:
-                curves.remove(curve)
+        _start_action(owner, f"{owner.name} {name}", parts, as_strip)
     key_motion(head, rig, range(start, start + len(frames)), frames, parts, warn)
     if "expression" in parts and offset_keys(head):
         if tracked is None:
             key_zero_offsets(head, rig, start)
         else:
-            own, numbers = tracked
-            key_tracked_offsets(head, rig, own, [own.frame(timestep) for timestep in own.timesteps], numbers)
+            sequence, numbers = tracked
+            own_frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+            key_tracked_offsets(head, rig, sequence, own_frames, numbers)
     for owner in owners:
         owner.animation_data.action.use_fake_user = True
         if as_strip:
-            compat.push_down_action(owner, extrapolation="NOTHING")
+            push_down_action(owner, extrapolation="NOTHING")
+
+
+def _start_action(owner: Any, name: str, parts: Sequence[str], as_strip: bool) -> None:
+    """Give `owner` a new active action: empty with the old one as a strip, or the old one's copy without the parts."""
+    if as_strip:
+        push_down_action(owner)
+        (owner.animation_data or owner.animation_data_create()).action = bpy.data.actions.new(name)
+        return
+    curves = copy_action(owner, name)
+    for curve in [curve for curve in curves if is_of_parts(curve.data_path, parts)]:
+        curves.remove(curve)
 
 
 def _for_all_sliders(head: Any, expr: np.ndarray) -> np.ndarray:
-    """(K,) coefficients of the head's K expression sliders: a model with fewer leaves the others at zero."""
+    """(K,) coefficients of the head's K expression sliders; those that `expr` lacks are zero."""
     count = sum(key.name.startswith(EXPRESSION_KEY) for key in head.data.shape_keys.key_blocks)
     return np.pad(expr[:count], (0, max(0, count - len(expr))))
 
 
-def _require_fitting(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: Sequence[str]) -> None:
+def _check_rig(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: Sequence[str]) -> None:
     for owner in (rig, head.data.shape_keys):
         if owner.animation_data is not None and owner.animation_data.use_tweak_mode:
-            raise StgaError(f"{owner.name}: is being tweaked in the NLA editor; leave tweak mode first")
+            raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
     for name in JOINTS:
         if rig.pose.bones[name].rotation_mode != "QUATERNION":
-            raise StgaError(
-                f"{rig.name}: the rotation mode of bone {name} is not Quaternion (WXYZ), which the rig needs"
-            )
+            raise StgaError(f"{rig.name}: the rotation mode of bone {name} must be Quaternion (WXYZ)")
     used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
     for component in np.flatnonzero(used).tolist():
         if expression_key(component) not in head.data.shape_keys.key_blocks:
             raise StgaError(f"{head.name}: has no slider {expression_key(component)}; import the head again to get all")
 
 
-def sample_motion(head: Any, own: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning) -> FlameSequence:
-    """What a FLAME head does in the scene, by hand or not, in each of the frames `numbers`: timesteps from 0.
+def sample_motion(
+    head: Any, sequence: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning
+) -> FlameSequence:
+    """FLAME parameters of the head as animated in the scene, in each of the frames `numbers`: timesteps from 0.
 
-    own: the sequence that it was imported from, for model and identity; identity sliders count as they stand in the
-    first frame. `warn` hears where FLAME's parameters do not make the mesh that the scene shows: another modifier, a
-    sculpted key, a scaled bone. Raises StgaError where the head has no rig.
+    sequence: the one that the head was imported from, for model and identity; identity sliders are read in the first
+    frame. `warn` reports where FLAME's parameters do not reproduce the mesh in the scene: another modifier, a sculpted
+    key, a scaled bone. Raises StgaError where the head has no rig.
     """
     rig = rig_of(head)
     frames: list[FlameFrame] = []
-    shape, worst = own.shape, 0.0
+    shape, largest_error = sequence.shape, 0.0
     for _ in iterate_frames(numbers):
-        frame = _performed_frame(head, rig, own.model)
-        shape = shape if frames else _identity(head, own)
-        made = flame_forward(own.model, shape, frame, own.static_offset)
-        worst = max(worst, float(np.abs(made - evaluated_vertices(head)).max()))
+        frame = _sample_frame(head, rig, sequence.model)
+        shape = shape if frames else _identity(head, sequence)
+        vertices = flame_forward(sequence.model, shape, frame, sequence.static_offset)
+        largest_error = max(largest_error, float(np.abs(vertices - evaluated_vertices(head)).max()))
         frames.append(frame)
-    if worst > SAME_MESH:
+    if largest_error > MESH_TOLERANCE:
         warn(
-            f"{head.name}: something that FLAME has no parameter for moves its mesh too, by up to {1000 * worst:.1f}"
-            " mm; the parameters leave that out"
+            f"{head.name}: its mesh differs from FLAME's by up to {1000 * largest_error:.1f} mm, because something"
+            " that is no FLAME parameter moves it; the exported parameters leave that out"
         )
-    return FlameSequence(own.model, shape, own.static_offset, tuple(range(len(frames))), frames.__getitem__)
+    return FlameSequence(sequence.model, shape, sequence.static_offset, tuple(range(len(frames))), frames.__getitem__)
 
 
-def _performed_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
+def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
     bones = rig.evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones
-    turns = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}
+    rotations = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}
     vectors = {}
-    for joint, parent in enumerate(model.parents.tolist()):
-        turn = turns[JOINTS[joint]] if parent < 0 else turns[JOINTS[parent]].transposed() @ turns[JOINTS[joint]]
-        vectors[JOINTS[joint]] = to_axis_angle(np.array(turn.to_quaternion()))
-    root = bones["root"]
-    above = bones.get(joint_bone("root"))
+    for name, parent in zip(JOINTS, model.parents.tolist(), strict=True):
+        local = rotations[name] if parent < 0 else rotations[JOINTS[parent]].transposed() @ rotations[name]
+        vectors[name] = to_axis_angle(np.array(local.to_quaternion()))
+    root, above = bones["root"], bones.get(parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
     return FlameFrame(
-        expr=np.array([_value(head, expression_key(k)) for k in range(model.n_expression)]),
+        expr=np.array([_key_value(head, expression_key(k)) for k in range(model.n_expression)]),
         rotation=vectors["root"],
         neck_pose=vectors["neck"],
         jaw_pose=vectors["jaw"],
         translation=np.array(root.matrix.translation - rest),
         eyes_pose=np.concatenate([vectors["left_eye"], vectors["right_eye"]]),
-        dynamic_offset=_offset(head),
+        dynamic_offset=_dynamic_offset(head),
     )
 
 
-def _identity(head: Any, own: FlameSequence) -> np.ndarray:
-    sliders = {name: k for name, k in slider_components(own.model).items() if k < own.model.n_identity}
-    shape = own.shape.copy()
-    for name, component in sliders.items():
-        shape[component] += _value(head, name)
+def _identity(head: Any, sequence: FlameSequence) -> np.ndarray:
+    shape = sequence.shape.copy()
+    for name, component in slider_components(sequence.model).items():
+        if component < sequence.model.n_identity:
+            shape[component] += _key_value(head, name)
     return np.asarray(shape)
 
 
-def _value(head: Any, name: str) -> float:
+def _key_value(head: Any, name: str) -> float:
     key = head.data.shape_keys.key_blocks.get(name)
     return 0.0 if key is None or key.mute else float(key.value)
 
 
-def _offset(head: Any) -> np.ndarray | None:
-    """(V, 3) of the keys that hold the tracked per-frame offsets, as they stand; None without any."""
+def _dynamic_offset(head: Any) -> np.ndarray | None:
+    """(V, 3) sum of the tracked per-frame offsets at their current values; None where all are zero."""
     total = None
     for key in offset_keys(head):
-        if _value(head, key.name):
-            moved = _value(head, key.name) * (_points(key) - _points(key.relative_key))
-            total = moved if total is None else total + moved
+        value = _key_value(head, key.name)
+        if value:
+            offset = value * (_key_points(key) - _key_points(key.relative_key))
+            total = offset if total is None else total + offset
     return total
 
 
-def _points(key: Any) -> np.ndarray:
-    points = np.empty(3 * len(key.points), np.float32)
-    key.points.foreach_get("co", points)
-    return points.reshape(-1, 3).astype(np.float64)
+def _key_points(key: Any) -> np.ndarray:
+    return read_values(key.points, "co", 3).astype(np.float64)

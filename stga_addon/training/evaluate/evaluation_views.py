@@ -1,4 +1,4 @@
-"""The views that a run is judged by: their images, the pixels of the head, and the pixels of what moves."""
+"""Evaluation views: held-out images, with the pixels of the head mask and of the moving region."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,18 +11,20 @@ from ...capture.model import Capture, View
 from ...selection import SelectionOptions, select_capture
 
 MAX_EVALUATION_VIEWS = 16
-"""Held-out views that an evaluation during training looks at, evenly spread: few enough to cost little."""
+"""Held-out views that an evaluation during training renders."""
 MIN_REGION_PIXELS = 50
-"""A region with fewer pixels in a view says nothing there."""
+"""A smaller region of a view is left out."""
+MIN_DEPTH_M = 0.01
+"""Triangles nearer to the camera's plane, or behind it, are not drawn."""
 
 
 @dataclass(frozen=True)
 class EvaluationView:
-    """A view and what its rendering is compared with.
+    """A view and the image that its rendering is compared with.
 
     target   (H, W, 3) uint8, read-only
-    regions  "mask": inside the head mask; "moving": pixels of the triangles that the default selection rule picks
-             at that timestep. (H, W) bool; a view without masks, or in which nothing moves, lacks the one or the other
+    regions  name -> (H, W) bool. "mask": the head mask, if the view has one; "moving": visible pixels of the triangles
+             that the default selection picks at the timestep, if there are any
     """
 
     view: View
@@ -31,7 +33,7 @@ class EvaluationView:
 
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
-    """The held-out views that are looked at while training: at most MAX_EVALUATION_VIEWS, evenly spread."""
+    """The held-out views that are evaluated during training: at most MAX_EVALUATION_VIEWS, evenly spread."""
     views = capture.views.get("val", ())
     if len(views) <= MAX_EVALUATION_VIEWS:
         return views
@@ -41,11 +43,11 @@ def choose_evaluation_views(capture: Capture) -> Sequence[View]:
 def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:
     """Read a view's image and mask and find its regions.
 
-    The rule for "moving" is the default one whatever a run trains by, so that runs compare.
-    Raises StgaError where a file cannot be read.
+    "moving" is by the default selection whatever a run's settings are, so that runs are comparable.
+    Raises StgaError if a file cannot be read.
     """
     target, mask = read_image(view), read_mask(view)
-    target.setflags(write=False)  # as in training; Numba would compile anew for writable arrays
+    target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
     selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
     regions = {"moving": visible_pixels(capture, view, selection[view.timestep])}
     if mask is not None:
@@ -56,16 +58,16 @@ def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:
 
 
 def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
-    """(H, W) bool: where one of the triangles `faces` (F,) bool is the nearest one."""
+    """(H, W) bool: pixels at which the nearest triangle is one of `faces` (F,) bool."""
     mesh = np.asarray(capture.mesh(view.timestep))
     corners, depth = view.camera.project(mesh)
     corners -= 0.5  # Pillow's pixel centers lie at whole numbers
-    centres = depth[capture.faces].mean(1)
+    center_depth = depth[capture.faces].mean(1)
     picture = Image.new("1", (view.camera.width, view.camera.height))
     draw = ImageDraw.Draw(picture)
-    drawn = np.flatnonzero((depth[capture.faces] > 0.01).all(1))
-    drawn = drawn[np.argsort(-centres[drawn], kind="stable")]  # the painter's order, far to near
+    drawn = np.flatnonzero((depth[capture.faces] > MIN_DEPTH_M).all(1))
+    drawn = drawn[np.argsort(-center_depth[drawn], kind="stable")]  # painter's algorithm: far to near
     polygons = corners[capture.faces[drawn]].reshape(-1, 6).tolist()
-    for polygon, chosen in zip(polygons, faces[drawn].tolist(), strict=True):
-        draw.polygon(polygon, fill=int(chosen))
+    for polygon, is_chosen in zip(polygons, faces[drawn].tolist(), strict=True):
+        draw.polygon(polygon, fill=int(is_chosen))
     return np.asarray(picture)

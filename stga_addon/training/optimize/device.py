@@ -47,7 +47,7 @@ def make_backend(
 
         return CpuBackend(settings, units, frames, state)
     if settings.tracking:
-        raise StgaError(f"effect tracking: FLAME's parameters are refined on the CPU only, not on {device}")
+        raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
     from .gpu_backend import GpuBackend
 
     return GpuBackend("cpu" if device == "warp-cpu" else device, settings, units, frames, state)

@@ -1,4 +1,4 @@
-"""Images of unlike cameras, as the mean of them would have taken them."""
+"""Correction of exposure and white balance between the training cameras."""
 
 from collections.abc import Callable
 
@@ -8,14 +8,14 @@ from ...capture.model import View
 from ..settings import TrainingSettings
 
 Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
-"""View, image (H, W, 3) uint8 and mask (H, W) uint8 or None -> the image to train on."""
+"""(view, image (H, W, 3) uint8, mask (H, W) uint8 or None) -> corrected image (H, W, 3) uint8."""
 
 
 def exposure_correction(settings: TrainingSettings) -> Correction | None:
-    """What takes the settings' `exposure` away from the images of training cameras; None where there is none.
+    """The correction that inverts the settings' `exposure`; None if there is none.
 
-    Only the foreground passed through the camera: what the mask says is background keeps its colour. Cameras that
-    the settings do not name stay as they are.
+    It applies to the foreground only, because the background is constant whatever the camera. Images of cameras that
+    the settings do not list stay unchanged.
     """
     if not settings.exposure:
         return None
@@ -27,8 +27,8 @@ def exposure_correction(settings: TrainingSettings) -> Correction | None:
             return image
         gain, offset = rows[view.camera_index]
         cover = np.float32(1) if mask is None else mask[..., None].astype(np.float32) / 255
-        behind = (1 - cover) * background
-        even = (image - behind - cover * offset) / gain + behind
-        return np.asarray(np.clip(even, 0, 255) + 0.5).astype(np.uint8)
+        background_part = (1 - cover) * background
+        corrected = (image - background_part - cover * offset) / gain + background_part
+        return np.asarray(np.clip(corrected, 0, 255) + 0.5).astype(np.uint8)
 
     return correct

@@ -1,4 +1,4 @@
-"""Splats for what the mesh does not cover: hair, shoulders, clothes."""
+"""Hull points: splats for what the mesh does not cover (hair, shoulders, clothes)."""
 
 from collections.abc import Sequence
 
@@ -14,80 +14,85 @@ from ...capture.camera import Camera
 from ...capture.images import read_image, read_mask
 from ...capture.model import Capture, View
 
-VOXEL = 0.004
-"""Metres between seeds, on a mesh of a head's size."""
-FINEST = 1 / 200
-"""Seeds are at least this share of the mesh's diagonal apart: a mesh in millimetres must not fill the memory."""
-CLEARANCE = 0.006
-"""Metres: nearer to the mesh than this, the mesh's own splats cover it."""
-MARGIN = 0.25
-"""How far around the mesh's bounding box to look, as a share of its diagonal."""
-WITNESSES = 0.25
-"""A voxel counts if at least this share of the views sees it at all (and all that do have it inside their mask)."""
-EXPOSED = 0.125
-"""... and if it shows beside the mesh in at least this share of the views. Without this, the hull's phantom volumes
-behind the head, which nothing contradicts, become floaters in every other view."""
-TRACKING_ERROR = 0.01
-"""How far, as a share of the image height, a tracked silhouette may be off the mask."""
+VOXEL_SIZE_M = 0.004
+"""Distance between hull points, on a mesh of a head's size."""
+MIN_VOXEL_SIZE_SHARE = 1 / 200
+"""Lower bound of the voxel size, as a share of the mesh's diagonal, so that a mesh in millimeters fits into memory."""
+MIN_MESH_DISTANCE_M = 0.006
+"""Points nearer to the mesh are covered by the mesh's own splats."""
+GRID_MARGIN_SHARE = 0.25
+"""Margin of the grid around the mesh's bounding box, as a share of its diagonal."""
+MIN_VISIBLE_SHARE = 0.25
+"""Share of the views in whose image a voxel must lie; it must be foreground in all of these."""
+MIN_EXPOSED_SHARE = 0.125
+"""Share of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind the head that no view
+contradicts would become floaters in other views."""
+SILHOUETTE_TOLERANCE_SHARE = 0.01
+"""Error of the tracked silhouette, as a share of the image height."""
+MIN_DEPTH_M = 0.01
+"""Points nearer to the camera's plane are not visible."""
 
 
 def hull_points(capture: Capture, views: Sequence[View], convention: str, sh_degree: int) -> Splats:
-    """Loose splats on the shell of the visual hull of one timestep, outside the mesh.
+    """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
 
-    views: all of one timestep. The hull is carved on a grid of VOXEL metres (coarser on a larger mesh) from the masks
-    (or, without masks, from what differs from white); each seed is bound to the nearest triangle, so it follows the
-    head.
+    views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger mesh) from the masks
+    or, without masks, from pixels that differ from white. Each splat is embedded in the nearest triangle and follows
+    it.
     """
     mesh = capture.mesh(views[0].timestep)
-    voxel = max(VOXEL, FINEST * float(np.linalg.norm(np.ptp(mesh, axis=0))))
-    points = _shell(mesh, capture.faces, views, voxel)
+    voxel = max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
+    points = _hull_surface(mesh, capture.faces, views, voxel)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
-    outside = distance > CLEARANCE
-    world = _seeds(points[outside], voxel, sh_degree)
+    outside = distance > MIN_MESH_DISTANCE_M
+    world = _new_splats(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(world, frames, face[outside])
 
 
 def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh and nearest triangle (N,), by a lattice of samples on every triangle."""
+    """Distance (N,) to the mesh and nearest triangle (N,), approximated by a lattice of samples on every triangle."""
     weights = lattice_weights(4, inset=0.02)
     samples = np.einsum("pc,fci->fpi", weights, mesh[faces]).reshape(-1, 3)
     distance, nearest = cKDTree(samples).query(points)
     return distance, nearest // len(weights)
 
 
-def _shell(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float) -> np.ndarray:
-    """Grid points (N, 3) on the surface of the visual hull that show beside the mesh."""
+def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float) -> np.ndarray:
+    """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
     low, high = mesh.min(0), mesh.max(0)
-    margin = MARGIN * np.linalg.norm(high - low)
+    margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = np.ones(len(grid), bool)
-    witnesses, exposed = np.zeros(len(grid), np.int32), np.zeros(len(grid), np.int32)
+    visible, exposed = np.zeros(len(grid), np.int32), np.zeros(len(grid), np.int32)
     for view in views:
         mask, beside = _foreground(view), ~_silhouette(mesh, faces, view.camera)
-        alive = np.flatnonzero(inside)
-        x, y, seen = _pixels(grid[alive], view.camera)
-        alive, x, y = alive[seen], x[seen], y[seen]
-        witnesses[alive] += 1
-        exposed[alive] += beside[y, x]
-        inside[alive] = mask[y, x]
-    solid = (inside & (witnesses >= max(2, WITNESSES * len(views)))).reshape([len(a) for a in axes])
+        remaining = np.flatnonzero(inside)
+        x, y, seen = _pixels(grid[remaining], view.camera)
+        remaining, x, y = remaining[seen], x[seen], y[seen]
+        visible[remaining] += 1
+        exposed[remaining] += beside[y, x]
+        inside[remaining] = mask[y, x]
+    solid = (inside & (visible >= max(2, MIN_VISIBLE_SHARE * len(views)))).reshape([len(a) for a in axes])
     surface = (solid & ~binary_erosion(solid)).ravel()
-    return np.asarray(grid[surface & (exposed >= np.maximum(1, EXPOSED * len(views)))])
+    return np.asarray(grid[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
 
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: pixels that the mesh covers, or that a small tracking error would make it cover."""
+    """(H, W) bool: pixels that the mesh covers, dilated by the tolerance."""
     pixels, depth = camera.project(mesh)
     picture = Image.new("1", (camera.width, camera.height))
     draw = ImageDraw.Draw(picture)
-    for corners in pixels[faces[(depth > 0.01)[faces].all(1)]].reshape(-1, 6).tolist():
+    for corners in pixels[faces[(depth > MIN_DEPTH_M)[faces].all(1)]].reshape(-1, 6).tolist():
         draw.polygon(corners, fill=1)
-    return np.asarray(binary_dilation(np.asarray(picture), iterations=max(1, round(TRACKING_ERROR * camera.height))))
+    return np.asarray(
+        binary_dilation(np.asarray(picture), iterations=max(1, round(SILHOUETTE_TOLERANCE_SHARE * camera.height)))
+    )
 
 
 def _foreground(view: View) -> np.ndarray:
+    """(H, W) bool from the mask or, without one, from the image's difference to white."""
     mask = read_mask(view)
     if mask is not None:
         return np.asarray(mask > 127)
@@ -95,14 +100,15 @@ def _foreground(view: View) -> np.ndarray:
 
 
 def _pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel columns and rows of world points (N, 3), and which of them lie in the image."""
+    """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in the image."""
     pixels, depth = camera.project(points)
     x, y = np.floor(pixels).T
-    seen = (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
 
 
-def _seeds(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
+def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
+    """Gray unbound spheres of one voxel's size at world points (N, 3)."""
     n = len(points)
     return Splats(
         xyz=points.astype(np.float32),

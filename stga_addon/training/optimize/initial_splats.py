@@ -6,7 +6,7 @@ import numpy as np
 
 from ...avatar.lattice import lattice_splats
 from ...avatar.splats import Splats
-from ...avatar.strain import STRAINS
+from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .hull_points import hull_points
@@ -24,7 +24,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
         first = capture.views["train"][0].timestep
         views = [view for view in capture.views["train"] if view.timestep == first]
         parts.append(hull_points(capture, views, settings.convention, settings.sh_degree))
-    strains = STRAINS if settings.strain_color else 0
+    strains = STRAIN_COMPONENTS if settings.strain_color else 0
     parts = [replace(part, strain_color=np.zeros((len(part), strains, 3), np.float32)) for part in parts]
     return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
 

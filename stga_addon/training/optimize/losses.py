@@ -12,7 +12,7 @@ from ...raster.cpu.layout import TILE
 
 
 def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:
-    """Rectangles (bands, 4) of pixels x0, y0, x1, y1 that tile an image, for the threads to share."""
+    """Rectangles (bands, 4) of pixels x0, y0, x1, y1 that tile an image; each is one thread's work."""
     edges = np.linspace(0, height, min(bands, height) + 1).astype(np.int64)
     return np.array([[0, top, width, bottom] for top, bottom in pairwise(edges)], np.int64)
 

@@ -1,4 +1,4 @@
-"""Compile (or load from the cache) every kernel before the clock of a training run starts."""
+"""Compilation of all CPU kernels before the timed part of a training run."""
 
 import os
 import subprocess
@@ -22,31 +22,31 @@ from .losses import image_gradient, whole_image
 from .state import TrainState, new_state
 
 PACKAGE = "stga_addon"
-PATIENCE_S = 120.0
+HELPER_TIMEOUT_S = 120.0
 CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
 
 
 def precompile_kernels() -> None:
     """Run each kernel once on two splats, with the argument types of real training.
 
-    On a machine where nothing is compiled yet, a second process compiles half of them meanwhile: Numba compiles one
-    function at a time in a process.
+    If the cache is empty, a second process compiles half of them at the same time, because Numba compiles one function
+    at a time per process.
     """
     helper = _second_process()
     _render()
     _limit()
     if helper is not None:
         try:
-            helper.wait(PATIENCE_S)
+            helper.wait(HELPER_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             helper.kill()
-    _second_half()  # whatever the second process has left
+    _second_half()  # loads from the cache what the second process has compiled
 
 
 def _second_process() -> "subprocess.Popen[bytes] | None":
-    """A process that runs `_second_half`; None where the cache has that, or another process could not fill it."""
+    """A process that runs `_second_half`; None if it is cached already or a second process would not help."""
     cached = any(Path(KERNEL_CACHE_FOLDER).glob("*/image_loss.image_loss-*.nbi"))
-    # As part of an extension the package has another name and another cache.
+    # As part of an extension, the package has another name and another cache.
     if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
         return None
     try:
@@ -62,7 +62,7 @@ def _second_process() -> "subprocess.Popen[bytes] | None":
 
 
 def _pair() -> TrainState:
-    # Two splats: a column of a one-row array counts as contiguous, which is another type to Numba.
+    # Two splats, because a column of a one-row array is contiguous, which is another type to Numba.
     return new_state(
         Splats(
             xyz=np.array([[0, 0, 1], [0, 0, 2]], np.float32),
@@ -77,7 +77,7 @@ def _pair() -> TrainState:
 
 
 def _render() -> None:
-    """Forwards and backwards."""
+    """Forward and backward pass."""
     state = _pair()
     seen, face = frames_in_camera(WORLD, CAMERA), state.face.numpy()
     rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
@@ -86,17 +86,17 @@ def _render() -> None:
 
 
 def _second_half() -> None:
-    """The loss, Adam and a part of rendering: as long to compile as the rest."""
+    """Loss, Adam and the backward projection: about half of the time to compile."""
     _project_backward()
     image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
-    target.setflags(write=False)  # as the loader's are; Numba compiles for that
+    target.setflags(write=False)  # like the loader's arrays: read-only arrays are a type of their own
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
     rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
     adam.step(_pair(), np.arange(2, dtype=np.int32), rates)
 
 
 def _project_backward() -> None:
-    """Two splats without a pair."""
+    """Two splats that no tile contains."""
     state = _pair()
     frames, none = frames_in_camera(WORLD, CAMERA), np.zeros(2, np.int32)
     gradients = Parameters(*(g.numpy() for g in state.gradients))
@@ -109,7 +109,7 @@ def _project_backward() -> None:
 
 
 def _limit() -> None:
-    """The limits, and the exchange of the background."""
+    """Limits, and replacement of the background."""
     state = _pair()
     target, mask = np.zeros((16, 16, 3), np.uint8), np.zeros((16, 16), np.uint8)
     target.setflags(write=False)

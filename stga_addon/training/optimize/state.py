@@ -1,4 +1,4 @@
-"""What training changes: the splats, their optimiser moments and what density control has gathered."""
+"""State of the splats in training: parameters, optimizer moments and statistics for density control."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -13,14 +13,14 @@ from ...raster.cpu.layout import Parameters
 
 @dataclass
 class TrainState:
-    """N splats in training, torch tensors on one device, all with N rows.
+    """N splats in training: CPU tensors with N rows each.
 
-    parameters, gradients, first, second  as in `Splats`: values, last gradient, Adam's two moments
-    average  the parameters' running average over their steps, which is what the avatar is made of
-    steps    (N,) int32: how often Adam stepped the row
-    face     (N,) int32 and unbound (N,) bool, as in `Splats`
-    screen_gradient     (N,) sum of the screen-space gradient lengths since the last density control, and
-    gradient_count  (N,) float32: how many were summed
+    parameters, gradients, first, second  values, latest gradients and Adam's two moments, shaped as in `Splats`
+    average  running average of the parameters over their steps, from which the avatar is made
+    steps    (N,) int32 Adam steps per row
+    face, unbound    (N,) int32 and (N,) bool, as in `Splats`
+    screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density control
+    gradient_count   (N,) float32 number of summands
     """
 
     parameters: Parameters
@@ -38,11 +38,11 @@ class TrainState:
         return len(self.steps)
 
     def arrays(self) -> Parameters:
-        """The parameters as numpy arrays that share their memory."""
+        """The parameters as NumPy arrays that share their memory."""
         return Parameters(*(t.numpy() for t in self.parameters))
 
     def splats(self) -> Splats:
-        """A copy of the splats as they are now."""
+        """A copy of the current splats."""
         return self._copy(self.parameters)
 
     def averaged(self) -> Splats:
@@ -55,7 +55,7 @@ class TrainState:
 
 
 def new_state(splats: Splats) -> TrainState:
-    """Fresh optimiser moments around a copy of the splats."""
+    """A copy of the splats with zero moments."""
     values = [torch.from_numpy(getattr(splats, name).astype(np.float32)) for name in Parameters._fields]
     n = len(splats)
 
@@ -77,12 +77,12 @@ def new_state(splats: Splats) -> TrainState:
 
 
 def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
-    """The rows at `keep`, a mask (N,) or indices, with everything that belongs to them."""
+    """The rows at `keep`, a mask (N,) or indices, of every tensor."""
     return _map(lambda tensors: tensors[0][keep], state)
 
 
 def join(state: TrainState, other: TrainState) -> TrainState:
-    """All rows of both, in order."""
+    """All rows of both states, in order."""
     return _map(lambda tensors: torch.cat(tensors), state, other)
 
 

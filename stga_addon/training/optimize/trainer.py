@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...capture.model import Capture, View
-from ..run.folder import Checkpoint
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .backend import Batch
@@ -15,7 +14,7 @@ from .initial_splats import initial_splats
 from .losses import limit_units
 from .state import TrainState, new_state
 from .strategies import DensityControl, PostStep, StrayReset, make_strategy
-from .tracking import refinable_tracking, refinement_rate
+from .tracking import RefinementState, refinable_tracking, refinement_rate
 
 
 class Trainer:
@@ -60,12 +59,19 @@ class Trainer:
     def state(self, state: TrainState) -> None:
         self._backend.state = state
 
-    def continue_from(self, checkpoint: Checkpoint) -> None:
-        """Restore everything that the next step depends on."""
-        self.state, self.iteration, self.visit = checkpoint.state, checkpoint.iteration, checkpoint.visit
-        self.last_timestep, self.initial_count = checkpoint.last_timestep, checkpoint.initial_count
-        if self.tracking is not None and checkpoint.tracking is not None:
-            self.tracking.state = checkpoint.tracking
+    def restore(
+        self,
+        iteration: int,
+        visit: int,
+        last_timestep: int | None,
+        initial_count: int,
+        tracking: RefinementState | None,
+    ) -> None:
+        """Restore, beside the state given at construction, everything that the next step depends on."""
+        self.iteration, self.visit = iteration, visit
+        self.last_timestep, self.initial_count = last_timestep, initial_count
+        if self.tracking is not None and tracking is not None:
+            self.tracking.state = tracking
 
     def step(
         self,

@@ -1,6 +1,11 @@
-"""A whole training run: from a capture to an avatar in a folder, with evaluation, checkpoints and resumption."""
+"""Training loop of a run: evaluations, checkpoints and resumption in a run folder."""
 
+import signal
+import threading
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,23 +25,25 @@ from ..evaluate.forecast import curve_of, forecast, forecast_horizon, plateau_st
 from ..evaluate.metrics import evaluate, peak_memory_mb
 from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
+from ..optimize.state import TrainState
 from ..optimize.tracking import write_tracking
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import to_json
-from . import folder as run_folder
-from .folder import Checkpoint, Run
-from .metrics_log import read_metrics
+from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
+from .folder import CHECKPOINT, SELECTION, Run, locked, read_run, write_run
+from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
+from .open_run import check_identity
 from .progress import Progress, Report
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 EVALUATIONS = 10
-"""Evaluations over a budget in iterations: always the same ones, so that the run repeats."""
+"""Evaluations over a budget in iterations, at fixed shares of it so that the run is reproducible."""
 EVALUATION_SHARE = 0.04
-"""Largest share of the training time that evaluations add to a budget in seconds; the last one comes on top."""
-MOST_EVALUATIONS = 40
-"""Evaluations over a budget in seconds, however little they cost."""
+"""Largest share of the training time that evaluations add to a budget in seconds, without the last one."""
+MAX_EVALUATIONS = 40
+"""Evaluations over a budget in seconds, even where they cost little."""
 
 
 def train(
@@ -46,126 +53,170 @@ def train(
     selection: dict[int, np.ndarray] | None = None,
     resume: bool = False,
     report: Report = lambda progress: False,
-    device: str = "cpu",
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
     selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
     checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
-    device: one of `device.choose_device`.
-    Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or the
-    weights of LPIPS are named and are none.
+    Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or
+    STGA_LPIPS names a file without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar and checkpoint
+    are saved, a second one at once.
     """
     lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
         raise StgaError(f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on")
-    with run_folder.locked(out):
-        if (out / "run.json").exists() and not resume:
+    with locked(out):
+        has_run = (out / "run.json").exists()
+        if has_run and not resume:
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
+        has_begun = has_run and read_run(out).identity is not None
+        run = replace(run, identity=check_identity(out, run, capture))
         report(Progress(message="Compiling kernels"))
         precompile_kernels()
-        loop = _Loop(capture, out, run, report, device)
-        if resume and (out / "checkpoint.npz").exists():
+        loop = _Loop(capture, out, run, report)
+        if has_begun and (out / CHECKPOINT).exists():
             loop.resume()
         else:
-            if resume and selection is None and (out / "selection.npz").exists():
-                selection = run_folder.read_selection(out, len(capture.faces))
+            if has_begun and selection is None and (out / SELECTION).exists():
+                selection = read_selection(out, len(capture.faces), loop.digest)
             loop.begin(selection)
         loop.work()
     return out / "avatar.npz"
 
 
+@contextmanager
+def _interrupt_requests() -> Iterator[list[int]]:
+    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt.
+
+    Without effect off the main thread and in Blender, which handles Ctrl-C itself.
+    """
+    requests: list[int] = []
+
+    def request(number: int, _frame: object) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield requests
+        return
+    signal.signal(signal.SIGINT, request)
+    try:
+        yield requests
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class _Loop:
     """The state of `train` between its steps."""
 
-    def __init__(self, capture: Capture, out: Path, run: Run, report: Report, device: str) -> None:
-        self.capture, self.out, self.run, self.report, self.device = capture, out, run, report, device
-        self.settings = run.settings
+    def __init__(self, capture: Capture, out: Path, run: Run, report: Report) -> None:
+        assert run.identity is not None
+        self.capture, self.out, self.run, self.report = capture, out, run, report
+        self.settings, self.digest = run.settings, run.identity.digest
         self.elapsed, self.best, self.evaluations = 0.0, -np.inf, 0
         self.losses: deque[float] = deque(maxlen=100)
         self.lines: list[dict[str, Any]] = []
         self.psnr: float | None = None
+        self.speed = 0.0
         self.forecast_text = ""
         self.evaluation_views = [read_evaluation_view(capture, view) for view in choose_evaluation_views(capture)]
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
-        """Start anew: choose triangles, place splats, and write down what is going to happen."""
-        self._tell("Placing splats")
+        """Start a new run: select triangles, place splats, and write the run's files."""
+        self.report(Progress(message="Placing splats"))
         if selection is None:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
-        self.trainer = Trainer(self.capture, self.settings, selection, device=self.device)
-        (self.out / TRACKING).unlink(missing_ok=True)  # a run that was here before may have left one
-        run_folder.write_selection(self.out, selection)
-        run_folder.write_run(self.out, self.run)
-        run_folder.cut_metrics(self.out, -1)
+        self.trainer = Trainer(self.capture, self.settings, selection, device=self.run.device)
+        for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
+            (self.out / stale).unlink(missing_ok=True)
+        write_selection(self.out, selection, self.digest)
+        write_run(self.out, self.run)
 
     def resume(self) -> None:
-        """Take up the folder's checkpoint."""
-        self._tell("Reading the checkpoint")
-        checkpoint = run_folder.read_checkpoint(self.out)
-        selection = run_folder.read_selection(self.out, len(self.capture.faces))
-        face = checkpoint.state.face
-        if len(face) and not 0 <= int(face.min()) <= int(face.max()) < len(self.capture.faces):
-            raise StgaError(f"{self.out}: its splats stand on triangles that {self.capture.root} does not have")
-        splats = checkpoint.state.splats()
-        if splats.sh_degree != self.settings.sh_degree:
-            says = self.settings.sh_degree
-            raise StgaError(f"{self.out}: its splats have SH degree {splats.sh_degree}, run.json says {says}")
-        if bool(splats.strain_color.shape[1]) != self.settings.strain_color:
-            raise StgaError(f"{self.out}: its splats and run.json disagree on whether colours follow strain")
-        self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state, self.device)
+        """Continue from the folder's checkpoint."""
+        self.report(Progress(message="Reading the checkpoint"))
+        checkpoint = read_checkpoint(self.out)
+        if checkpoint.identity != self.digest:
+            raise StgaError(f"{self.out / CHECKPOINT}: {OTHER_RUN}")
+        selection = read_selection(self.out, len(self.capture.faces), self.digest)
+        self._check(checkpoint.state)
+        self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state, self.run.device)
         here, there = self.trainer.tracking, checkpoint.tracking
         if (None if here is None else here.tracked.shape) != (None if there is None else there.change.shape):
-            raise StgaError(f"{self.out}: its refined tracking is not of this capture, or run.json knows of none")
-        self.trainer.continue_from(checkpoint)
+            raise StgaError(f"{self.out}: its checkpoint's refined tracking does not fit the capture or the settings")
+        self.trainer.restore(
+            checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count,
+            checkpoint.tracking,
+        )  # fmt: skip
         self.losses.extend(checkpoint.losses)
         self.elapsed, self.best = checkpoint.elapsed_s, checkpoint.best_psnr
         self.evaluations = checkpoint.evaluations
-        run_folder.cut_metrics(self.out, checkpoint.iteration)
+        cut_metrics(self.out, checkpoint.iteration)
         self.lines = read_metrics(self.out)
+        write_run(self.out, self.run)  # capture, model and device may be others now
+
+    def _check(self, state: TrainState) -> None:
+        """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
+        face, splats = state.face, state.splats()
+        if len(face) and not 0 <= int(face.min()) <= int(face.max()) < len(self.capture.faces):
+            raise StgaError(f"{self.out}: its splats refer to triangles that {self.capture.root} does not have")
+        if splats.sh_degree != self.settings.sh_degree:
+            expected = self.settings.sh_degree
+            raise StgaError(f"{self.out}: its splats have SH degree {splats.sh_degree}, run.json says {expected}")
+        if bool(splats.strain_color.shape[1]) != self.settings.strain_color:
+            raise StgaError(f"{self.out}: its splats and run.json disagree on the effect strain-color")
 
     def work(self) -> None:
-        """Train until the budget is spent, the settings' goal is reached or the report says stop."""
-        if self._share() >= 1 or self._enough():
+        """Train until the budget is spent, a goal of the settings is reached or the report asks to stop."""
+        if self._finished():
             return  # a finished run was resumed
-        settings, trainer = self.settings, self.trainer
-        views = self.capture.views["train"]
-        order = view_order(views, settings.views_per_visit, settings.seed, trainer.iteration)
-        red, green, blue = (round(255 * c) for c in settings.background)
-        correct = exposure_correction(settings)
-        saved, started = self.elapsed, self.elapsed
-        first = trainer.iteration
-        self.clock_began = perf_counter() - (self.lines[-1].get("wall_s", 0.0) if self.lines else 0.0)
-        with ViewLoader(
-            order,
-            lambda position: self._size(first + position),
-            (red, green, blue),
-            correct=correct,
-            mesh=self.capture.mesh if trainer.tracking is None else None,  # refined meshes change with every step
-        ) as loader:
-            while (share := self._share()) < 1:
-                begin = perf_counter()
-                view, image, mask, mesh = next(loader)
-                loss = trainer.step(view, image, share, mask, mesh)
-                self.elapsed += perf_counter() - begin
-                if loss is not None:
-                    self.losses.append(loss)
+        self.clock_began = perf_counter() - (self.lines[-1]["wall_s"] if self.lines else 0.0)
+        with _interrupt_requests() as interrupts:
+            self._train(interrupts)
+            self._evaluate(perceptual=self._finished())  # LPIPS takes long, so a run that is stopped goes without
+            self._save()
+        self.report(self._progress("Interrupted" if interrupts else "Finished"))
+        if interrupts:
+            raise KeyboardInterrupt
+
+    def _train(self, interrupts: list[int]) -> None:
+        saved, started, first = self.elapsed, self.elapsed, self.trainer.iteration
+        with self._loader() as loader:
+            while not self._share() >= 1:
+                self._step(loader)
                 if self._due():
                     self._evaluate()
-                    if self._enough():
+                    if self._finished():
                         break
                 if self.elapsed - saved > CHECKPOINT_S:
                     self._save()
                     saved = self.elapsed
-                speed = (trainer.iteration - first) / max(self.elapsed - started, 1e-9)
-                if self.report(self._progress(speed)):
+                self.speed = (self.trainer.iteration - first) / max(self.elapsed - started, 1e-9)
+                if self.report(self._progress("Training")) or interrupts:
                     break
-        self._evaluate(perceptual=self._share() >= 1 or self._enough())  # who stops a run is not made to wait
-        self._save()
-        self.report(self._progress(speed, "Finished"))
+
+    def _loader(self) -> ViewLoader:
+        settings, first = self.settings, self.trainer.iteration
+        red, green, blue = (round(255 * c) for c in settings.background)
+        order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
+        correct = exposure_correction(settings)
+        mesh = self.capture.mesh if self.trainer.tracking is None else None  # refined meshes change with every step
+        return ViewLoader(
+            order, lambda position: self._size(first + position), (red, green, blue), correct=correct, mesh=mesh
+        )
+
+    def _step(self, loader: ViewLoader) -> None:
+        begin = perf_counter()
+        view, image, mask, mesh = next(loader)
+        loss = self.trainer.step(view, image, self._share(), mask, mesh)
+        self.elapsed += perf_counter() - begin
+        if loss is not None:
+            self.losses.append(loss)
 
     def _share(self) -> float:
         """Share of the budget spent."""
@@ -187,17 +238,17 @@ class _Loop:
         cost, last = 0.5 * len(self.evaluation_views) * self.elapsed / self.trainer.iteration, 0.0
         if self.lines:
             cost, last = float(self.lines[-1]["evaluation_s"]), float(self.lines[-1]["seconds"])
-        return self.elapsed - last >= max(self.settings.seconds / MOST_EVALUATIONS, cost / EVALUATION_SHARE)
+        return self.elapsed - last >= max(self.settings.seconds / MAX_EVALUATIONS, cost / EVALUATION_SHARE)
 
-    def _enough(self) -> bool:
-        """Whether the target is reached, or nothing more is to be gained and the settings say to stop then."""
+    def _finished(self) -> bool:
+        """Whether the budget is spent, the target PSNR is reached, or a stop at a flat curve is due."""
         curve, target = curve_of(self.lines), self.settings.target_psnr
-        if target is not None and any(psnr >= target for _, psnr in curve):
+        if self._share() >= 1 or (target is not None and any(psnr >= target for _, psnr in curve)):
             return True
         return self.settings.stop_when_flat and plateau_start(curve) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
-        """Look at the held-out views, keep the avatar if it is the best so far, and write the metrics down."""
+        """Measure the evaluation views, keep the avatar if it is the best so far, and append a line of metrics."""
         share = min(1.0, self._share())
         self.evaluations = max(self.evaluations, int(share * EVALUATIONS))
         begin = perf_counter()
@@ -212,30 +263,34 @@ class _Loop:
             quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
             self.psnr = quality.psnr
             line.update(quality.as_json())
-        # Without held-out views the latest avatar counts as the best.
-        if not self.evaluation_views or self.psnr is None or self.psnr >= self.best:
-            self.best = -np.inf if self.psnr is None else self.psnr
-            write_avatar(self.out / "avatar.npz", self._avatar())
-            if self.trainer.tracking is not None:
-                write_tracking(self.out, self.trainer.tracking)
+        self._keep_best()
         now = perf_counter()
         line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
         line["peak_memory_mb"] = peak_memory_mb()
         self.lines.append(line)
-        self._look_ahead(line)
-        run_folder.append_metrics(self.out, line)
+        self._forecast(line)
+        append_metrics(self.out, line)
 
-    def _look_ahead(self, line: dict[str, Any]) -> None:
-        """Say what more time will bring, and note it in the line so that it can be checked."""
+    def _keep_best(self) -> None:
+        """Write the avatar if it is the best so far; without evaluation views the latest one counts as the best."""
+        if self.psnr is not None and not self.psnr >= self.best:
+            return
+        self.best = -np.inf if self.psnr is None else self.psnr
+        write_avatar(self.out / "avatar.npz", self._avatar())
+        if self.trainer.tracking is not None:
+            write_tracking(self.out, self.trainer.tracking)
+
+    def _forecast(self, line: dict[str, Any]) -> None:
+        """Predict the gain of more training, and add the forecast to the line so that it can be checked later."""
         curve, left = curve_of(self.lines), self._left_s()
         ahead = forecast_horizon(self.elapsed, left)
-        coming = None if ahead is None else forecast(curve, ahead)
-        self.forecast_text = "" if coming is None else str(coming)
-        if coming is not None:
-            line["forecast"] = coming.as_json()
-        level = plateau_start(curve) if left else None
-        if level is not None:
-            self.forecast_text = f"no gain since {format_duration(level)}: more time no longer helps"
+        predicted = None if ahead is None else forecast(curve, ahead)
+        self.forecast_text = "" if predicted is None else str(predicted)
+        if predicted is not None and "psnr" in line:
+            line["forecast"] = predicted.as_json()
+        plateau = plateau_start(curve) if left else None
+        if plateau is not None:
+            self.forecast_text = f"no gain since {format_duration(plateau)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None
         if target is not None and end is not None and end.psnr + end.error < target:
             far = f"{target:g} dB is out of reach ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"
@@ -251,24 +306,23 @@ class _Loop:
             dict(self.capture.regions),
             self.settings.background,
             self.settings.antialiased,
+            self.run.principal_point,
         )
 
     def _save(self) -> None:
         trainer = self.trainer
-        run_folder.write_checkpoint(
-            self.out,
-            Checkpoint(
-                trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
-                self.elapsed, self.best, self.evaluations, list(self.losses),
-                None if trainer.tracking is None else trainer.tracking.state,
-            ),
+        checkpoint = Checkpoint(
+            trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
+            self.elapsed, self.best, self.evaluations, list(self.losses),
+            None if trainer.tracking is None else trainer.tracking.state, self.digest,
         )  # fmt: skip
+        write_checkpoint(self.out, checkpoint)
 
-    def _progress(self, per_second: float, message: str = "Training") -> Progress:
+    def _progress(self, message: str) -> Progress:
         return Progress(
             min(1.0, self._share()),
             self.trainer.iteration,
-            per_second,
+            self.speed,
             float(np.mean(self.losses)) if self.losses else np.nan,
             self.psnr,
             len(self.trainer),
@@ -282,6 +336,3 @@ class _Loop:
         """Seconds of training until the budget is spent, at the speed so far."""
         share = self._share()
         return max(0.0, self.elapsed * (1 / share - 1)) if share > 0 else np.nan
-
-    def _tell(self, message: str) -> None:
-        self.report(Progress(message=message))

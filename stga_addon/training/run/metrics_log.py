@@ -1,19 +1,25 @@
-"""The evaluations of a run, read from its folder; without torch, since Blender shows them, too."""
+"""The evaluations of a run, one line of JSON each in its folder."""
 
 import json
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ...errors import StgaError
-from ...files import file_size
+from ...files import file_size, replacing
 
 METRICS = "metrics.jsonl"
+REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
+"""Fields of every line."""
+FORECAST = ("seconds", "psnr", "error", "ahead", "gain")
+"""Fields of a line's forecast, where it has one."""
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All complete lines, up to the first that is none: a kill may have cut it off.
+    """The lines up to the first that is not JSON: a kill may have cut it off.
 
-    Raises StgaError where there is something else than a file, or one that cannot be read.
+    Raises StgaError where the file cannot be read or a line has a missing or malformed field.
     """
     path = folder / METRICS
     lines: list[dict[str, Any]] = []
@@ -23,12 +29,60 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         file_size(path)
         with path.open("rb") as texts:
             for text in texts:
-                line = json.loads(text.decode("utf-8"))
-                if not isinstance(line, dict) or type(line.get("iteration")) is not int:
-                    break
-                lines.append(line)
+                lines.append(json.loads(text.decode("utf-8")))
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, RecursionError):
         pass
+    for number, line in enumerate(lines, 1):
+        fault = _fault(line)
+        if fault is not None:
+            raise StgaError(f"{path}: line {number}: {fault}")
     return lines
+
+
+def append_metrics(folder: Path, line: Mapping[str, Any]) -> None:
+    try:
+        with (folder / METRICS).open("a", encoding="utf-8") as out:
+            out.write(json.dumps(line) + "\n")
+    except OSError as error:
+        raise StgaError(f"{folder / METRICS}: cannot be written ({error.strerror})") from error
+
+
+def cut_metrics(folder: Path, iteration: int) -> None:
+    """Remove the evaluations after `iteration`, which a resumed run makes again."""
+    kept = [line for line in read_metrics(folder) if line["iteration"] <= iteration]
+    with replacing(folder / METRICS) as partial:
+        partial.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+
+
+def _fault(line: Any) -> str | None:
+    """What is wrong with a line; None for a good one. Numbers other than the required ones need not be finite."""
+    if not isinstance(line, dict):
+        return "is no object"
+    for name in REQUIRED:
+        if not _is_number(line.get(name)) or not 0 <= line[name] < math.inf:
+            return f"{name} is {line.get(name)!r:.40}, expected a number from 0 up"
+    for name, value in line.items():
+        if name != "forecast" and not _is_number(value):
+            return f"{name} is {value!r:.40}, expected a number"
+    if type(line["iteration"]) is not int:
+        return f"iteration is {line['iteration']!r:.40}, expected a whole number"
+    if "psnr" in line and "ssim" not in line:
+        return "psnr has no ssim beside it"
+    return _forecast_fault(line) if "forecast" in line else None
+
+
+def _forecast_fault(line: dict[str, Any]) -> str | None:
+    forecast = line["forecast"]
+    if not isinstance(forecast, dict) or not all(_is_finite(forecast.get(name)) for name in FORECAST):
+        return f"forecast is {forecast!r:.40}, expected numbers named {', '.join(FORECAST)}"
+    return None if _is_finite(line.get("psnr")) else "forecast has no psnr beside it"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 63)
+
+
+def _is_finite(value: Any) -> bool:
+    return _is_number(value) and math.isfinite(value)

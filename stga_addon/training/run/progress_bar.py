@@ -1,4 +1,4 @@
-"""Progress of a run on a terminal."""
+"""Progress bar of a training run on a terminal."""
 
 from tqdm import tqdm
 
@@ -6,7 +6,7 @@ from .progress import Progress
 
 
 class ProgressBar:
-    """tqdm over the share of the budget, with the figures a person wants beside it."""
+    """tqdm over the share of the budget, with speed, loss, PSNR and forecast beside it."""
 
     def __enter__(self) -> "ProgressBar":
         layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"

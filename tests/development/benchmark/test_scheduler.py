@@ -16,7 +16,9 @@ from stga_addon.development.benchmark.scheduler import BenchmarkRun, train_in_tu
 from stga_addon.development.benchmark.variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
-from stga_addon.training.run.folder import Run, read_checkpoint, read_metrics, write_run
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run, write_run
+from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
 

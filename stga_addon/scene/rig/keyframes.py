@@ -1,0 +1,107 @@
+"""Keyframes of a FLAME head: expressions, joint rotations, translation and tracked per-frame offsets."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...flame.forward import FlameFrame, joint_positions
+from ...flame.model import JOINTS
+from ...flame.motion import PARTS
+from ...flame.quaternions import continuous, from_axis_angle
+from ...flame.sequence import FlameSequence
+from ..animation import write_curve, write_triangle_curves
+from ..compat import action_curves
+from ..objects import Warn, log_warning
+from .names import (
+    PART_JOINTS,
+    ROOT_LOCATION,
+    expression_key,
+    key_value_path,
+    offset_key,
+    offset_keys,
+    offset_property,
+    property_path,
+    rotation_path,
+)
+
+MAX_SLIDER = 10.0
+"""The widest range that Blender allows a shape key's value: -10 to 10."""
+
+
+def key_motion(
+    head: Any,
+    rig: Any,
+    numbers: Sequence[int],
+    frames: Sequence[FlameFrame],
+    parts: Sequence[str] = tuple(PARTS),
+    warn: Warn = log_warning,
+) -> None:
+    """Add keyframes of the parts (`flame.motion.PARTS`) of `frames` to the active actions of rig and shape keys.
+
+    numbers: the Blender frame of each, ascending. A slider that the motion never moves gets a single keyframe.
+    """
+    if "expression" in parts:
+        _key_expressions(head, numbers, np.stack([frame.expr for frame in frames]), warn)
+    bones = [bone for part in parts for bone in PART_JOINTS.get(part, ())]
+    if not bones:
+        return
+    curves, at = action_curves(rig), np.asarray(numbers)
+    poses = np.stack([frame.pose for frame in frames])
+    for bone in bones:
+        quaternions = continuous(from_axis_angle(poses[:, JOINTS.index(bone)]))
+        for element in range(4):
+            write_curve(curves, rotation_path(bone), element, at, quaternions[:, element])
+    if "head" in parts:
+        translations = np.stack([frame.translation for frame in frames])
+        for axis in range(3):
+            write_curve(curves, ROOT_LOCATION, axis, at, translations[:, axis])
+
+
+def key_tracked_offsets(
+    head: Any, rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], numbers: Sequence[float]
+) -> None:
+    """Keyframe the tracked per-frame offsets of mesh and joints.
+
+    sequence: the one that the head was imported from, with its frames; numbers: the Blender frame of each, ascending.
+    """
+    write_triangle_curves(head.data.shape_keys, [offset_key(timestep) for timestep in sequence.timesteps], numbers)
+    displacement = np.zeros((len(frames), len(JOINTS), 3))
+    for row, frame in enumerate(frames):
+        if frame.dynamic_offset is not None:
+            displacement[row] = joint_positions(sequence.model, frame.dynamic_offset)
+    curves, at = action_curves(rig), np.asarray(numbers)
+    for joint, name in enumerate(JOINTS):
+        for axis in range(3):
+            write_curve(curves, property_path(offset_property(name)), axis, at, displacement[:, joint, axis])
+
+
+def key_zero_offsets(head: Any, rig: Any, frame: int) -> None:
+    """Keyframe the tracked per-frame offsets of mesh and joints, where there are any, to zero from `frame` on."""
+    at, zero = np.array([frame]), np.zeros(1)
+    for key in offset_keys(head):
+        write_curve(action_curves(head.data.shape_keys), key_value_path(key.name), 0, at, zero)
+    for joint in JOINTS:
+        if offset_property(joint) in rig:
+            for axis in range(3):
+                write_curve(action_curves(rig), property_path(offset_property(joint)), axis, at, zero)
+
+
+def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:
+    """The data-blocks in whose actions the parts are keyframed: the rig, the shape keys, or both."""
+    in_rig = set(parts) & set(PART_JOINTS) or ("expression" in parts and offset_keys(head))
+    return ([rig] if in_rig else []) + ([head.data.shape_keys] if "expression" in parts else [])
+
+
+def _key_expressions(head: Any, numbers: Sequence[int], values: np.ndarray, warn: Warn) -> None:
+    """values (T, E), one row per frame in `numbers`."""
+    curves, at = action_curves(head.data.shape_keys), np.asarray(numbers)
+    for component, column in enumerate(values.T):
+        keyed = slice(None) if column.any() else slice(1)
+        write_curve(curves, key_value_path(expression_key(component)), 0, at[keyed], column[keyed])
+    row, component = np.unravel_index(np.abs(values).argmax(), values.shape) if values.size else (0, 0)
+    if values.size and abs(values[row, component]) > MAX_SLIDER:
+        warn(
+            f"{head.name}: expression {component} is {values[row, component]:.1f} at frame {at[row]}, but Blender"
+            f" limits shape keys to ±{MAX_SLIDER:g}; the mesh differs from the tracked one there"
+        )

@@ -1,0 +1,170 @@
+"""Checkpoints of a training run and the selection that it trains, as files in its folder."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...avatar.file import SH_SIZES
+from ...avatar.strain import STRAIN_COMPONENTS
+from ...errors import StgaError
+from ...files import read_npz, write_npz
+from ..optimize.state import TrainState, state_of, tensors_of
+from ..optimize.tracking import RefinementState
+from .folder import CHECKPOINT, SELECTION
+
+VERSION = 2
+REFINEMENT, IDENTITY = "tracking/", "identity"
+MAX_COUNT = 1 << 53
+"""Largest iteration or timestep that a checkpoint may hold."""
+OTHER_RUN = "belongs to another run than run.json beside it; remove it, or train into another folder"
+
+
+@dataclass
+class Checkpoint:
+    """State of training between two iterations.
+
+    elapsed_s  seconds of training so far, evaluation not counted
+    best_psnr  of avatar.npz, dB; −inf before the first evaluation
+    losses     of the last global iterations
+    identity   digest of the run's identity
+    tracking   of refined FLAME parameters; None where they are not refined
+    """
+
+    state: TrainState
+    iteration: int
+    visit: int
+    last_timestep: int | None
+    initial_count: int
+    elapsed_s: float
+    best_psnr: float
+    evaluations: int
+    losses: list[float]
+    tracking: RefinementState | None = None
+    identity: str = ""
+
+
+def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity: str) -> None:
+    """Write timestep -> (F,) bool of the run with this digest of its identity."""
+    arrays = {f"{timestep:05d}": faces for timestep, faces in selection.items()}
+    write_npz(folder / SELECTION, {**arrays, IDENTITY: _packed(identity)}, compressed=True)
+
+
+def read_selection(folder: Path, faces: int, identity: str | None = None) -> dict[int, np.ndarray]:
+    """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or has not this `identity`."""
+    path = folder / SELECTION
+    arrays = read_npz(path, max_compression=faces // 100 + 16)  # an entry of a zip has some 200 bytes
+    stored = arrays.pop(IDENTITY, None)
+    if identity is not None and (stored is None or stored.tobytes() != identity.encode()):
+        raise StgaError(f"{path}: {OTHER_RUN}")
+    selection = {}
+    for name, mask in arrays.items():
+        if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
+            raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep")
+        selection[int(name)] = mask
+    return selection
+
+
+def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
+    arrays = {k: t.numpy() for k, t in tensors_of(checkpoint.state).items() if not k.startswith("gradients/")}
+    if checkpoint.tracking is not None:
+        arrays.update({REFINEMENT + name: array for name, array in vars(checkpoint.tracking).items()})
+    values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
+    arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
+    write_npz(folder / CHECKPOINT, arrays)
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """Raises StgaError where there is none, or it is damaged."""
+    path = folder / CHECKPOINT
+    arrays = read_npz(path)
+    try:
+        meta = _meta(arrays.pop("meta"))
+        if meta.pop("version") != VERSION:
+            raise StgaError(f"{path}: was written by another version")
+        refinement = _refinement(path, arrays)
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        for name in [n for n in tensors if n.startswith("first/")]:
+            tensors[name.replace("first/", "gradients/")] = torch.zeros_like(tensors[name])
+        if any(tensor.ndim == 0 for tensor in tensors.values()):
+            raise StgaError(f"{path}: an array has no rows")
+        state = state_of(tensors)
+        _check_state(path, state)
+        return Checkpoint(state=state, tracking=refinement, **meta)
+    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
+        raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
+
+
+def _packed(text: str) -> np.ndarray:
+    return np.frombuffer(text.encode(), np.uint8)
+
+
+def _meta(packed: np.ndarray) -> dict[str, Any]:
+    """Everything of a checkpoint that is no array. Raises ValueError for what training cannot continue with."""
+    meta = json.loads(packed.tobytes())
+    if not isinstance(meta, dict):
+        raise ValueError("meta is no object")
+    lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0}
+    for name, low in lowest.items():
+        if type(meta.get(name)) is not int or not low <= meta[name] < MAX_COUNT:
+            raise ValueError(f"{name} is {meta.get(name)!r:.40}, expected a whole number from {low} up")
+    last, losses = meta.get("last_timestep"), meta.get("losses")
+    if last is not None and (type(last) is not int or not 0 <= last < MAX_COUNT):
+        raise ValueError(f"last_timestep is {last!r:.40}, expected a timestep")
+    if not _is_number(meta.get("elapsed_s")) or not 0 <= meta["elapsed_s"] < math.inf:
+        raise ValueError(f"elapsed_s is {meta.get('elapsed_s')!r:.40}, expected seconds from 0 up")
+    if not _is_number(meta.get("best_psnr")) or math.isnan(meta["best_psnr"]):
+        raise ValueError(f"best_psnr is {meta.get('best_psnr')!r:.40}, expected a number of dB")
+    if not isinstance(losses, list) or not all(_is_number(loss) and not math.isnan(loss) for loss in losses):
+        raise ValueError("losses is no list of numbers")
+    if not isinstance(meta.get("identity"), str):
+        raise ValueError("identity is no text")
+    return meta
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float) or (type(value) is int and abs(value) < MAX_COUNT)
+
+
+def _check_state(path: Path, state: TrainState) -> None:
+    """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the array."""
+    n, coefficients = len(state), state.parameters.sh.shape[1]
+    if coefficients not in SH_SIZES:
+        raise StgaError(f"{path}: parameters/sh has {coefficients} coefficients, expected one of {SH_SIZES}")
+    strains = STRAIN_COMPONENTS if state.parameters.strain_color.shape[1] else 0
+    tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "sh": (coefficients, 3), "strain_color": (strains, 3)}
+    whole = {"steps": torch.int32, "face": torch.int32, "unbound": torch.bool}
+    for name, tensor in tensors_of(state).items():
+        dtype = whole.get(name, torch.float32)
+        shape = (n, *tails.get(name.rpartition("/")[2], ()))
+        if tensor.dtype != dtype or tuple(tensor.shape) != shape:
+            raise StgaError(f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {shape}")
+        if dtype == torch.float32 and not tensor.isfinite().all():
+            raise StgaError(f"{path}: {name} holds a value that is not finite")
+
+
+def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | None:
+    """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
+    names = [name for name in arrays if name.startswith(REFINEMENT)]
+    if not names:
+        return None
+    found = RefinementState(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
+    whole = found.change.shape
+    if len(whole) != 2:
+        raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")
+    shapes = {"change": whole, "first": whole, "second": whole[1:], "steps": whole[:1]}
+    for name, array in vars(found).items():
+        dtype = np.dtype(np.int64 if name == "steps" else np.float64)
+        if array.dtype != dtype or array.shape != shapes[name]:
+            expected = f"{dtype} {shapes[name]}"
+            raise StgaError(f"{path}: {REFINEMENT}{name} is {array.dtype} {array.shape}, expected {expected}")
+        if not np.isfinite(array).all():
+            raise StgaError(f"{path}: {REFINEMENT}{name} holds a value that is not finite")
+    return found

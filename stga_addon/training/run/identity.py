@@ -1,0 +1,115 @@
+"""Identity of a training run: digests of the capture, the FLAME model and the settings that it was trained with."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...capture.camera import Camera
+from ...capture.model import Capture, View
+from ...errors import StgaError
+from ..settings import TrainingSettings, to_json
+
+QUANTUM = 1e-6 * 0.5**0.5
+"""Cameras (metres, pixels) and meshes (metres) are compared in multiples of this: other machines compute other last
+bits. It is irrational, so that neither decimals nor binary fractions lie at the edge between two multiples."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a run was trained with. Digests are SHA-256.
+
+    principal_point  convention of the capture
+    summary   counts of cameras and timesteps, for messages
+    images    names, sizes, splits and timesteps of the views
+    cameras   their poses and intrinsics
+    faces, neutral   of the mesh
+    flame     content of the FLAME model file; empty without one
+    settings  of training
+    """
+
+    principal_point: str
+    summary: str
+    images: str
+    cameras: str
+    faces: str
+    neutral: str
+    flame: str
+    settings: str
+
+    @property
+    def digest(self) -> str:
+        """One digest of the whole identity, which a run's other files carry."""
+        return _digest(json.dumps(asdict(self)).encode())
+
+
+def identity_of(capture: Capture, flame: Path | None, principal_point: str, settings: TrainingSettings) -> Identity:
+    """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises StgaError."""
+    views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
+    return Identity(
+        principal_point,
+        _summary([view for _, view in views]),
+        _digest(json.dumps([_image(split, view) for split, view in views]).encode()),
+        _digest(_quantized(_camera_table([view.camera for _, view in views]))),
+        _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
+        _digest(_quantized(capture.neutral)),
+        "" if flame is None or capture.flame is None else _file_digest(flame),
+        _digest(json.dumps(to_json(settings), sort_keys=True).encode()),
+    )
+
+
+def difference(trained: Identity, given: Identity) -> str | None:
+    """The first part of `given` that differs from `trained`, as in "has other images"; None where they agree."""
+    phrases = {
+        "faces": "has a mesh with other triangles",
+        "images": "has other images or image sizes",
+        "cameras": "has other camera poses or intrinsics",
+        "neutral": "has another neutral mesh",
+    }
+    return next((phrase for name, phrase in phrases.items() if getattr(trained, name) != getattr(given, name)), None)
+
+
+def identity_from_json(values: Any) -> Identity | None:
+    """Raises TypeError for anything but None and the fields of `Identity` as texts."""
+    if values is None:
+        return None
+    identity = Identity(**values)
+    if not all(isinstance(getattr(identity, field.name), str) for field in fields(Identity)):
+        raise TypeError("identity holds something else than texts")
+    return identity
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _file_digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _summary(views: list[View]) -> str:
+    cameras, timesteps = {view.camera_index for view in views}, {view.timestep for view in views}
+    return f"{len(cameras)} cameras, {len(timesteps)} timesteps"
+
+
+def _image(split: str, view: View) -> tuple[object, ...]:
+    camera = view.camera
+    return split, view.timestep, view.camera_index, view.name, camera.width, camera.height, view.mask is not None
+
+
+def _camera_table(cameras: list[Camera]) -> np.ndarray:
+    """(N, 20) float64: pose and intrinsics."""
+    poses = np.array([camera.world_to_camera for camera in cameras], np.float64).reshape(-1, 16)
+    intrinsics = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras], np.float64).reshape(-1, 4)
+    return np.hstack([poses, intrinsics])
+
+
+def _quantized(values: np.ndarray) -> bytes:
+    return np.asarray(np.round(np.asarray(values, np.float64) / QUANTUM) + 0.0).tobytes()  # adding zero turns −0 into 0

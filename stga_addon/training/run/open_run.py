@@ -1,0 +1,80 @@
+"""Opening a run together with the capture that it was trained on."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ...capture.model import Capture
+from ...capture.open import open_capture
+from ...errors import StgaError
+from ..optimize.device import choose_device
+from .folder import Run, read_run
+from .identity import Identity, difference, identity_of
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """A run and its capture. `run` has the paths of `capture` and FLAME model that were opened."""
+
+    run: Run
+    capture: Capture
+
+
+def open_run(
+    folder: Path, capture: Path | None = None, flame: Path | None = None, principal_point: str | None = None
+) -> OpenedRun:
+    """Open the run in `folder`; the other arguments stand in for what it was trained with.
+
+    A capture or a FLAME model may have moved, but not changed; tracked meshes may be refined.
+    Raises StgaError in one sentence where the folder holds no run or anything differs from what it was trained with.
+    """
+    run = read_run(folder)
+    if principal_point not in (None, run.principal_point):
+        raise StgaError(f"{folder}: was trained with principal point '{run.principal_point}', not '{principal_point}'")
+    flame = run.flame if flame is None else flame.resolve()
+    opened = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
+    run = replace(run, capture=opened.root, flame=flame)
+    check_identity(folder, run, opened)
+    return OpenedRun(run, opened)
+
+
+def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
+    """The identity of `run` on `capture`.
+
+    Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
+    """
+    given = identity_of(capture, run.flame, run.principal_point, run.settings)
+    if not (folder / "run.json").exists():
+        return given
+    stored = read_run(folder)
+    trained = stored.identity
+    if trained is None or trained == given:  # None: the run was prepared, but has not begun
+        return given
+    if trained.principal_point != given.principal_point:
+        wanted = f"principal point '{trained.principal_point}', not '{given.principal_point}'"
+        raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
+    if trained.flame != given.flame:
+        wanted = f"FLAME model {stored.flame}, but {run.flame} has other content"
+        raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
+    changed = difference(trained, given)
+    if changed is not None:
+        where = "it now" if capture.root == stored.capture else f"{capture.root} ({given.summary})"
+        wanted = f"{stored.capture} ({trained.summary}), but {where} {changed}"
+        raise StgaError(f"{folder}: was trained on {wanted}; train into another folder")
+    raise StgaError(f"{folder}: was begun with other settings; restore them in run.json, or train into another folder")
+
+
+def device_of(run: Run, wanted: str = "auto") -> tuple[str, str]:
+    """The device to continue a run on, and why: its own, unless `wanted` names another (`choose_device`).
+
+    Raises StgaError where that device does not work or cannot train this run.
+    """
+    own = run.device.partition(":")[0]
+    try:
+        device, reason = choose_device(own if wanted == "auto" else wanted)
+    except StgaError as error:
+        if wanted != "auto":
+            raise
+        raise StgaError(f"this run was trained on {own}: {error}; give --device cpu to continue on the CPU") from error
+    if run.settings.tracking and device != "cpu":
+        raise StgaError(f"--device {wanted}: this run refines the tracking, which works on the CPU only")
+    return device, reason

@@ -1,0 +1,311 @@
+"""Identity of a run: what was trained on one capture is not continued, measured or rendered on another."""
+
+import json
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture import factory
+from PIL import Image
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+from stga_addon.errors import StgaError
+from stga_addon.jobs.training_job import TrainingJob, run_training_job, write_job
+from stga_addon.training.optimize import device as device_choice
+from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run, read_run, write_run
+from stga_addon.training.run.identity import difference, identity_of
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.open_run import device_of, open_run
+from stga_addon.training.run.progress import Progress
+
+from .toys import quick_settings
+
+ITERATIONS = 12
+
+
+def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run:
+    settings = quick_settings("global", **{"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0, **changes})
+    return Run(capture.root, flame, "vhap", settings)
+
+
+def stop_at(iteration: int) -> Callable[[Progress], bool]:
+    return lambda progress: progress.iteration >= iteration
+
+
+@pytest.fixture(scope="session")
+def begun(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the toy capture, stopped halfway."""
+    out = tmp_path_factory.mktemp("begun") / "run"
+    train(toy, out, make_run(toy), report=stop_at(ITERATIONS // 2))
+    return out
+
+
+@pytest.fixture
+def copy(begun: Path, tmp_path: Path) -> Path:
+    """A copy of that run, to be damaged."""
+    return shutil.copytree(begun, tmp_path / "run")
+
+
+def edit_frames(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    for path in root.glob("transforms_*.json"):
+        factory.edit(path, lambda document: [change(frame) for frame in document["frames"]])
+
+
+def move_cameras(root: Path) -> None:
+    def change(frame: dict[str, Any]) -> None:
+        frame["transform_matrix"][0][3] += 0.001
+
+    edit_frames(root, change)
+
+
+def rename_images(root: Path) -> None:
+    shutil.copytree(root / "images", root / "pictures")
+    edit_frames(root, lambda frame: frame.update(file_path=frame["file_path"].replace("images", "pictures")))
+
+
+def halve_images(root: Path) -> None:
+    for path in (*root.glob("images/*"), *root.glob("fg_masks/*")):
+        Image.open(path).resize((20, 30)).save(path)
+    edit_frames(root, lambda frame: frame.update(w=20, h=30))
+
+
+def other_topology(root: Path) -> None:
+    vertices, faces = factory.ball()
+    for path in (root / "meshes").iterdir():
+        factory.write_mesh(path, vertices, faces[:, ::-1])
+
+
+def larger_neutral(root: Path) -> None:
+    vertices, faces = factory.ball()
+    factory.write_mesh(root / "meshes/neutral.obj", 1.15 * vertices, faces)
+
+
+CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "poses": (move_cameras, "other camera poses or intrinsics"),
+    "focal length": (lambda root: edit_frames(root, lambda f: f.update(fl_x=101.0)), "other camera poses"),
+    "sizes": (halve_images, "other images or image sizes"),
+    "names": (rename_images, "other images or image sizes"),
+    "triangles": (other_topology, "a mesh with other triangles"),
+    "neutral mesh": (larger_neutral, "another neutral mesh"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_changed_captures_are_refused(copy: Path, toy: Capture, tmp_path: Path, name: str) -> None:
+    """Catches a run that is resumed or measured on another capture, by its path or replaced in place."""
+    change, message = CHANGES[name]
+    other = shutil.copytree(toy.root, tmp_path / "other")
+    change(other)
+    both = rf"was trained on {toy.root} \(4 cameras, 4 timesteps\), but {other} \(.*{message}"
+    with pytest.raises(StgaError, match=both):
+        open_run(copy, other)
+    with pytest.raises(StgaError, match=message):
+        train(open_capture(other), copy, make_run(toy), resume=True)
+    factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))  # replaced in place
+    with pytest.raises(StgaError, match=rf"was trained on {other} .*, but it now has .*{message}"):
+        open_run(copy)
+
+
+def test_moved_captures_and_refined_meshes_are_accepted(copy: Path, toy: Capture, tmp_path: Path) -> None:
+    """Catches a run that is lost with its capture's old path, or with a better tracking of its frames."""
+    other = shutil.copytree(toy.root, tmp_path / "other")
+    vertices, faces = factory.ball()
+    for timestep in toy.timesteps:
+        factory.write_mesh(other / f"meshes/{timestep:05d}.obj", vertices * 1.001, faces)
+    opened = open_run(copy, other)
+    assert opened.run.capture == opened.capture.root == other
+    train(opened.capture, copy, opened.run, resume=True)
+    assert read_checkpoint(copy).iteration == ITERATIONS
+    assert read_run(copy).capture == other
+
+
+def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
+    """Catches a run that cannot be resumed where another linear algebra library rounds differently."""
+    rng = np.random.default_rng(0)
+
+    def shifted(view: Any) -> Any:
+        noise = 1e-15 * rng.normal(size=(4, 4))
+        return replace(view, camera=replace(view.camera, world_to_camera=view.camera.world_to_camera + noise))
+
+    views = {split: tuple(map(shifted, members)) for split, members in toy.views.items()}
+    settings = quick_settings()
+    same = replace(toy, views=views, neutral=toy.neutral + 1e-16)
+    one, two = (identity_of(capture, None, "vhap", settings) for capture in (toy, same))
+    assert one == two
+    assert difference(one, two) is None
+
+
+def test_another_flame_model_is_refused(tmp_path: Path) -> None:
+    """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a moved one."""
+    root, model = factory.write_flame_capture(tmp_path / "capture")
+    capture, out = open_capture(root, model), tmp_path / "run"
+    train(capture, out, make_run(capture, model), report=stop_at(4))
+    moved = shutil.copy(model, tmp_path / "moved.npz")
+    assert open_run(out, flame=moved).run.flame == moved
+    other = factory.write_flame_model(tmp_path / "other.npz", seed=1)
+    message = f"was trained with FLAME model {model}, but {other} has other content"
+    with pytest.raises(StgaError, match=message):
+        open_run(out, flame=other)
+    arguments = ["train", str(root), "--out", str(out), "--resume", "--flame"]
+    assert main([*arguments, str(other)]) == 2
+    assert main([*arguments, str(moved)]) == 0
+
+
+def test_edited_settings_are_refused(copy: Path) -> None:
+    """Catches a run that continues with other settings than those of its checkpoint."""
+    factory.edit(copy / "run.json", lambda document: document["settings"].update(seed=7))
+    with pytest.raises(StgaError, match="was begun with other settings"):
+        open_run(copy)
+
+
+def test_every_command_checks_the_identity(copy: Path, toy: Capture, tmp_path: Path, capsys: Any) -> None:
+    """Catches a command that opens a run without the check: each ends with one sentence and exit code 2."""
+    other = shutil.copytree(toy.root, tmp_path / "other")
+    move_cameras(other)
+    before = {path.name: path.read_bytes() for path in copy.iterdir()}
+    assert main(["train", str(other), "--out", str(copy), "--resume"]) == 2
+    with pytest.raises(StgaError, match="has other camera poses"):
+        write_job(copy, TrainingJob(other, None, "vhap", None))
+    with pytest.raises(StgaError, match="principal point 'vhap', not 'opencv'"):
+        write_job(copy, TrainingJob(toy.root, None, "opencv", None))
+    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
+    write_job(copy, TrainingJob(toy.root, None, "vhap", None))
+    factory.edit(copy / "job/job.json", lambda document: document.update(capture=str(other)))
+    assert main(["job", str(copy)]) == 2
+    factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
+    cameras = str(other / "transforms_test.json")
+    assert main(["eval", str(copy)]) == 2
+    assert main(["render", str(copy), "--cameras", cameras, "--out", str(tmp_path / "pictures")]) == 2
+    assert main(["export", str(copy), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 2
+    assert capsys.readouterr().err.count("other camera poses or intrinsics; train into another folder") == 5
+    # Another capture that is named drives the avatar: only its triangles must fit.
+    assert (
+        main(["export", str(copy), "--capture", str(other), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 0
+    )
+
+
+def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Capture) -> None:
+    """Catches a new run that continues a removed one, because it died before its first checkpoint."""
+    (copy / "run.json").unlink()
+    run = make_run(toy, seed=5)
+
+    def die(progress: Progress) -> bool:
+        if progress.iteration:
+            raise OSError("died")
+        return False
+
+    with pytest.raises(OSError, match="died"):
+        train(toy, copy, run, report=die)
+    assert not (copy / "checkpoint.npz").exists()
+    reached: list[int] = []
+    train(toy, copy, run, resume=True, report=lambda progress: bool(reached.append(progress.iteration)))
+    assert reached[:4] == [0, 0, 1, 2]
+
+
+@pytest.mark.parametrize("name", ["checkpoint.npz", "selection.npz"])
+def test_files_of_another_run_are_refused(copy: Path, toy: Capture, tmp_path: Path, name: str) -> None:
+    """Catches a checkpoint or a selection that was copied beside the run.json of another run."""
+    train(toy, tmp_path / "other", make_run(toy, seed=5), report=stop_at(3))
+    shutil.copy(tmp_path / "other" / name, copy / name)
+    with pytest.raises(StgaError, match=rf"{name}: belongs to another run than run\.json"):
+        train(toy, copy, make_run(toy), resume=True)
+
+
+def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path) -> None:
+    """Catches `render` that reads cameras by another convention than the one that the avatar was trained with."""
+    root = shutil.copytree(toy.root, tmp_path / "capture")
+    edit_frames(root, lambda frame: frame.update(cy=frame["cy"] + 7))
+    capture = open_capture(root, principal_point="opencv")
+    out = tmp_path / "run"
+    train(capture, out, replace(make_run(capture), principal_point="opencv"))
+    assert read_avatar(out / "avatar.npz").principal_point == "opencv"
+    cameras = str(root / "transforms_test.json")
+
+    def pictures(source: Path, *options: str) -> list[bytes]:
+        folder = tmp_path / f"{source.name}{len(options)}"
+        driver = ["--capture", str(root)] if source.is_file() else []
+        command = ["render", str(source), "--cameras", cameras, "--out", str(folder), *driver, *options]
+        assert main(command) == 0
+        return [path.read_bytes() for path in sorted(folder.iterdir())]
+
+    expected = pictures(out, "--principal-point", "opencv")
+    assert expected != pictures(out / "avatar.npz", "--principal-point", "vhap")
+    assert pictures(out) == pictures(out / "avatar.npz") == expected
+
+
+def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run begun on the CPU that moves to a GPU, where refined tracking cannot be resumed."""
+    run = read_run(copy)
+    assert run.device == "cpu"
+    monkeypatch.setattr(device_choice, "_find_gpu", lambda: ("cuda:0", "Card"))
+    assert device_of(run)[0] == "cpu"
+    assert device_of(run, "cuda")[0] == "cuda:0"
+    with pytest.raises(StgaError, match="refines the tracking, which works on the CPU only"):
+        device_of(replace(run, settings=replace(run.settings, tracking=True)), "cuda")
+    monkeypatch.setattr(device_choice, "_find_gpu", lambda: (None, "no driver"))
+    with pytest.raises(StgaError, match=r"trained on cuda: .*no driver; give --device cpu"):
+        device_of(replace(run, device="cuda:0"))
+    assert device_of(replace(run, device="cuda:0"), "cpu")[0] == "cpu"
+
+
+def test_a_resumed_job_keeps_the_device(copy: Path, toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a worker that always trains on what this machine offers."""
+    monkeypatch.setattr(device_choice, "_find_gpu", lambda: ("cuda:0", "Card"))
+    write_job(copy, TrainingJob(toy.root, None, "vhap", None))
+    run_training_job(copy)
+    assert read_run(copy).device == "cpu"
+
+
+def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Path) -> None:
+    """Catches Ctrl-C that loses what was trained since the last checkpoint, or saves half an iteration."""
+
+    def interrupt(progress: Progress) -> bool:
+        if progress.iteration == 5 and progress.message == "Training":
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    out, unbroken = tmp_path / "run", tmp_path / "unbroken"
+    with pytest.raises(KeyboardInterrupt):
+        train(toy, out, make_run(toy), report=interrupt)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert read_checkpoint(out).iteration == 5
+    assert len(read_avatar(out / "avatar.npz").splats) == len(toy.faces)
+    train(toy, out, make_run(toy), resume=True)
+    train(toy, unbroken, make_run(toy))
+    ours, theirs = (tensors_of(read_checkpoint(folder).state) for folder in (out, unbroken))
+    for name, tensor in ours.items():
+        np.testing.assert_array_equal(tensor, theirs[name], err_msg=name)
+
+
+def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:
+    """Catches a training that cannot be ended while it saves."""
+
+    def interrupt_twice(progress: Progress) -> bool:
+        if progress.iteration == 5:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        train(toy, tmp_path, make_run(toy), report=interrupt_twice)
+    assert not (tmp_path / "checkpoint.npz").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_prepared_run_begins_with_its_identity(toy: Capture, tmp_path: Path) -> None:
+    """Catches a run.json written ahead of the training (as the benchmark does) that stays without identity."""
+    write_run(tmp_path, make_run(toy))
+    assert json.loads((tmp_path / "run.json").read_text())["identity"] is None
+    train(toy, tmp_path, make_run(toy), resume=True, report=stop_at(2))
+    stored = read_run(tmp_path)
+    assert stored.identity == identity_of(toy, None, "vhap", stored.settings)
