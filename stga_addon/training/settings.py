@@ -9,7 +9,6 @@ from typing import Any
 from ..avatar.embedding import CONVENTIONS
 from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
-from ..flame.sequence import ZERO_POSES
 from ..selection import SelectionOptions
 from .effect_plan import CHOICES, EFFECTS
 from .schema import MAX_COUNT, build, complaint, setting, validate_fields
@@ -187,7 +186,7 @@ class Preset:
 PRESETS = {
     "draft": Preset("a first look", 800, 0.5, {"lattice": 1}),
     "standard": Preset("everyday work", 3000, 2.0, {}),
-    "final": Preset("the best that a coffee break buys", 9000, 6.0, {"growth": 0.6}),
+    "final": Preset("the best quality of the three", 9000, 6.0, {"growth": 0.6}),
 }
 """Fewer splats are ahead in the first seconds, more of them in the end."""
 
@@ -222,12 +221,6 @@ def validate(settings: TrainingSettings) -> None:
         raise StgaError("the budget must be given either in seconds or in iterations")
     if settings.preset not in (None, *PRESETS):
         raise StgaError(complaint("preset", f"one of {', '.join(PRESETS)}", settings.preset))
-    if settings.selection.zero_pose not in ZERO_POSES:
-        raise StgaError(
-            complaint("selection.zero_pose", f"one of {', '.join(ZERO_POSES)}", settings.selection.zero_pose)
-        )
-    if settings.selection.threshold < 0:
-        raise StgaError(complaint("selection.threshold", "metres from 0 up", settings.selection.threshold))
     for row in settings.exposure:
         if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
             raise StgaError(complaint("exposure", "rows of a camera index, three gains above 0, three offsets", row))

@@ -81,9 +81,6 @@ REFUSED: list[tuple[str, Any]] = [
     *[("effects", value) for value in (5, {"jaw": "maybe"}, {"chin": "on"}, {1: "on"})],
     *[("hull_points", value) for value in (1, None, "yes")],
     *[("rates", value) for value in (None, 5, Rates(end=-1.0), Rates(xyz=math.inf), Rates(sh="5"))],  # type: ignore[arg-type]
-    ("selection", SelectionOptions(threshold=math.nan)),
-    ("selection", SelectionOptions(threshold=-1.0)),
-    ("selection", SelectionOptions(zero_pose="neck")),
     ("selection", SelectionOptions(regions=("nose", 5))),  # type: ignore[arg-type]
     ("scale", 2.0),
     ("scale", 0.01),
@@ -112,6 +109,14 @@ def test_one_schema_for_new_and_stored_settings(name: str, value: Any) -> None:
         return  # JSON's lists become tuples
     with pytest.raises(StgaError, match=name):
         from_json({**stored, name: plain})
+
+
+@pytest.mark.parametrize("change", [{"threshold": math.nan}, {"threshold": -1.0}, {"zero_pose": "neck"}])
+def test_stored_selection_is_validated(change: dict[str, Any]) -> None:
+    """Catches a stored selection rule that could not have been made."""
+    stored = to_json(make_settings(iterations=5))
+    with pytest.raises(StgaError, match=next(iter(change))):
+        from_json({**stored, "selection": {**stored["selection"], **change}})
 
 
 def test_paper_schedule() -> None:
