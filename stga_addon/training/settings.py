@@ -29,7 +29,7 @@ EXPOSURE_SIZE = 7
 class Rates:
     """Adam's learning rates at the start; each decays exponentially to `position_end` or `end` of itself.
 
-    Positions in local units (metres of the neutral mesh), scales as logarithms, opacity as logit.
+    Positions in local units (meters of the neutral mesh), scales as logarithms, opacity as logit.
     """
 
     xyz: float = setting(4e-4, 0, MAX_RATE)

@@ -14,7 +14,7 @@ from ...errors import StgaError
 from ..settings import TrainingSettings, to_json
 
 QUANTUM = 1e-6 * 0.5**0.5
-"""Cameras (metres, pixels) and meshes (metres) are compared in multiples of this: other machines compute other last
+"""Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines compute other last
 bits. It is irrational, so that neither decimals nor binary fractions lie at the edge between two multiples."""
 
 
