@@ -7,7 +7,7 @@ import bpy
 
 from ..stga_addon import __version__
 from ..stga_addon.jobs.training_job import job_folder
-from ..stga_addon.worker.status import failure_report, inspect_worker
+from ..stga_addon.worker.status import failure_report
 from . import ids, monitor
 from .common import file_path, reporting
 
@@ -31,6 +31,6 @@ class CopyReport(bpy.types.Operator):
         run = monitor.training_of(context.scene).folder
         folder = file_path(self.directory, "folder") if self.directory or run is None else job_folder(run)
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
-        context.window_manager.clipboard = f"{versions}\n{failure_report(folder, inspect_worker(folder))}"
+        context.window_manager.clipboard = f"{versions}\n{failure_report(folder, monitor.inspect_status(folder))}"
         self.report({"INFO"}, "Copied to the clipboard")
         return {"FINISHED"}

@@ -57,7 +57,7 @@ def training_of(scene: Any) -> MonitorState:
     if state.run is None:
         return state
     folder = _locate(scene, state.run)
-    return replace(state, folder=folder, snapshot=_inspect(job_folder(folder)))
+    return replace(state, folder=folder, snapshot=inspect_status(job_folder(folder)))
 
 
 def curve(folder: Path) -> Curve | None:
@@ -98,15 +98,20 @@ def monitor_worker(folder: Path, process: "Popen[bytes] | None" = None) -> None:
     """Monitor a worker that belongs to no scene until it ends."""
     if process is not None:
         _processes[folder] = process
-    _snapshots[folder] = _inspect(folder)
+    _snapshots[folder] = inspect_status(folder)
     _start_timer()
 
 
 def snapshot(folder: Path) -> WorkerSnapshot:
     """Status of a worker that belongs to no scene, as the timer last saw it; without a window, as it is."""
     if folder not in _snapshots or not has_timer():
-        _snapshots[folder] = _inspect(folder)
+        _snapshots[folder] = inspect_status(folder)
     return _snapshots[folder]
+
+
+def inspect_status(folder: Path) -> WorkerSnapshot:
+    """Status of a worker as it is now, with its exit code where this Blender started it."""
+    return inspect_worker(folder, _processes.get(folder))
 
 
 def has_timer() -> bool:
@@ -137,7 +142,7 @@ def _check_worker_safely(folder: Path) -> float | None:
     """Check a worker that belongs to no scene; after an unexpected error, which is printed, it counts as ended."""
     before = _snapshots[folder]
     try:
-        _snapshots[folder] = _inspect(folder)
+        _snapshots[folder] = inspect_status(folder)
     except Exception:
         traceback.print_exc()
         _snapshots[folder] = WorkerSnapshot()
@@ -176,17 +181,13 @@ def _locate(scene: Any, run: Path) -> Path:
     return next((folder for folder in (run, beside) if job_folder(folder).is_dir()), run)
 
 
-def _inspect(folder: Path) -> WorkerSnapshot:
-    return inspect_worker(folder, _processes.get(folder))
-
-
 def _read_status(scene: Any, show_result: bool | None = None) -> states.StatusRead:
     settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     assert run is not None
     folder = _locate(scene, run)
     files = RunFiles(_stamp(job_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
     shown = settings.show_result if show_result is None else show_result
-    return states.StatusRead(folder, _inspect(job_folder(folder)), files, settings.live_preview, shown)
+    return states.StatusRead(folder, inspect_status(job_folder(folder)), files, settings.live_preview, shown)
 
 
 def _stamp(path: Path) -> states.Stamp | None:

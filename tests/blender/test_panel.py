@@ -133,7 +133,7 @@ def test_unreadable_worker_does_not_end_the_timer_silently(extension, tmp_path, 
     monitor = extension.operators.monitor
     running = extension.stga_addon.worker.status.WorkerState.WORKING
     monkeypatch.setitem(monitor._snapshots, tmp_path, monitor.WorkerSnapshot(running))
-    monkeypatch.setattr(monitor, "_inspect", lambda folder: 1 / 0)
+    monkeypatch.setattr(monitor, "inspect_status", lambda folder: 1 / 0)
     assert monitor.tick() is None
     assert "ZeroDivisionError" in capsys.readouterr().err
     assert not monitor._snapshots[tmp_path].state.is_alive
