@@ -49,7 +49,7 @@ def main() -> None:
         title = f"Which strategy or preset is best at equal time? ({capture.name})"
         sections += benchmark_section(title, capture, folder / f"benchmark-{capture.name}", arguments)
     title = f"What does a single setting cost or bring? ({first.name})"
-    sections += benchmark_section(title, first, folder / "knobs", ["--knobs", "--budget", "15s", "--seeds", "1"])
+    sections += benchmark_section(title, first, folder / "knobs", ["--knobs", "--budget", "10s", "--seeds", "1"])
     options.out.write_text("\n".join(sections), encoding="utf-8")
     print(options.out)
 

@@ -41,7 +41,7 @@ def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -
     with tqdm(desc="Rendering the capture", unit="image") as bar:
         model = make_capture(folder, SEED, options, progress=lambda done, total: _advance(bar, done, total))
     capture = open_capture(folder, model)
-    head, selection = _import_and_select(capture)
+    head, selection = _import_and_select(capture, model)
     avatar = _train(capture, model, out, seconds, selection)
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
@@ -58,8 +58,9 @@ def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
     bar.update(done - bar.n)
 
 
-def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
+def _import_and_select(capture: Capture, model: Path) -> tuple[object, dict[int, np.ndarray]]:
     """Make a Blender scene with head, cameras and a vertex group per frame; returns head and selection read back."""
+    from ...scene import tags
     from ...scene.blend_file import current_scene, new_file
     from ...scene.cameras import configure_scene, import_cameras
     from ...scene.objects import capture_root
@@ -68,6 +69,7 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 
     new_file()
     head = import_head(capture)
+    head[tags.FLAME_MODEL] = str(model.resolve())  # so that Train works in the saved file
     cameras = import_cameras(capture, capture_root(capture.root))
     configure_scene(current_scene(), capture, cameras[len(cameras) // 2])
     write_selection(head, select_capture(capture, SelectionOptions()))
