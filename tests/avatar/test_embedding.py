@@ -177,7 +177,7 @@ def test_quaternion_of_any_rotation_is_scipys():
 
 
 def test_zero_quaternion_counts_as_no_rotation():
-    """Catches 0/0 when an optimiser, or a foreign file, delivers a zero quaternion."""
+    """Catches 0/0 when an optimizer, or a foreign file, delivers a zero quaternion."""
     splats = random_splats(10, 3, 1)
     splats.rotation[:] = 0
     np.testing.assert_array_equal(to_world(splats, WORLD).rotation, np.tile([1, 0, 0, 0], (3, 1)))

@@ -65,7 +65,7 @@ def flame_model(vertices: int = 80, components: int = 40, identity: int = 10, se
 def flame_sequence(
     model: FlameModel, timesteps: Sequence[int] = (4, 5, 9), seed: int = 0, dynamic: bool = False
 ) -> FlameSequence:
-    """Large random poses, so that a transposed rotation or a wrong pivot is centimetres off."""
+    """Large random poses, so that a transposed rotation or a wrong pivot is centimeters off."""
     rng = np.random.default_rng(seed)
     size = len(model.v_template)
     frames = {

@@ -23,7 +23,7 @@ from .captures import mesh_capture  # noqa: E402
 
 
 def pose(seed: int) -> np.ndarray:
-    """Camera-to-world (4, 4), OpenGL axes: about a metre from the origin, roughly looking at it, rolled."""
+    """Camera-to-world (4, 4), OpenGL axes: about a meter from the origin, roughly looking at it, rolled."""
     rng = np.random.default_rng(seed)
     back = rng.normal(size=3)
     back /= np.linalg.norm(back)

@@ -208,7 +208,7 @@ def test_standard_view_transform_shows_trained_colors(tmp_path):
     assert middle[3] > 0.99
 
 
-def test_depth_in_metres(tmp_path):
+def test_depth_in_meters(tmp_path):
     """Catches distances instead of depth, and anything but Blender's 1e10 where nothing is."""
     one = random_splats(1, 2, degree=0)
     flat = replace(

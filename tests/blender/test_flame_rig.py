@@ -17,7 +17,7 @@ from stga_addon.scene.rig.head import import_head  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 
-TOLERANCE = 2e-6  # metres; float32 skinning of a head half a metre from its origin
+TOLERANCE = 2e-6  # meters; float32 skinning of a head half a meter from its origin
 
 
 @pytest.fixture

@@ -280,7 +280,7 @@ def test_more_bounces_where_cycles_needs_them(extension):
 
 
 def test_standard_view(extension):
-    """Catches a one-click cure that does not cure: AgX turns trained colors grey."""
+    """Catches a one-click cure that does not cure: AgX turns trained colors gray."""
     bpy.context.scene.view_settings.view_transform = "AgX"
     bpy.ops.stga.standard_view()
     assert bpy.context.scene.view_settings.view_transform == "Standard"

@@ -28,7 +28,7 @@ def _empty_scene():
 
 
 def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Head-sized triangles (V, 3), (F, 3), a metre from the origin, each starting at a random one of its corners."""
+    """Head-sized triangles (V, 3), (F, 3), a meter from the origin, each starting at a random one of its corners."""
     rng = np.random.default_rng(0)
     theta, phi = np.meshgrid(np.linspace(0.2, np.pi - 0.2, rings), np.linspace(0, 2 * np.pi, segments, endpoint=False))
     ball = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(-1, 3)

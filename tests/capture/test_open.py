@@ -60,7 +60,7 @@ def test_mesh_capture(tmp_path: Path, suffix: str) -> None:
 
 
 def test_without_canonical_mesh(tmp_path: Path) -> None:
-    """Catches a capture without a neutral mesh being refused, or its first timestep taken without a word."""
+    """Catches a capture without a neutral mesh being refused, or its first timestep taken silently."""
     root = factory.write_mesh_capture(tmp_path / "capture", timesteps=(2, 4))
     each_split(root, lambda document: document.pop("canonical_mesh_path"))
     capture = open_capture(root)
@@ -214,7 +214,7 @@ def test_union_set(tmp_path: Path) -> None:
 
 
 def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
-    """Catches a capture of the other convention opened without a word, and a warning where all is well."""
+    """Catches a capture of the other convention opened silently, and a warning where all is well."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     assert open_capture(root, principal_point="vhap").warnings == ()
     for wrong in ("opencv", "center"):
@@ -227,7 +227,7 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
 def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str | None) -> None:
-    """Catches a capture in millimeters that trains to nonsense, or renders nothing, without a word."""
+    """Catches a capture in millimeters that trains to nonsense, or renders nothing, silently."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     vertices, faces = factory.ball()
     for path in (root / "meshes").glob("*.obj"):

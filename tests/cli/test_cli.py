@@ -144,7 +144,7 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     drawn = pixels(tmp_path / "val" / "00000_02.png")
     assert drawn.shape == (60, 40, 3)
     assert (drawn[0] == 255).all()
-    # Ten steps from grey: the ball stands where its silhouette says, in something that is not white.
+    # Ten steps from gray: the ball stands where its silhouette says, in something that is not white.
     dark = (drawn < 230).any(axis=2)
     assert np.mean(dark == factory.silhouette()) > 0.9
     assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
@@ -394,7 +394,7 @@ def test_budgets_exclude_each_other(root: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("threshold", ["nan", "-1", "inf"])
 def test_select_refuses_thresholds_that_are_no_distance(root: Path, threshold: str) -> None:
-    """Catches a selection of nothing or everything without a word."""
+    """Catches a selection of nothing or everything silently."""
     with pytest.raises(SystemExit, match="2"):
         main(["select", str(root), f"--threshold={threshold}"])
 

@@ -144,7 +144,7 @@ def in_window() -> Any:
 
 
 def looks_at_head() -> bool:
-    """Whether every viewport shows the head, and little else: Blender's own cube is two metres high."""
+    """Whether every viewport shows the head, and little else: Blender's own cube is two meters high."""
     head = chosen().head
     corners = [head.matrix_world @ Vector(corner) for corner in head.bound_box]
     center, size = sum(corners, Vector()) / len(corners), (corners[6] - corners[0]).length

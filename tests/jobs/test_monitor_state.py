@@ -188,7 +188,7 @@ def test_curve_is_read_when_it_grows():
 
 
 def test_unexpected_error_stops_until_the_next_start_or_check():
-    """Catches a timer that ends without a word, one that repeats the same traceback, and one that never recovers."""
+    """Catches a timer that ends silently, one that repeats the same traceback, and one that never recovers."""
     state, effects = after(Started(RUN), status(WorkerState.WORKING, preview=1), MonitorFailed("a bug"))
     assert (state.error, state.interval_s, effects) == ("a bug", None, [Redraw()])
     for restart in (Started(RUN), status(WorkerState.WORKING)):

@@ -202,7 +202,7 @@ def test_a_preview_that_cannot_be_written_costs_nothing_else(tmp_path, capture, 
 
 @pytest.mark.slow
 def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
-    """Catches a worker whose mishap only its log knows, and a command that ends well although nothing was trained."""
+    """Catches a worker whose failure only its log shows, and a command that ends well although nothing was trained."""
     pytest.importorskip("torch")
     assert main(["job", str(tmp_path / "nothing")]) == 2
     assert "holds no job" in capsys.readouterr().err

@@ -43,9 +43,9 @@ def _message(read: Callable[[], Any]) -> str:
     try:
         read()
     except StgaError as error:
-        message = str(error) or "an error without a word"
+        message = str(error) or "an error without a message"
     assert "\n" not in message[:80]
-    assert message != "an error without a word"
+    assert message != "an error without a message"
     return message
 
 

@@ -450,7 +450,7 @@ def test_meshes(tmp_path: Path, name: str) -> None:
 
 
 def test_images_that_unpack_elsewhere(tmp_path: Path) -> None:
-    """Catches bombs beside the pixels: text and colour profiles of a PNG, which Pillow unpacks as well."""
+    """Catches bombs beside the pixels: text and color profiles of a PNG, which Pillow unpacks as well."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">L", len(data)) + kind + data + struct.pack(">L", zlib.crc32(kind + data))

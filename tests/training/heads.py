@@ -20,7 +20,7 @@ PLACES = (0, 1, 3, 4, 2)
 """Of the cameras, side by side: `val` is in the middle."""
 LENS = {"w": 96, "h": 96, "cx": 48.0, "cy": 48.0, "fl_x": 380.0, "fl_y": 380.0}
 NOISE = {"expr": 0.5, "rotation": 0.02, "jaw_pose": 0.04, "translation": 0.002}
-"""What a tracker is off by where the error is 1: coefficients of some 2 mm, radians, metres."""
+"""What a tracker is off by where the error is 1: coefficients of some 2 mm, radians, meters."""
 
 
 def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.ndarray]]:

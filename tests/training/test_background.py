@@ -22,7 +22,7 @@ def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
     out = np.empty_like(image)
     change_background(image, coverage, before, after, out)
     expected = foreground * alpha + after * (1 - alpha)
-    # Half a grey level was lost when `image` was rounded, half is lost again.
+    # Half a gray level was lost when `image` was rounded, half is lost again.
     assert np.abs(out - expected).max() <= 1.01
 
 

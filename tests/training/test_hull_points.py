@@ -20,7 +20,7 @@ TIMESTEP = 4
 
 
 def cameras(count: int = 20) -> list[Camera]:
-    """Cameras on a sphere of a metre around the origin (a Fibonacci spiral), looking at it."""
+    """Cameras on a sphere of a meter around the origin (a Fibonacci spiral), looking at it."""
     found = []
     for n in range(count):
         height, angle = 1 - 2 * (n + 0.5) / count, n * np.pi * (3 - np.sqrt(5))
@@ -148,7 +148,7 @@ def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> Non
     assert len(hull_points(beside, views, "stga", 0)) == 0
 
 
-def test_a_mesh_in_millimetres_does_not_fill_the_memory(beside: Capture) -> None:
+def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None:
     """Catches a grid of 4 mm laid through a mesh of 100 m: 10^13 points."""
     huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
     assert len(hull_points(huge, beside.views["train"], "stga", 0)) < 100_000

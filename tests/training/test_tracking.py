@@ -38,7 +38,7 @@ WHITE = np.ones(3, np.float32)
 
 @pytest.fixture(scope="module")
 def lost(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Tracked a few millimetres and degrees off."""
+    """Tracked a few millimeters and degrees off."""
     return write_head(tmp_path_factory.mktemp("lost"))
 
 
@@ -66,11 +66,11 @@ def trained(capture: Capture, iterations: int, **changes: Any) -> Trainer:
 GROUPS = {"expression": slice(0, 2), "root": slice(2, 5), "jaw": slice(8, 11), "translation": slice(17, 20)}
 """Where the numbers of the ball's FLAME stand."""
 AWAY = {"expression": 0.5, "root": 0.03, "jaw": 0.1, "translation": 0.002}
-"""What they are disturbed by: coefficients, radians, metres."""
+"""What they are disturbed by: coefficients, radians, meters."""
 
 
 def differences(tracking: Tracking, timestep: int, loss: Callable[[], float], step: float) -> np.ndarray:
-    """(P,) central differences of a loss; step: metres by which vertices move, about."""
+    """(P,) central differences of a loss; step: meters by which vertices move, about."""
     row, before = tracking.sequence.timesteps.index(timestep), tracking.tracked.copy()
     sizes = step * np.repeat([250.0, 10.0, 1.0], [2, 15, 3])
     found = []
@@ -157,7 +157,7 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     assert 0.7 < found @ away / slope < 1.2
 
 
-def millimetres(trainer: Trainer, true: dict[int, np.ndarray]) -> float:
+def millimeters(trainer: Trainer, true: dict[int, np.ndarray]) -> float:
     """Mean distance of the training timesteps' vertices from where they should be."""
     away = [trainer.frames.mesh(timestep) - true[timestep] for timestep in TIMESTEPS[:-1]]
     return 1000 * float(np.linalg.norm(away, axis=-1).mean())
@@ -173,8 +173,8 @@ def test_what_it_brings(lost: Made) -> None:
     capture, true = lost
     on, off = (trained(capture, 300, tracking=tracking) for tracking in (True, False))
     assert on.tracking is not None
-    assert millimetres(off, true) > 3.0
-    assert millimetres(on, true) < 0.45 * millimetres(off, true)
+    assert millimeters(off, true) > 3.0
+    assert millimeters(on, true) < 0.45 * millimeters(off, true)
     assert held_out(on) > held_out(off) + 1.5
     common = on.tracking.parameters() - on.tracking.tracked
     assert np.abs(common[:-1].mean(0)).max() < 1e-12  # what all have in common, an unseen timestep would not follow
@@ -185,12 +185,12 @@ def test_what_it_costs_where_nothing_is_wrong(right: Made) -> None:
     """Catches a drift away from a tracking that is right."""
     capture, true = right
     on, off = (trained(capture, 300, tracking=tracking) for tracking in (True, False))
-    assert millimetres(on, true) < 0.8  # a third of a pixel
+    assert millimeters(on, true) < 0.8  # a third of a pixel
     assert held_out(on) > held_out(off) - 0.1
 
 
 def test_nothing_moves_before_there_is_something_to_see(lost: Made) -> None:
-    """Catches a tracking that follows grey splats, and one that moves in local iterations."""
+    """Catches a tracking that follows gray splats, and one that moves in local iterations."""
     capture, _ = lost
     trainer = Trainer(
         capture,

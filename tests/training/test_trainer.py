@@ -254,7 +254,7 @@ def test_render_returns_a_copy(toy: Capture) -> None:
 
 
 def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
-    """Catches limits in metres applied to GaussianAvatars' triangle units, and an area without its factor two."""
+    """Catches limits in meters applied to GaussianAvatars' triangle units, and an area without its factor two."""
     areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
     np.testing.assert_allclose(limit_units(toy, "stga"), np.sqrt(2 * areas), rtol=1e-5)
     np.testing.assert_array_equal(limit_units(toy, "gaussian_avatars"), 1)
