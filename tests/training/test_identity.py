@@ -161,6 +161,15 @@ def test_another_flame_model_is_refused(tmp_path: Path) -> None:
     assert main([*arguments, str(moved)]) == 0
 
 
+def test_a_capture_of_another_kind_is_named_as_such(toy: Capture, tmp_path: Path) -> None:
+    """Catches a run on a FLAME capture, resumed on tracked meshes, that blames the FLAME file instead."""
+    root, model = factory.write_flame_capture(tmp_path / "flame")
+    capture, out = open_capture(root, model), tmp_path / "run"
+    train(capture, out, make_run(capture, model), report=stop_at(4))
+    with pytest.raises(StgaError, match=rf"was trained on {root} .* but {toy.root} \(.* has "):
+        open_run(out, toy.root)
+
+
 def test_edited_settings_are_refused(copy: Path) -> None:
     """Catches a run that continues with other settings than those of its checkpoint."""
     factory.edit(copy / "run.json", lambda document: document["settings"].update(seed=7))

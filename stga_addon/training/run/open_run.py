@@ -52,7 +52,7 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
     if trained.principal_point != given.principal_point:
         wanted = f"principal point '{trained.principal_point}', not '{given.principal_point}'"
         raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
-    if trained.flame != given.flame:
+    if "" not in (trained.flame, given.flame) and trained.flame != given.flame:
         wanted = f"FLAME model {stored.flame}, but {run.flame} has other content"
         raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
     changed = difference(trained, given)
