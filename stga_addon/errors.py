@@ -29,7 +29,10 @@ def one_line(message: str) -> str:
 
 def shorten(value: object) -> str:
     """The value as a message quotes it: its repr, with the middle of a long one left out."""
-    return _cut(_repr.repr(value), MAX_VALUE_CHARACTERS)
+    try:
+        return _cut(_repr.repr(value), MAX_VALUE_CHARACTERS)
+    except ValueError:  # Python does not write whole numbers of more than 4,300 digits
+        return "a number of too many digits"
 
 
 def _cut(text: str, limit: int) -> str:

@@ -21,3 +21,8 @@ def test_quoted_values_are_short():
     assert shorten("left") == "'left'"
     for value in ("x" * 10**6, ["y" * 10**6] * 100, {"k" * 1000: [1] * 1000}, 10**4000, [[[[1] * 50] * 50] * 50] * 50):
         assert len(shorten(value)) <= MAX_VALUE_CHARACTERS
+
+
+def test_numbers_that_python_does_not_write_are_quoted():
+    """Catches a ValueError in place of the message about a whole number of thousands of digits."""
+    assert shorten(10**5000) == "a number of too many digits"

@@ -151,7 +151,8 @@ def _check(path: Path, avatar: Avatar) -> None:
         raise StgaError(f"{path}: convention is {shorten(avatar.convention)}, expected one of {', '.join(CONVENTIONS)}")
     if avatar.principal_point not in PRINCIPAL_POINTS:
         raise StgaError(
-            f"{path}: principal_point is {avatar.principal_point!r:.40}, expected one of {', '.join(PRINCIPAL_POINTS)}"
+            f"{path}: principal_point is {shorten(avatar.principal_point)}, "
+            f"expected one of {', '.join(PRINCIPAL_POINTS)}"
         )
     _check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
     _check_array(path, "faces", avatar.faces, "int32", (-1, 3))

@@ -9,7 +9,7 @@ import numpy as np
 from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 
 FOLDER = "STGA_HEAD"
@@ -58,7 +58,7 @@ def read_head(folder: Path) -> OpenHead:
     for name, needed in (("capture", True), ("flame", False), ("avatar", False)):
         value = values.get(name)
         if not isinstance(value, str) and (needed or value is not None):
-            raise StgaError(f"{path}: {name} is {value!r:.40}, expected a path")
+            raise StgaError(f"{path}: {name} is {shorten(value)}, expected a path")
     flame, avatar = (Path(values[name]) if values.get(name) else None for name in ("flame", "avatar"))
 
     def selection() -> dict[int, np.ndarray] | None:

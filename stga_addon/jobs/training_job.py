@@ -18,7 +18,7 @@ import numpy as np
 from ..avatar.file import Avatar, write_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_json, write_json, write_npz
 from ..training.optimize.device import choose_device
 from ..training.run.folder import SELECTION, Run
@@ -96,7 +96,7 @@ def read_job(run: Path) -> TrainingJob:
     try:
         flame, settings, device = values["flame"], values["settings"], values["device"]
         if device not in DEVICES:
-            raise ValueError(f"device is {device!r:.40}")
+            raise ValueError(f"device is {shorten(device)}")
         return TrainingJob(
             Path(values["capture"]),
             None if flame is None else Path(flame),

@@ -7,7 +7,7 @@ from dataclasses import field
 from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 
 MAX_COUNT = (1 << 31) - 1
 """Largest whole number that kernels can count to."""
@@ -61,12 +61,7 @@ def validate_fields(part: Any, prefix: str = "") -> None:
 
 def complaint(name: str, expected: str, value: Any) -> str:
     """The message for a setting with a value that is not allowed."""
-    return f"setting {name}: expected {expected}, got {_shortened(value)}"
-
-
-def _shortened(value: Any) -> str:
-    too_long = type(value) is int and value.bit_length() > 1000  # more digits than Python converts into text
-    return "a number of too many digits" if too_long else f"{value!r:.60}"
+    return f"setting {name}: expected {expected}, got {shorten(value)}"
 
 
 def _expected(value: Any, hint: Any, limits: Mapping[str, Any]) -> str | None:

@@ -13,7 +13,7 @@ import torch
 
 from ...avatar.file import SH_SIZES
 from ...avatar.strain import STRAIN_COMPONENTS
-from ...errors import StgaError
+from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
 from ..optimize.state import TrainState, state_of, tensors_of
 from ..optimize.tracking import RefinementState
@@ -114,14 +114,14 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
     lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0}
     for name, low in lowest.items():
         if type(meta.get(name)) is not int or not low <= meta[name] < MAX_COUNT:
-            raise ValueError(f"{name} is {meta.get(name)!r:.40}, expected a whole number from {low} up")
+            raise ValueError(f"{name} is {shorten(meta.get(name))}, expected a whole number from {low} up")
     last, losses = meta.get("last_timestep"), meta.get("losses")
     if last is not None and (type(last) is not int or not 0 <= last < MAX_COUNT):
-        raise ValueError(f"last_timestep is {last!r:.40}, expected a timestep")
+        raise ValueError(f"last_timestep is {shorten(last)}, expected a timestep")
     if not _is_number(meta.get("elapsed_s")) or not 0 <= meta["elapsed_s"] < math.inf:
-        raise ValueError(f"elapsed_s is {meta.get('elapsed_s')!r:.40}, expected seconds from 0 up")
+        raise ValueError(f"elapsed_s is {shorten(meta.get('elapsed_s'))}, expected seconds from 0 up")
     if not _is_number(meta.get("best_psnr")) or math.isnan(meta["best_psnr"]):
-        raise ValueError(f"best_psnr is {meta.get('best_psnr')!r:.40}, expected a number of dB")
+        raise ValueError(f"best_psnr is {shorten(meta.get('best_psnr'))}, expected a number of dB")
     if not isinstance(losses, list) or not all(_is_number(loss) and not math.isnan(loss) for loss in losses):
         raise ValueError("losses is no list of numbers")
     if not isinstance(meta.get("identity"), str):

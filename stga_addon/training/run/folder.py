@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ...capture.transforms import PRINCIPAL_POINTS
-from ...errors import StgaError
+from ...errors import StgaError, shorten
 from ...files import read_json, remove_leftovers, write_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
@@ -71,13 +71,13 @@ def read_run(folder: Path) -> Run:
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
     if values.get("version") != VERSION:
-        raise StgaError(f"{path}: has run format version {values.get('version')!r:.40}, this add-on reads {VERSION}")
+        raise StgaError(f"{path}: has run format version {shorten(values.get('version'))}, this add-on reads {VERSION}")
     try:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
-            raise ValueError(f"principal_point is {principal_point!r:.40}")
+            raise ValueError(f"principal_point is {shorten(principal_point)}")
         if not isinstance(device, str) or device.partition(":")[0] not in DEVICES:
-            raise ValueError(f"device is {device!r:.40}")
+            raise ValueError(f"device is {shorten(device)}")
         return Run(
             Path(values["capture"]),
             None if flame is None else Path(flame),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ...errors import StgaError
+from ...errors import StgaError, shorten
 from ...files import file_size, replacing
 
 METRICS = "metrics.jsonl"
@@ -62,12 +62,12 @@ def _fault(line: Any) -> str | None:
         return "is no object"
     for name in REQUIRED:
         if not _is_number(line.get(name)) or not 0 <= line[name] < math.inf:
-            return f"{name} is {line.get(name)!r:.40}, expected a number from 0 up"
+            return f"{name} is {shorten(line.get(name))}, expected a number from 0 up"
     for name, value in line.items():
         if name != "forecast" and not _is_number(value):
-            return f"{name} is {value!r:.40}, expected a number"
+            return f"{name} is {shorten(value)}, expected a number"
     if type(line["iteration"]) is not int:
-        return f"iteration is {line['iteration']!r:.40}, expected a whole number"
+        return f"iteration is {shorten(line['iteration'])}, expected a whole number"
     if "psnr" in line and "ssim" not in line:
         return "psnr has no ssim beside it"
     return _forecast_fault(line) if "forecast" in line else None
@@ -76,7 +76,7 @@ def _fault(line: Any) -> str | None:
 def _forecast_fault(line: dict[str, Any]) -> str | None:
     forecast = line["forecast"]
     if not isinstance(forecast, dict) or not all(_is_finite(forecast.get(name)) for name in FORECAST):
-        return f"forecast is {forecast!r:.40}, expected numbers named {', '.join(FORECAST)}"
+        return f"forecast is {shorten(forecast)}, expected numbers named {', '.join(FORECAST)}"
     return None if _is_finite(line.get("psnr")) else "forecast has no psnr beside it"
 
 
