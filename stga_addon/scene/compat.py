@@ -88,6 +88,15 @@ def modifier_input(modifier: Any, identifier: str) -> Any:
     return modifier[identifier]
 
 
+def modifier_menu(modifier: Any, identifier: str) -> str:
+    """The name of the item that is chosen in a menu input of a geometry nodes modifier."""
+    value = modifier_input(modifier, identifier)
+    if isinstance(value, str):
+        return value
+    items = modifier.id_properties_ui(identifier).as_dict()["items"]
+    return next((str(item[0]) for item in items if item[4] == value), "")
+
+
 def modifier_input_owner(modifier: Any, identifier: str) -> tuple[Any, str]:
     """What `UILayout.prop` needs to draw a geometry nodes modifier's input: the owner and the property's name."""
     if MODIFIER_INPUT_PROPERTIES:
@@ -122,3 +131,9 @@ def native_splats(tree: Any, points: Any) -> Any:
             return node.outputs[0]
     tree.nodes.remove(node)
     return None
+
+
+def allow_depth_write(shader: Any) -> None:
+    """Let a shader's fragments set their depth; versions before 5.0 need no declaration."""
+    if hasattr(shader, "depth_write"):
+        shader.depth_write("ANY")

@@ -1,4 +1,4 @@
-"""Node groups for the display modes: points, ellipsoids, camera quads and, from Blender 5.3, native splats."""
+"""Node groups for the display modes: as trained, points, ellipsoids, camera quads and, from 5.3, native splats."""
 
 from typing import Any
 
@@ -12,6 +12,7 @@ from .node_builder import NodeGroup, Nodes
 WORLD_ROTATION = "rotation"
 WORLD_SCALE = "scale"
 
+AS_TRAINED = "As Trained"
 POINTS = "Points"
 ELLIPSOIDS = "Ellipsoids"
 QUADS = "Camera Quads"
@@ -35,6 +36,12 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
         nodes.tree.links.new(geometry, menu.inputs[name])
     nodes.tree.links.new(mode, menu.inputs["Menu"])
     return menu.outputs[0]
+
+
+def _as_trained(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
+    """Nothing in a viewport, where `gpu.viewport_display` draws; points in images by other engines than STGA Splats."""
+    points = nodes.group(MODES[POINTS], splats, visible, size)
+    return nodes.switch("GEOMETRY", nodes.out("GeometryNodeIsViewport"), points, None)
 
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
@@ -98,6 +105,7 @@ def _quad_transform(nodes: Nodes, size: Any) -> bpy.types.NodeSocket:
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
 MODES = {
+    AS_TRAINED: NodeGroup("STGA As Trained", _INPUTS, "Geometry", _as_trained),
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     ELLIPSOIDS: NodeGroup("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),

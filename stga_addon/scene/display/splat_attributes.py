@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
+from .. import tags
 from ..arrays import flat_floats, read_values
 from .colors import srgb_to_linear
 
@@ -80,6 +82,7 @@ def write_splats(mesh: Any, attributes: Attributes) -> None:
         mesh.vertices.add(len(positions) // 3)
     # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
     write_attributes(mesh, {"position": ("FLOAT_VECTOR", "vector", positions), **attributes}, "POINT")
+    mesh[tags.REVISION] = uuid4().hex
     mesh.update()
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from .. import tags
+from ..layers import FROZEN_COLOR
 from .color_nodes import DEFORMED, SH_BANDS, SRGB_TO_LINEAR, STRAIN, constant_color, view_color, view_direction
 from .display_modes import MODES, POINTS, displayed
 from .frame_nodes import FRAMES, PLACED
@@ -26,8 +27,6 @@ PERCENTAGE = "Percentage"
 VIEW_DEPENDENT = "View-Dependent Color"
 SHOW_SELECTION = "Show Selection"
 SELECTED_ONLY = "Selected Only"
-
-FROZEN_COLOR = (0.25, 0.25, 0.25, 1.0)  # linear; splats that the current frame does not train
 
 _FROZEN = "stga_frozen"
 

@@ -10,9 +10,10 @@ from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
-from ..compat import modifier_input, set_modifier_input
+from ..compat import modifier_input, modifier_menu, set_modifier_input
+from ..layers import DisplaySettings
 from . import splat_nodes
-from .display_modes import POINTS, WORLD_ROTATION, WORLD_SCALE
+from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
 from .node_builder import is_splat_tree
 from .splat_attributes import (
     Attributes,
@@ -23,6 +24,16 @@ from .splat_attributes import (
     write_attributes,
     write_splats,
 )
+
+SETTING_NAMES = {
+    splat_nodes.SIZE: "size",
+    splat_nodes.OPACITY_THRESHOLD: "opacity_threshold",
+    splat_nodes.PERCENTAGE: "percentage",
+    splat_nodes.VIEW_DEPENDENT: "view_dependent",
+    splat_nodes.SHOW_SELECTION: "show_selection",
+    splat_nodes.SELECTED_ONLY: "selected_only",
+}
+"""Inputs of the splat modifier -> fields of `DisplaySettings`."""
 
 
 def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None) -> Any:
@@ -133,6 +144,23 @@ def input_identifier(modifier: Any, name: str) -> str | None:
     return next((item.identifier for item in items if item.in_out == "INPUT" and item.name == name), None)
 
 
+def display_mode(splat_object: Any) -> str:
+    """The display mode that is chosen for a splat object, one of `display_modes`."""
+    modifier = splat_modifier(splat_object)
+    identifier = input_identifier(modifier, splat_nodes.DISPLAY)
+    return "" if identifier is None else modifier_menu(modifier, identifier)
+
+
+def display_settings(modifier: Any) -> DisplaySettings:
+    """The display settings of a splat object, by its `splat_modifier`; defaults for those that its splats lack."""
+    chosen = {
+        SETTING_NAMES[item.name]: modifier_input(modifier, item.identifier)
+        for item in modifier.node_group.interface.items_tree
+        if item.name in SETTING_NAMES
+    }
+    return DisplaySettings(**chosen)
+
+
 def stored_avatar(splat_object: Any) -> Avatar:
     """The avatar that `show_avatar` made a splat object of, with unit rotations and without regions."""
     neutral = get_input(splat_object, splat_nodes.NEUTRAL)
@@ -151,8 +179,15 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
     """What a splat object displays as points at the current frame, in its object space.
 
     Returns position (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32.
+    Splats displayed as trained are posed by the GPU display: here they are evaluated as points.
     Raises StgaError where it displays ellipsoids, which are instances and not one geometry.
     """
+    if display_mode(splat_object) == AS_TRAINED:
+        set_input(splat_object, splat_nodes.DISPLAY, POINTS)
+        try:
+            return evaluated_splats(splat_object)
+        finally:
+            set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for instance in depsgraph.object_instances:
         owner = instance.parent if instance.is_instance else instance.object
@@ -184,7 +219,9 @@ def _neutral_object(name: str, avatar: Avatar, attributes: Attributes) -> Any:
 def _add_modifier(splat_object: Any, convention: str | None, splats: Splats) -> None:
     modifier = splat_object.modifiers.new("STGA Splats", "NODES")
     modifier.node_group = splat_nodes.splat_tree(*_tree_options(convention, splats))
-    set_input(splat_object, splat_nodes.DISPLAY, POINTS)  # a menu's default reaches the modifier in some versions only
+    set_input(
+        splat_object, splat_nodes.DISPLAY, AS_TRAINED
+    )  # a menu's default reaches the modifier in some versions only
 
 
 def _tree_options(convention: str | None, splats: Splats) -> tuple[str | None, int, bool]:

@@ -1,26 +1,33 @@
-"""The render engine "STGA Splats": final images, animations and viewports through the training rasterizer.
+"""The render engine "STGA Splats": final images, animations and viewports that show splats exactly as trained.
 
-It renders splats and nothing else; meshes are composited by its alpha and depth. Registering it imports no rasterizer:
-that happens with the first image.
+The GPU draws them, or, where it cannot, the training rasterizer. It renders splats and nothing else; meshes are
+composited by its alpha and depth. Registering it imports no rasterizer: that happens with the first image.
 """
 
+import logging
+import traceback
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import bpy
+import gpu
 import numpy as np
 
+from ...capture.camera import Camera
 from ...errors import StgaError
+from ...raster.posed_splats import ComposedImage, PosedSplats
 from ...raster.render_client import RenderClient, missing_packages
-from ..compat import world_nodes
 from ..display.colors import linear_to_srgb, srgb_to_linear
+from ..gpu.packing import View
+from ..gpu.renderer import SplatRenderer
+from ..gpu.viewport_display import ENGINE, is_drawn_by_engine, region_view, world_color
+from ..layers import SceneLayer
 from . import redraw
 from .camera import render_camera, viewport_camera
 from .scene_splats import SplatCache, visible_layers
 from .viewport import RenderRequest, ViewportImage, ViewportRenderer
 
-ENGINE = "STGA_SPLATS"
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
 MIN_DEPTH_ALPHA = 1 / 255  # pixels with less show nothing
 # Blender's panels that are for some engines only and apply to this one too.
@@ -57,6 +64,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_idname = ENGINE
     bl_label = "STGA Splats"
     bl_use_eevee_viewport = True  # Material Preview stays EEVEE's
+    bl_use_gpu_context = True
 
     # No __init__: its signature differs between Blender's versions. Created when a viewport is first drawn.
     _viewport: "Viewport | None" = None
@@ -81,11 +89,13 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         camera = render_camera(camera_object, depsgraph, *size, border)
         layers = visible_layers(depsgraph, SplatCache())
         self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
-        _interpreter.update()
-        image = _client.compose(layers, camera, with_depth=True)
+        image = draw_image(layers, camera)
+        if image is None:
+            _interpreter.update()
+            image = _client.compose([layer.posed() for layer in layers], camera, with_depth=True)
         result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
         passes = result.layers[0].passes
-        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, _background(scene)))
+        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, background(scene)))
         if "Depth" in passes:
             assert image.depth is not None
             covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
@@ -97,6 +107,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
         viewport, region = self._get_viewport(), context.region
+        if viewport.draw(context, depsgraph):
+            self.update_stats("", viewport.error)
+            return
         renderer = viewport.renderer
         if viewport.request_image(context, depsgraph):
             redraw.redraw_when_rendered(renderer, self)
@@ -121,8 +134,12 @@ class Viewport:
     def __init__(self) -> None:
         self.renderer = ViewportRenderer(partial(_render_request, _client))
         self.image = ViewportImage()
+        self.error = ""
+        self._gpu: SplatRenderer | None = None
+        self._gpu_failed = False
         self._cache = SplatCache()
-        self._layers: list[Any] | None = None
+        self._layers: list[SceneLayer] | None = None
+        self._posed: list[PosedSplats] = []
 
     def update(self, depsgraph: Any) -> None:
         """The scene has changed: pose the splats again, and read meshes again that were edited themselves."""
@@ -131,19 +148,63 @@ class Viewport:
             {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Mesh)}
         )
 
+    def draw(self, context: Any, depsgraph: Any) -> bool:
+        """Draw the current view with the GPU; returns False where it cannot."""
+        if self._gpu_failed:
+            return False
+        try:
+            self._draw(context, depsgraph)
+        except Exception:  # from then on, the rasterizer renders
+            traceback.print_exc()
+            self._gpu, self._gpu_failed, self._layers = None, True, None
+        return not self._gpu_failed
+
     def request_image(self, context: Any, depsgraph: Any) -> bool:
         """Request an image of the current view; whether it differs from the last one requested."""
-        region, space = context.region, context.space_data
-        if self._layers is None:
-            try:
-                self._layers = visible_layers(depsgraph, self._cache, space)
-            except StgaError as error:
-                self.renderer.error, self.renderer.image = str(error), None
-                return False
+        region = context.region
+        if not self._update_layers(context, depsgraph):
+            self.renderer.error, self.renderer.image = self.error, None
+            return False
         camera = viewport_camera(context.region_data, region.width, region.height)
         if not self.renderer.is_busy():
             _interpreter.update()
-        return self.renderer.request(RenderRequest(self._layers, camera, _background(depsgraph.scene)))
+        return self.renderer.request(RenderRequest(self._posed, camera, background(depsgraph.scene)))
+
+    def _update_layers(self, context: Any, depsgraph: Any) -> bool:
+        """Read the scene if it has changed; returns False, and sets `error`, where that fails."""
+        if self._layers is None:
+            try:
+                self._layers = visible_layers(depsgraph, self._cache, context.space_data)
+            except StgaError as error:
+                self.error = str(error)
+                return False
+            self._posed = [layer.posed() for layer in self._layers] if self._gpu_failed else []
+            self.error = ""
+        return True
+
+    def _draw(self, context: Any, depsgraph: Any) -> None:
+        color = background(depsgraph.scene)
+        if color is not None:
+            gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
+        if not is_drawn_by_engine(context) or not self._update_layers(context, depsgraph) or not self._layers:
+            return
+        self._gpu = self._gpu or SplatRenderer()
+        x, y, width, height = gpu.state.viewport_get()
+        view, to_depth = region_view(context.region_data, width, height)
+        self._gpu.draw(self._layers, view)
+        behind = None if color is None else tuple(linear_to_srgb(np.clip(np.array(color), 0, 1)).tolist())
+        self._gpu.composite((x, y), to_depth, behind)
+
+
+def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:
+    """A final image drawn by the GPU; None where this Blender has no GPU context, or not the memory."""
+    try:
+        renderer = SplatRenderer()
+        renderer.draw(layers, View(camera))
+        return renderer.read(with_depth=True)
+    except Exception as error:  # of many kinds, by device and version
+        logging.getLogger(__name__).info("GPU rendering is not available (%s); the rasterizer renders", error)
+        return None
 
 
 def _render_request(client: RenderClient, request: RenderRequest, scale: float) -> np.ndarray:
@@ -169,24 +230,15 @@ def combined(rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] |
     return image
 
 
-def _background(scene: Any) -> tuple[float, ...] | None:
+def background(scene: Any) -> tuple[float, ...] | None:
     """Scene-linear color behind the splats, None where the film is transparent.
 
     From the world's Background node if its inputs are constants, else its viewport color; black without a world.
     """
-    world = scene.world
     if scene.render.film_transparent:
         return None
-    if world is None:
-        return 0.0, 0.0, 0.0
-    tree = world_nodes(world)
-    output = tree.get_output_node("ALL") if tree else None
-    links = output.inputs["Surface"].links if output else ()
-    if links and links[0].from_node.type == "BACKGROUND":
-        color, strength = (links[0].from_node.inputs[name] for name in ("Color", "Strength"))
-        if not color.is_linked and not strength.is_linked:
-            return tuple(channel * strength.default_value for channel in color.default_value[:3])
-    return tuple(world.color)
+    color = world_color(scene)
+    return tuple(scene.world.color) if color is None else color
 
 
 def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:

@@ -1,58 +1,80 @@
-"""The splats that the render engine renders: those of a scene's visible objects, posed at its frame."""
+"""The splats of a scene's visible objects, posed at its frame: what the GPU display and the render engine draw."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...avatar.embedding import WORLD
+from ...avatar.embedding import WORLD, FaceFrames
 from ...avatar.file import Avatar
-from ...avatar.splats import SH_C0, Splats
+from ...avatar.splats import Splats
 from ...errors import StgaError
-from ...raster.posed_splats import PosedSplats
 from .. import tags
 from ..arrays import mesh_vertices
 from ..display import splat_nodes
-from ..display.colors import linear_to_srgb
 from ..display.splat_attributes import read_splats
-from ..display.splat_object import get_input, stored_avatar
+from ..display.splat_object import display_settings, get_input, splat_modifier, stored_avatar
+from ..layers import SceneLayer
 from ..vertex_groups import frame_selection
 
 
 class SplatCache:
-    """Avatars and world splats by their meshes, as last read from Blender.
+    """Avatars and world splats as last read from Blender's meshes, and avatars' frames on their heads' last shapes.
 
-    Reading their attributes takes longer than posing them, and an animated head does not change them.
+    Reading attributes takes longer than posing splats, and an animated head does not change them. `write_splats` gives
+    a mesh a new revision, so that neither undo nor a loaded file brings up what another state of the mesh held.
     """
 
     def __init__(self) -> None:
-        self._by_mesh: dict[Any, Avatar | Splats] = {}
+        self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
+        self._frames: dict[tuple[Any, ...], tuple[np.ndarray, FaceFrames]] = {}
 
     def discard(self, meshes: set[Any]) -> None:
         """Forget meshes that were edited."""
-        for mesh in meshes:
-            self._by_mesh.pop(mesh, None)
+        uids = {mesh.session_uid for mesh in meshes}
+        self._keep(lambda key: key[0] not in uids)
 
     def get(self, splat_object: Any) -> Avatar | Splats:
-        mesh = splat_object.data
-        if mesh not in self._by_mesh:
+        key = _key(splat_object.data)
+        if key not in self._stored:
+            current = {_key(mesh) for mesh in bpy.data.meshes}
+            self._keep(lambda known: known in current)
             is_avatar = tags.CONVENTION in splat_object
-            self._by_mesh[mesh] = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
-        return self._by_mesh[mesh]
+            stored = stored_avatar(splat_object) if is_avatar else read_splats(splat_object.data)
+            self._stored[key] = stored
+        return self._stored[key]
+
+    def frames(self, splat_object: Any, avatar: Avatar, vertices: np.ndarray) -> FaceFrames:
+        """The avatar's frames on a head of this shape (V, 3)."""
+        key = (*_key(splat_object.data), splat_object.session_uid)
+        known = self._frames.get(key)
+        if known is None or not np.array_equal(known[0], vertices):
+            known = self._frames[key] = vertices, avatar.frames(vertices)
+        return known[1]
+
+    def _keep(self, is_kept: Callable[[tuple[Any, ...]], bool]) -> None:
+        self._stored = {key: stored for key, stored in self._stored.items() if is_kept(key)}
+        self._frames = {key: frames for key, frames in self._frames.items() if is_kept(key[:3])}
 
 
-def visible_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[PosedSplats]:
-    """The splats of each visible object at the depsgraph's frame, with its display settings applied.
+def _key(mesh: Any) -> tuple[Any, ...]:
+    return mesh.session_uid, mesh.get(tags.REVISION, ""), len(mesh.vertices)
 
-    view: the 3D viewport (a SpaceView3D) to render, None for a final image. Raises StgaError where the head of an
-    object is gone or has other triangles than its splats.
+
+def visible_layers(
+    depsgraph: Any, cache: SplatCache, view: Any = None, is_wanted: Callable[[Any], bool] = lambda splat_object: True
+) -> list[SceneLayer]:
+    """The splats of each visible object at the depsgraph's frame.
+
+    view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects.
+    Raises StgaError where the head of an object is gone or has other triangles than its splats.
     """
     return [
         _layer(visible, matrix, depsgraph, cache)
         for visible, matrix in _visible_objects(depsgraph, view)
-        if visible.get(tags.KIND) == tags.SPLATS
+        if visible.get(tags.KIND) == tags.SPLATS and is_wanted(visible)
     ]
 
 
@@ -85,17 +107,23 @@ def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iter
                 yield from _with_instances(member, depsgraph, inside)
 
 
-def _layer(splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache) -> PosedSplats:
+def _layer(splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache) -> SceneLayer:
     stored = cache.get(splat_object)
     to_world = np.array(matrix, np.float64)
+    # From the evaluated object: its settings may be animated.
+    settings = display_settings(splat_modifier(splat_object.evaluated_get(depsgraph)))
     if isinstance(stored, Splats):
-        return PosedSplats(_with_display_settings(splat_object, stored, None, depsgraph), WORLD, to_world)
+        return SceneLayer(stored, WORLD, to_world, settings=settings)
     head = get_input(splat_object, splat_nodes.HEAD)
     if head is None:
         raise StgaError(f"{splat_object.name}: has no head to follow; choose one in its modifier")
-    frames = stored.frames(_head_vertices(splat_object, head, len(stored.faces), depsgraph))
-    splats = _with_display_settings(splat_object, stored.splats, head, depsgraph)
-    return PosedSplats(splats, frames, to_world, stored.antialiased)
+    vertices = _head_vertices(splat_object, head, len(stored.faces), depsgraph)
+    frames = cache.frames(splat_object, stored, vertices)
+    selected = None
+    if settings.show_selection or settings.selected_only:
+        selected = frame_selection(head, depsgraph.scene.frame_current)
+    frozen = None if selected is None else ~selected
+    return SceneLayer(stored.splats, frames, to_world, stored.antialiased, settings, frozen)
 
 
 def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -> np.ndarray:
@@ -108,34 +136,3 @@ def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -
     to_splats = splat_object.evaluated_get(depsgraph).matrix_world.inverted_safe() @ posed.matrix_world
     matrix = np.array(to_splats, np.float64)
     return mesh_vertices(posed.data) @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _with_display_settings(splat_object: Any, splats: Splats, head: Any, depsgraph: Any) -> Splats:
-    """The splats after their object's display settings; head: None for splats in world space."""
-    posed = splat_object.evaluated_get(depsgraph)  # its settings may be animated
-
-    def setting(name: str) -> Any:
-        return get_input(posed, name)
-
-    visible = 1 / (1 + np.exp(-splats.opacity)) >= setting(splat_nodes.OPACITY_THRESHOLD)
-    visible &= np.random.default_rng(0).random(len(splats)) * 100 < setting(splat_nodes.PERCENTAGE)
-    show_selection, selected_only = setting(splat_nodes.SHOW_SELECTION), setting(splat_nodes.SELECTED_ONLY)
-    selected = frame_selection(head, depsgraph.scene.frame_current) if show_selection or selected_only else None
-    if selected is not None:
-        frozen = ~selected[splats.face]
-        splats = _grayed(splats, frozen) if show_selection else splats
-        visible &= ~(frozen & selected_only)
-    if splats.sh_degree > 0 and not setting(splat_nodes.VIEW_DEPENDENT):
-        splats = replace(splats, sh=splats.sh[:, :1])
-    size = setting(splat_nodes.SIZE)
-    if size != 1:
-        visible &= size > 0
-        splats = replace(splats, log_scale=splats.log_scale + np.float32(np.log(max(size, 1e-6))))
-    return splats if visible.all() else splats.rows(visible)
-
-
-def _grayed(splats: Splats, frozen: np.ndarray) -> Splats:
-    sh, strain_color = splats.sh.copy(), splats.strain_color.copy()
-    sh[frozen] = strain_color[frozen] = 0
-    sh[frozen, 0] = (linear_to_srgb(np.array(splat_nodes.FROZEN_COLOR[:3])) - 0.5) / SH_C0
-    return replace(splats, sh=sh, strain_color=strain_color)

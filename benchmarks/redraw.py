@@ -1,0 +1,86 @@
+"""What the GPU display computes on the CPU for one redraw of a viewport.
+
+    python benchmarks/redraw.py [--repeats 20]
+
+A head of 9,976 triangles that moves (playback: its triangles' frames are computed again) and one that rests while the
+view moves, with 65,536 and 200,000 splats. Medians in milliseconds. Needs no GPU: uploading the results takes it
+another 0.1 to 1 ms, which `tests/gui` shows. Run it on an idle machine.
+"""
+
+import argparse
+import statistics
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.camera import look_at
+from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames, table
+from stga_addon.scene.layers import SceneLayer
+
+TRIANGLES = 9976
+"""Of the FLAME head."""
+
+
+def head_mesh() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a closed grid of about TRIANGLES triangles."""
+    rings, around = 59, 86
+    polar, angle = np.meshgrid(np.linspace(0.1, 3.0, rings), np.arange(around) * 2 * np.pi / around, indexing="ij")
+    points = [np.sin(polar) * np.cos(angle), np.cos(polar), np.sin(polar) * np.sin(angle)]
+    index = np.arange(rings * around).reshape(rings, around)
+    a, b, c, d = (np.roll(index, (-i, -j), (0, 1))[:-1].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
+    return 0.1 * np.stack([p.ravel() for p in points], 1), faces.astype(np.int32)
+
+
+def head_avatar(count: int) -> Avatar:
+    vertices, faces = head_mesh()
+    rng = np.random.default_rng(0)
+    splats = Splats(
+        xyz=rng.normal(0, 1e-3, (count, 3)).astype(np.float32),
+        rotation=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scale=np.full((count, 3), -6, np.float32),
+        opacity=np.zeros(count, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        face=rng.integers(0, len(faces), count).astype(np.int32),
+        unbound=np.zeros(count, bool),
+    )
+    return Avatar(splats, "stga", vertices.astype(np.float32), faces)
+
+
+def median_ms(work: Callable[[], object], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        begin = perf_counter()
+        work()
+        times.append(1e3 * (perf_counter() - begin))
+    return statistics.median(times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=20)
+    repeats = parser.parse_args().repeats
+    view = View(look_at((0.1, 0.1, 0.6), (0, 0, 0), 1600, 1000, 1500))
+    for count in (65_536, 200_000):
+        avatar = head_avatar(count)
+        layer = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
+        static, block = StaticSplats([layer]), frame_block(layer.frames)
+
+        def moving_view() -> None:
+            drawing_order(static, posed_frames([layer], [block], view), view)
+            table(static, [layer], view)
+
+        def playback() -> None:
+            posed = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
+            drawing_order(static, posed_frames([posed], [frame_block(posed.frames)], view), view)
+            table(static, [posed], view)
+
+        for name, work in (("moving view", moving_view), ("playback", playback)):
+            print(f"{count} splats, {name}: {median_ms(work, repeats):.2f} ms")
+
+
+if __name__ == "__main__":
+    main()

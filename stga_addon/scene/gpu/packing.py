@@ -1,0 +1,195 @@
+"""Splats, triangle frames and a view as the float32 arrays that the shaders read; numpy only.
+
+Every array is a list of texels (vec4), in the order that `shaders.py` documents.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...avatar.embedding import FaceFrames
+from ...avatar.splats import Splats
+from ...capture.camera import Camera
+from ...errors import StgaError
+from ..layers import SceneLayer, random_percentage
+
+NEAR_M = 0.01
+"""Splats nearer to the camera than this are dropped, as by the rasterizer."""
+CLIP_PLANES = 6
+VIEW_TEXELS = 3 + CLIP_PLANES
+LAYER_TEXELS = 5
+MAX_INDEX = 1 << 24
+"""float32, in which the shader reads indices, holds whole numbers up to here exactly."""
+MAX_DEPTH_STEP = 1e-4
+"""Coarsest step of the sort's keys, as a share of the nearest splat's depth; where 16 bits are coarser, 32 are used."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera, and the part of its space in which splats are drawn.
+
+    far: meters; clip_planes (P, 4), P ≤ 6, in world space: a splat is drawn where plane · (center, 1) ≥ 0 for all.
+    """
+
+    camera: Camera
+    near: float = NEAR_M
+    far: float = np.inf
+    clip_planes: np.ndarray | None = None
+
+
+class StaticSplats:
+    """What does not change while layers show the same splats.
+
+    centers (N, 4): xyz and 1; face (N,) index into all layers' triangles. texels: name -> (M, 4) for the textures.
+    """
+
+    def __init__(self, layers: Sequence[SceneLayer]) -> None:
+        self.key = static_key(layers)
+        count = sum(len(layer.splats) for layer in layers)
+        self.centers = np.ones((count, 4), np.float32)
+        self.face = np.empty(count, np.intp)
+        axes = np.empty((count, 3, 4), np.float32)
+        colors, self.rows = [], np.empty((len(layers), 4), np.float32)
+        begin = first_face = first_color = 0
+        for index, layer in enumerate(layers):
+            splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
+            self.centers[rows, :3] = splats.xyz
+            self.face[rows] = splats.face + first_face
+            axes[rows] = _axes(splats, index)
+            coefficients = np.concatenate([splats.sh, splats.strain_color], axis=1)
+            colors.append(np.pad(coefficients, ((0, 0), (0, 0), (0, 1))).reshape(-1, 4))
+            self.rows[index] = first_color, begin, coefficients.shape[1], splats.sh_degree
+            begin, first_face = rows.stop, first_face + len(layer.frames.origin)
+            first_color += len(colors[-1])
+        if max(first_color, 3 * count, 4 * first_face) > MAX_INDEX:
+            raise StgaError(f"{count} splats with their colors are too many to display as trained; choose Points")
+        centers = self.centers.copy()
+        centers[:, 3] = self.face
+        self.texels = {"centers": centers, "axes": axes.reshape(-1, 4), "colors": np.concatenate(colors)}
+
+    def __len__(self) -> int:
+        return len(self.face)
+
+
+def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
+    """What a `StaticSplats` of these layers was made of; valid while it keeps the layers' splats alive."""
+    return tuple((id(layer.splats), len(layer.frames.origin)) for layer in layers)
+
+
+def _axes(splats: Splats, layer: int) -> np.ndarray:
+    """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a random value in
+    0…100 for the display's percentage, and the layer's index."""
+    w, x, y, z = _unit(splats.rotation).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    axes = np.empty((len(splats), 3, 4), np.float32)
+    deviation = np.exp(splats.log_scale.astype(np.float64))
+    for axis in range(3):
+        for row in range(3):
+            axes[:, axis, row] = rows[row][axis] * deviation[:, axis]
+    with np.errstate(over="ignore"):
+        axes[:, 0, 3] = 1 / (1 + np.exp(-splats.opacity.astype(np.float64)))
+    axes[:, 1, 3] = random_percentage(len(splats))
+    axes[:, 2, 3] = layer
+    return axes
+
+
+def _unit(rotation: np.ndarray) -> np.ndarray:
+    """(N, 4) float64 unit quaternions; zero counts as the identity."""
+    rotation = rotation.astype(np.float64)
+    length = np.linalg.norm(rotation, axis=1, keepdims=True)
+    return np.where(length > 0, rotation / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+
+
+def frame_block(frames: FaceFrames) -> np.ndarray:
+    """(3, 4·F) float64: the rows of the triangles' affine maps, [scale · rotation | origin]."""
+    block = np.empty((3, len(frames.origin), 4))
+    np.multiply(frames.rotation.transpose(1, 0, 2), frames.scale[None, :, None], out=block[..., :3])
+    block[..., 3] = frames.origin.T
+    return block.reshape(3, -1)
+
+
+@dataclass(frozen=True)
+class PosedFrames:
+    """The triangles of all layers as a camera sees them.
+
+    texels (4, F, 4) float32: three rows of the map to camera space, then strain and whether the triangle is frozen.
+    depth_rows (F, 4) float32: the third row, less `base` meters: far from the camera, float32 would round away the
+    differences by which splats are sorted.
+    """
+
+    texels: np.ndarray
+    depth_rows: np.ndarray
+    base: float
+
+
+def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], view: View) -> PosedFrames:
+    """Compose `frame_block` of each layer with its object and the camera, in float64."""
+    count = sum(len(layer.frames.origin) for layer in layers)
+    texels, depth_rows, base = np.zeros((4, count, 4), np.float32), np.empty((count, 4), np.float32), None
+    begin = 0
+    for layer, block in zip(layers, blocks, strict=True):
+        to_camera = view.camera.world_to_camera @ layer.to_world
+        end = begin + len(layer.frames.origin)
+        part = (to_camera[:3, :3] @ block).reshape(3, -1, 4)
+        part[..., 3] += to_camera[:3, 3:]
+        texels[:3, begin:end] = part
+        base = float(part[2, 0, 3]) if base is None else base
+        part[2, :, 3] -= base
+        depth_rows[begin:end] = part[2]
+        texels[3, begin:end, : layer.frames.strain.shape[1]] = layer.frames.strain
+        texels[3, begin:end, 3] = 0 if layer.frozen is None else layer.frozen
+        begin = end
+    return PosedFrames(texels, depth_rows, base or 0.0)
+
+
+def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.ndarray:
+    """Indices (M,) float32 of the splats within the view's near and far ends, farthest first."""
+    depth = np.einsum("ij,ij->i", np.take(frames.depth_rows, static.face, axis=0), static.centers)
+    inside = np.flatnonzero((depth >= view.near - frames.base) & (depth <= view.far - frames.base))
+    if not len(inside):
+        return np.empty(0, np.float32)
+    if len(inside) < len(depth):
+        depth = depth[inside]
+    nearest, farthest = float(depth.min()), float(depth.max())
+    if farthest - nearest <= 65535 * MAX_DEPTH_STEP * (nearest + frames.base):
+        key = ((farthest - depth) * (65535 / max(farthest - nearest, 1e-30))).astype(np.uint16)
+        order = np.argsort(key, kind="stable")  # of 16 bits: a radix sort
+    else:
+        key = ((farthest - depth.astype(np.float64)) * ((2**32 - 1) / (farthest - nearest))).astype(np.uint32)
+        order = np.argsort(key.astype(np.uint16), kind="stable")
+        order = order[np.argsort((key >> 16).astype(np.uint16)[order], kind="stable")]
+    return np.asarray(inside[order], np.float32)
+
+
+def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.ndarray:
+    """(VIEW_TEXELS + LAYER_TEXELS · L, 4) float32: what the shader knows of the view and of each layer."""
+    camera = view.camera
+    texels = np.zeros((VIEW_TEXELS + LAYER_TEXELS * len(layers), 4), np.float32)
+    planes = np.zeros((0, 4)) if view.clip_planes is None else view.clip_planes @ np.linalg.inv(camera.world_to_camera)
+    texels[0] = camera.fl_x, camera.fl_y, camera.cx, camera.cy
+    texels[1] = camera.width, camera.height, len(planes), 0
+    texels[3 : 3 + len(planes)] = planes
+    for layer, first, row in zip(layers, static.rows, texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4), strict=True):
+        settings = layer.settings
+        row[0] = first
+        if not settings.view_dependent:
+            row[0, 3] = 0
+        strained = bool(layer.frames.strain.shape[1] and layer.splats.strain_color.shape[1])
+        row[1] = layer.antialiased, strained, settings.size, settings.opacity_threshold
+        row[2:5, :3] = direction_matrix(camera.world_to_camera @ layer.to_world)
+        row[2:5, 3] = settings.percentage, settings.show_selection, settings.selected_only
+    return texels
+
+
+def direction_matrix(to_camera: np.ndarray) -> np.ndarray:
+    """(3, 3): from directions in camera space to the space that splats were trained in.
+
+    The rotation in the map `to_camera`; its scale and reflection do not change a direction.
+    """
+    u, _, v = np.linalg.svd(to_camera[:3, :3])
+    return np.asarray((u @ v).T)

@@ -1,0 +1,139 @@
+"""Draws layers of splats with Blender's `gpu` module: off-screen, into a viewport, or to an image in memory.
+
+Needs a GPU context: a viewport's drawing, or a render engine with `bl_use_gpu_context`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gpu
+import numpy as np
+from gpu.types import Buffer, GPUBatch, GPUFrameBuffer, GPUTexture, GPUVertBuf, GPUVertFormat
+
+from ...avatar.embedding import FaceFrames
+from ...raster.posed_splats import ComposedImage
+from ..layers import SceneLayer
+from . import packing
+from .packing import StaticSplats, View
+from .shaders import SPLAT_TEXTURES, TEXTURE_WIDTH, composite_shader, splat_shader
+
+CLEAR = (0.0, 0.0, 0.0, 0.0)
+EXACT, COMPACT = "RGBA32F", "RGBA16F"
+"""Formats of the color target. The depth target is always exact."""
+
+
+class SplatRenderer:
+    """Shaders, the textures of the layers drawn last, and the targets they were drawn to."""
+
+    def __init__(self, color_format: str = EXACT) -> None:
+        self._shader, self._composite, self._corners = splat_shader(), composite_shader(), _corners()
+        self._color_format = color_format
+        self._static: StaticSplats | None = None
+        self._static_textures: dict[str, Any] = {}
+        self._layers: Sequence[SceneLayer] = ()
+        self._blocks: dict[int, tuple[FaceFrames, np.ndarray]] = {}
+        self._size = (0, 0)
+        self._color = self._depth = self._target = None
+
+    def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
+        """Draw layers, sorted together, to this renderer's own targets."""
+        self._resize(view.camera.width, view.camera.height)
+        with self._target.bind():  # type: ignore[attr-defined]
+            gpu.state.active_framebuffer_get().clear(color=CLEAR)
+            if layers:
+                self._draw_splats(layers, view)
+
+    def read(self, with_depth: bool = False) -> ComposedImage:
+        """What was drawn last, in memory."""
+        color, depth = (_pixels(texture)[::-1] for texture in (self._color, self._depth))
+        alpha = np.ascontiguousarray(color[..., 3])
+        rgb = np.ascontiguousarray(color[..., :3].transpose(2, 0, 1))
+        return ComposedImage(rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None)
+
+    def composite(
+        self, corner: tuple[int, int], to_depth: tuple[float, ...], behind: tuple[float, ...] | None = None
+    ) -> None:
+        """Put what was drawn last into the active framebuffer, which blends linearly and has the scene's depth.
+
+        corner: pixel of the framebuffer for the image's bottom left. to_depth (a, b, c, d): depth in −1…1 is
+        (a + b·z) / (c + d·z) at z meters along the view axis. behind: sRGB expected behind the splats, if known.
+        """
+        gpu.state.blend_set("ALPHA_PREMULT")
+        gpu.state.depth_mask_set(False)
+        gpu.state.depth_test_set("LESS_EQUAL")
+        shader = self._composite
+        shader.bind()
+        shader.uniform_sampler("color_image", self._color)
+        shader.uniform_sampler("depth_image", self._depth)
+        shader.uniform_float("corner_px", (*corner, 0.0, 0.0))
+        shader.uniform_float("to_depth", to_depth)
+        shader.uniform_float("behind", CLEAR if behind is None else (*behind, 1.0))
+        self._corners.draw(shader)
+        gpu.state.depth_test_set("NONE")
+        gpu.state.blend_set("NONE")
+
+    def _update_static(self, layers: Sequence[SceneLayer]) -> StaticSplats:
+        if self._static is None or self._static.key != packing.static_key(layers):
+            self._static = StaticSplats(layers)
+            self._static_textures = {name: _texture(texels) for name, texels in self._static.texels.items()}
+        self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
+        return self._static
+
+    def _frame_blocks(self, layers: Sequence[SceneLayer]) -> list[np.ndarray]:
+        """`packing.frame_block` of each layer, computed again only for frames that are new."""
+        known = self._blocks
+        self._blocks = {
+            id(layer.frames): known.get(id(layer.frames)) or (layer.frames, packing.frame_block(layer.frames))
+            for layer in layers
+        }
+        return [self._blocks[id(layer.frames)][1] for layer in layers]
+
+    def _resize(self, width: int, height: int) -> None:
+        if self._size != (width, height):
+            self._size = width, height
+            self._color = GPUTexture((width, height), format=self._color_format)
+            self._depth = GPUTexture((width, height), format=EXACT)
+            self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
+
+    def _draw_splats(self, layers: Sequence[SceneLayer], view: View) -> None:
+        static = self._update_static(layers)
+        frames = packing.posed_frames(layers, self._frame_blocks(layers), view)
+        order = packing.drawing_order(static, frames, view)
+        if not len(order):
+            return
+        textures = self._static_textures | {
+            "orders": _texture(order[:, None], "R32F"), "frames": _texture(frames.texels.reshape(-1, 4)),
+            "table": _texture(packing.table(static, layers, view)),
+        }  # fmt: skip
+        gpu.state.depth_test_set("NONE")
+        gpu.state.depth_mask_set(False)
+        gpu.state.blend_set("ALPHA_PREMULT")
+        shader = self._shader
+        shader.bind()
+        for name in SPLAT_TEXTURES:
+            shader.uniform_sampler(name, textures[name])
+        shader.uniform_int("faces", frames.texels.shape[1])
+        self._corners.draw_instanced(shader, instance_start=0, instance_count=len(order))
+        gpu.state.blend_set("NONE")
+
+
+def _corners() -> Any:
+    layout = GPUVertFormat()
+    layout.attr_add(id="corner", comp_type="F32", len=2, fetch_mode="FLOAT")
+    vertices = GPUVertBuf(len=4, format=layout)
+    vertices.attr_fill(id="corner", data=np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32))
+    return GPUBatch(type="TRI_STRIP", buf=vertices)
+
+
+def _texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
+    """Texels (M, C) as a texture TEXTURE_WIDTH wide, its last row filled with zeros."""
+    rows = max(1, -(-len(texels) // TEXTURE_WIDTH))
+    padded = np.zeros((rows * TEXTURE_WIDTH, texels.shape[1]), np.float32)
+    padded[: len(texels)] = texels
+    pixels = Buffer("FLOAT", padded.size, padded.reshape(-1))
+    return GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
+
+
+def _pixels(texture: Any) -> np.ndarray:
+    """(H, W, 4) float32, bottom row first."""
+    return np.asarray(texture.read(), np.float32).reshape(texture.height, texture.width, 4)

@@ -1,0 +1,225 @@
+"""GLSL of the splats, of their composition with a viewport, and the shaders made of it.
+
+Textures of `packing.py`, each 2048 texels wide and read by texel index:
+    orders   per instance: index of the splat (one channel)
+    centers  per splat: xyz in its triangle's frame, index of the triangle
+    axes     per splat: three axes times standard deviations; beside them opacity, random percentage, layer
+    colors   per splat: spherical harmonics, then strain colors
+    frames   three rows of the triangles' maps to camera space (all triangles' first rows, then second, …), then strain
+    table    the view: focal lengths and principal point; width, height, number of clip planes; –; 6 clip planes;
+             per layer: first color, first splat, colors per splat, degree; antialiased, strained, size, opacity
+             threshold; three rows of the matrix to directions, with percentage, show selection, selected only
+"""
+
+from typing import Any
+
+import gpu
+from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
+
+from ..compat import allow_depth_write
+from ..layers import FROZEN_COLOR_SRGB
+from .packing import CLIP_PLANES, LAYER_TEXELS, VIEW_TEXELS
+
+TEXTURE_WIDTH = 2048
+SPLAT_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
+
+_DEFINES = f"""
+#define WIDTH {TEXTURE_WIDTH}
+#define VIEW_TEXELS {VIEW_TEXELS}
+#define LAYER_TEXELS {LAYER_TEXELS}
+#define CLIP_PLANES {CLIP_PLANES}
+#define FROZEN_COLOR vec3({", ".join(f"{channel:.6f}" for channel in FROZEN_COLOR_SRGB)})
+"""
+
+_SPLAT_VERTEX = """
+const float LOW_PASS_PX2 = 0.3;
+const float MIN_ALPHA = 1.0 / 255.0;
+
+ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
+
+vec3 spherical_harmonics(int first, int degree, vec3 d)
+{
+  vec3 color = vec3(0.5) + 0.28209479177387814 * texelFetch(colors, at(first), 0).rgb;
+  if (degree > 0) {
+    vec3 b = 0.4886025119029199 * vec3(-d.y, d.z, -d.x);
+    color += b.x * texelFetch(colors, at(first + 1), 0).rgb + b.y * texelFetch(colors, at(first + 2), 0).rgb
+           + b.z * texelFetch(colors, at(first + 3), 0).rgb;
+  }
+  float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;
+  if (degree > 1) {
+    float m = 1.0925484305920792;
+    color += m * d.x * d.y * texelFetch(colors, at(first + 4), 0).rgb
+           - m * d.y * d.z * texelFetch(colors, at(first + 5), 0).rgb
+           + 0.31539156525252005 * (2.0 * zz - xx - yy) * texelFetch(colors, at(first + 6), 0).rgb
+           - m * d.x * d.z * texelFetch(colors, at(first + 7), 0).rgb
+           + 0.5 * m * (xx - yy) * texelFetch(colors, at(first + 8), 0).rgb;
+  }
+  if (degree > 2) {
+    float outer = 0.5900435899266435, inner = 0.4570457994644658;
+    color += -outer * d.y * (3.0 * xx - yy) * texelFetch(colors, at(first + 9), 0).rgb
+           + 2.890611442640554 * d.x * d.y * d.z * texelFetch(colors, at(first + 10), 0).rgb
+           - inner * d.y * (4.0 * zz - xx - yy) * texelFetch(colors, at(first + 11), 0).rgb
+           + 0.3731763325901154 * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * texelFetch(colors, at(first + 12), 0).rgb
+           - inner * d.x * (4.0 * zz - xx - yy) * texelFetch(colors, at(first + 13), 0).rgb
+           + 1.445305721320277 * d.z * (xx - yy) * texelFetch(colors, at(first + 14), 0).rgb
+           - outer * d.x * (xx - 3.0 * yy) * texelFetch(colors, at(first + 15), 0).rgb;
+  }
+  return color;
+}
+
+void main()
+{
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* outside: all four corners in one point */
+  offset = vec2(0.0);
+  shade = vec4(0.0);
+  depth = 0.0;
+  int splat = int(texelFetch(orders, at(gl_InstanceID), 0).r);
+  vec4 center = texelFetch(centers, at(splat), 0);
+  vec4 axis0 = texelFetch(axes, at(3 * splat), 0);
+  vec4 axis1 = texelFetch(axes, at(3 * splat + 1), 0);
+  vec4 axis2 = texelFetch(axes, at(3 * splat + 2), 0);
+  int face = int(center.w), row = VIEW_TEXELS + LAYER_TEXELS * int(axis2.w);
+  vec4 color_rows = texelFetch(table, at(row), 0), display = texelFetch(table, at(row + 1), 0);
+  vec4 turn0 = texelFetch(table, at(row + 2), 0), turn1 = texelFetch(table, at(row + 3), 0);
+  vec4 turn2 = texelFetch(table, at(row + 4), 0), strain = texelFetch(frames, at(3 * faces + face), 0);
+  float opacity = axis0.w;
+  bool frozen = strain.w > 0.5;
+  if (opacity < display.w || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
+    return;
+  }
+  vec4 r0 = texelFetch(frames, at(face), 0), r1 = texelFetch(frames, at(faces + face), 0);
+  vec4 r2 = texelFetch(frames, at(2 * faces + face), 0);
+  vec4 local = vec4(center.xyz, 1.0);
+  vec3 p = vec3(dot(r0, local), dot(r1, local), dot(r2, local));
+  vec4 lens = texelFetch(table, at(0), 0), image = texelFetch(table, at(1), 0);
+  for (int plane = 0; plane < CLIP_PLANES; plane++) {
+    if (plane < int(image.z) && dot(texelFetch(table, at(3 + plane), 0), vec4(p, 1.0)) < 0.0) {
+      return;
+    }
+  }
+  /* Linearized projection; slopes far outside the image are clamped (as the rasterizer's). */
+  vec2 focal = lens.xy, principal = lens.zw, margin = 0.15 * image.xy / focal;
+  vec2 slope = clamp(p.xy / p.z, -principal / focal - margin, (image.xy - principal) / focal + margin);
+  vec3 u = focal.x / p.z * (r0.xyz - slope.x * r2.xyz), v = focal.y / p.z * (r1.xyz - slope.y * r2.xyz);
+  vec3 a = display.z * vec3(dot(u, axis0.xyz), dot(u, axis1.xyz), dot(u, axis2.xyz));
+  vec3 b = display.z * vec3(dot(v, axis0.xyz), dot(v, axis1.xyz), dot(v, axis2.xyz));
+  float xx = dot(a, a) + LOW_PASS_PX2, xy = dot(a, b), yy = dot(b, b) + LOW_PASS_PX2;
+  vec3 minors = cross(a, b); /* the determinant without cancellation */
+  float sharp = dot(minors, minors), determinant = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2);
+  if (display.x > 0.5) {
+    opacity *= sqrt(sharp / determinant);
+  }
+  if (!(opacity >= MIN_ALPHA) || !(determinant < 1e30) || display.z <= 0.0) {
+    return;
+  }
+  vec3 toward = normalize(p);
+  vec3 direction = vec3(dot(turn0.xyz, toward), dot(turn1.xyz, toward), dot(turn2.xyz, toward));
+  int first = int(color_rows.x) + (splat - int(color_rows.y)) * int(color_rows.z);
+  vec3 color = spherical_harmonics(first, int(color_rows.w), direction);
+  if (display.y > 0.5) {
+    int last = first + int(color_rows.z); /* the strain colors are the last three */
+    color += strain.x * texelFetch(colors, at(last - 3), 0).rgb + strain.y * texelFetch(colors, at(last - 2), 0).rgb
+           + strain.z * texelFetch(colors, at(last - 1), 0).rgb;
+  }
+  if (!(abs(color.r) + abs(color.g) + abs(color.b) < 1e30)) {
+    return;
+  }
+  if (frozen && turn1.w > 0.5) {
+    color = FROZEN_COLOR;
+  }
+  /* A rectangle along the ellipse's axes, up to where alpha falls below MIN_ALPHA. */
+  float mean = 0.5 * (xx + yy), spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.0));
+  float large = mean + spread, small = max(determinant / large, 1e-9);
+  vec2 major = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
+  float reach = sqrt(2.0 * log(opacity / MIN_ALPHA)) * 1.001;
+  offset = reach * corner;
+  vec2 pixel = focal * p.xy / p.z + principal
+             + offset.x * sqrt(large) * major + offset.y * sqrt(small) * vec2(-major.y, major.x);
+  shade = vec4(max(color, vec3(0.0)), opacity);
+  depth = p.z;
+  gl_Position = vec4(2.0 * pixel.x / image.x - 1.0, 1.0 - 2.0 * pixel.y / image.y, 0.0, 1.0);
+}
+"""
+
+_SPLAT_FRAGMENT = """
+void main()
+{
+  float alpha = min(0.999, shade.a * exp(-0.5 * dot(offset, offset)));
+  if (alpha < 1.0 / 255.0) {
+    discard;
+  }
+  color_out = vec4(shade.rgb * alpha, alpha);
+  depth_out = vec4(depth * alpha, 0.0, 0.0, alpha);
+}
+"""
+
+_COMPOSITE_VERTEX = """
+void main()
+{
+  gl_Position = vec4(corner, 0.0, 1.0);
+}
+"""
+
+_COMPOSITE_FRAGMENT = """
+vec3 to_linear(vec3 srgb)
+{
+  vec3 curve = pow((max(srgb, vec3(0.04045)) + 0.055) / 1.055, vec3(2.4));
+  return mix(curve, srgb / 12.92, vec3(lessThanEqual(srgb, vec3(0.04045))));
+}
+
+void main()
+{
+  ivec2 texel = ivec2(gl_FragCoord.xy) - ivec2(corner_px.xy);
+  vec4 splats = texelFetch(color_image, texel, 0), distances = texelFetch(depth_image, texel, 0);
+  if (splats.a < 1.0 / 255.0) {
+    discard;
+  }
+  /* From z along the view axis to the depth of the projection: (x + y·z) / (z + w·z), by its matrix. */
+  float z = distances.r / max(distances.a, 1e-9);
+  gl_FragDepth = clamp(0.5 + 0.5 * (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z), 0.0, 1.0);
+  if (behind.a < 0.5) {
+    color_final = vec4(to_linear(splats.rgb / splats.a) * splats.a, splats.a);
+    return;
+  }
+  /* Splats are blended in sRGB, the viewport blends linear: exact where `behind` is what lies behind. */
+  vec3 goal = to_linear(clamp(splats.rgb + (1.0 - splats.a) * behind.rgb, 0.0, 1.0)), back = to_linear(behind.rgb);
+  vec3 most = min(vec3(1.0 - splats.a), goal / max(back, vec3(1e-6)));
+  float through = min(most.r, min(most.g, most.b));
+  color_final = vec4(goal - through * back, 1.0 - through);
+}
+"""
+
+
+def splat_shader() -> Any:
+    """Draws instances of a strip of four corners; two color targets: sRGB premultiplied, and (depth · alpha, alpha)."""
+    info = GPUShaderCreateInfo()
+    info.typedef_source(_DEFINES)
+    info.vertex_in(0, "VEC2", "corner")
+    passed = GPUStageInterfaceInfo("stga_splat")
+    passed.smooth("VEC2", "offset")
+    passed.flat("VEC4", "shade")
+    passed.flat("FLOAT", "depth")
+    info.vertex_out(passed)
+    info.fragment_out(0, "VEC4", "color_out")
+    info.fragment_out(1, "VEC4", "depth_out")
+    for slot, name in enumerate(SPLAT_TEXTURES):
+        info.sampler(slot, "FLOAT_2D", name)
+    info.push_constant("INT", "faces")
+    info.vertex_source(_SPLAT_VERTEX)
+    info.fragment_source(_SPLAT_FRAGMENT)
+    return gpu.shader.create_from_info(info)
+
+
+def composite_shader() -> Any:
+    """Puts the two targets of `splat_shader` into a viewport, with depth; outputs display-linear, premultiplied."""
+    info = GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC2", "corner")
+    info.fragment_out(0, "VEC4", "color_final")
+    allow_depth_write(info)
+    for slot, name in enumerate(("color_image", "depth_image")):
+        info.sampler(slot, "FLOAT_2D", name)
+    for name in ("corner_px", "to_depth", "behind"):
+        info.push_constant("VEC4", name)
+    info.vertex_source(_COMPOSITE_VERTEX)
+    info.fragment_source(_COMPOSITE_FRAGMENT)
+    return gpu.shader.create_from_info(info)

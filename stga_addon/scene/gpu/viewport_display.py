@@ -1,0 +1,203 @@
+"""GPU display: draws avatars as trained in every 3D viewport, in every shading mode, over what Blender has drawn.
+
+An object is drawn where its display mode is *As Trained*. Playback, posing and edits need no handler of their own: each
+redraw reads the evaluated head.
+"""
+
+import traceback
+from contextlib import suppress
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from bpy.app.handlers import persistent
+
+from ...errors import StgaError
+from .. import tags
+from ..compat import world_nodes
+from ..display import splat_nodes
+from ..display.colors import linear_to_srgb
+from ..display.display_modes import AS_TRAINED, POINTS
+from ..display.splat_object import display_mode, set_input
+from ..render.camera import viewport_camera
+from ..render.scene_splats import SplatCache, visible_layers
+from .packing import NEAR_M, View
+from .renderer import COMPACT, SplatRenderer
+
+ENGINE = "STGA_SPLATS"
+"""The render engine, which draws all splats in *Rendered* mode."""
+POINTS_INTERVAL_S = 1.0
+
+
+class GpuDisplay:
+    """What the display keeps between redraws of all viewports.
+
+    problem  one sentence: why nothing, or something else, is shown; "" where all is well
+    failed   whether this device cannot draw; the display is off then, and points are shown
+    """
+
+    def __init__(self) -> None:
+        self._handler: Any = None
+        self._renderer: SplatRenderer | None = None
+        self._cache = SplatCache()
+        self.problem, self.failed = "", False
+
+    def start(self) -> None:
+        """Draw from now on; without a window there is nothing to draw in."""
+        if self._handler is None and not bpy.app.background:
+            self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_VIEW")
+
+    def stop(self) -> None:
+        """Remove the handler, and free textures and shaders."""
+        if self._handler is not None:
+            bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
+            self._handler = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Free what belongs to the open file."""
+        self._renderer, self._cache = None, SplatCache()
+        self.problem = self.problem if self.failed else ""
+
+    def _draw(self) -> None:
+        try:
+            self._draw_region(bpy.context)
+            self.problem = ""
+        except StgaError as error:
+            self.problem = str(error)
+        except Exception as error:  # raised again at each redraw otherwise: reported once, then off
+            traceback.print_exc()
+            self._fail(f"Splats cannot be drawn as trained here ({type(error).__name__}: {error}); points are shown")
+
+    def _draw_region(self, context: Any) -> None:
+        space, depsgraph = context.space_data, context.evaluated_depsgraph_get()
+        if is_drawn_by_engine(context):
+            return
+        everything = is_engine_view(context)
+        layers = visible_layers(
+            depsgraph, self._cache, space, lambda shown: everything or display_mode(shown) == AS_TRAINED
+        )
+        if not layers:
+            if not any(candidate.get(tags.KIND) == tags.SPLATS for candidate in bpy.data.objects):
+                self._renderer = None
+            return
+        if self._renderer is None:
+            self._renderer = SplatRenderer(COMPACT)
+        x, y, width, height = gpu.state.viewport_get()
+        view, to_depth = region_view(context.region_data, width, height)
+        self._renderer.draw(layers, view)
+        self._renderer.composite((x, y), to_depth, expected_background(context))
+
+    def _fail(self, problem: str) -> None:
+        self.stop()
+        self.problem, self.failed = problem, True
+        print(f"STGA: {problem}")
+        bpy.app.timers.register(show_points, persistent=True)  # while drawing, Blender's data cannot be changed
+
+
+display = GpuDisplay()
+
+
+def show_points() -> float | None:
+    """Display as points what is to be displayed as trained, from a timer: also what is added or opened later."""
+    for candidate in bpy.data.objects:
+        if candidate.get(tags.KIND) == tags.SPLATS and candidate.library is None:
+            with suppress(StgaError):
+                if display_mode(candidate) == AS_TRAINED:
+                    set_input(candidate, splat_nodes.DISPLAY, POINTS)
+    return POINTS_INTERVAL_S if display.failed else None
+
+
+def is_engine_view(context: Any) -> bool:
+    """Whether the viewport is the render engine's, *Rendered* mode of STGA Splats."""
+    return context.space_data.shading.type == "RENDERED" and context.scene.render.engine == ENGINE
+
+
+def is_drawn_by_engine(context: Any) -> bool:
+    """Whether the render engine draws the splats itself, below overlays and bones.
+
+    It draws before the view transform. Where that would change colors, the display draws them, after it.
+    """
+    return is_engine_view(context) and keeps_colors(context.scene)
+
+
+def keeps_colors(scene: Any) -> bool:
+    """Whether the scene's color management shows sRGB colors as they are."""
+    settings = scene.view_settings
+    plain = settings.view_transform == "Standard" and settings.look == "None" and not settings.use_curve_mapping
+    return bool(plain and settings.exposure == 0 and settings.gamma == 1)
+
+
+def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float, ...]]:
+    """The view of a RegionView3D, and how `SplatRenderer.composite` gets from its z to the depth buffer's."""
+    camera = viewport_camera(region, width, height)
+    matrix = np.array(region.window_matrix, np.float64)
+    # A view that is not in perspective is drawn from this far behind Blender's camera.
+    back = float((camera.world_to_camera @ np.linalg.inv(np.array(region.view_matrix, np.float64))[:, 3])[2])
+    a, b, c, d = matrix[2, 3], -matrix[2, 2], matrix[3, 3], -matrix[3, 2]
+    near, far = (back + (a - c * end) / (d * end - b) for end in (-1.0, 1.0))
+    planes = np.array(region.clip_planes, np.float64) if region.use_clip_planes else None
+    to_depth = (a - b * back, b, c - d * back, d)
+    return View(camera, max(NEAR_M, near), far if far > near else np.inf, planes), to_depth
+
+
+def expected_background(context: Any) -> tuple[float, ...] | None:
+    """sRGB color that the viewport shows behind everything, None where that is not one color.
+
+    Splats were trained to be blended in sRGB, and a viewport blends linearly: their soft edges are right over what is
+    known to be behind them.
+    """
+    shading, theme = context.space_data.shading, context.preferences.themes[0].view_3d.space.gradients
+    if shading.type in ("SOLID", "WIREFRAME"):
+        source = shading.background_type
+    else:
+        uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
+        source = "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
+    if source == "THEME":
+        return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient)
+    if source == "VIEWPORT":
+        return _srgb(shading.background_color)
+    if source == "WORLD":
+        return _srgb(context.scene.world.color) if context.scene.world else (0.0, 0.0, 0.0)
+    if source == "SCENE" and keeps_colors(context.scene) and not context.scene.render.film_transparent:
+        color = world_color(context.scene)
+        return None if color is None else _srgb(color)
+    return None
+
+
+def world_color(scene: Any) -> tuple[float, ...] | None:
+    """Scene-linear color of the scene's world, None where it is not one color; black without a world."""
+    world = scene.world
+    if world is None:
+        return 0.0, 0.0, 0.0
+    tree = world_nodes(world)
+    output = tree.get_output_node("ALL") if tree else None
+    links = output.inputs["Surface"].links if output else ()
+    if not links:
+        return tuple(world.color)
+    if links[0].from_node.type == "BACKGROUND":
+        color, strength = (links[0].from_node.inputs[name] for name in ("Color", "Strength"))
+        if not color.is_linked and not strength.is_linked:
+            return tuple(channel * strength.default_value for channel in color.default_value[:3])
+    return None
+
+
+def _srgb(linear: Any) -> tuple[float, ...]:
+    return tuple(linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist())
+
+
+@persistent  # type: ignore[untyped-decorator]
+def _forget_file(*_: Any) -> None:
+    display.forget()
+
+
+def register() -> None:
+    bpy.app.handlers.load_pre.append(_forget_file)
+    display.start()
+
+
+def unregister() -> None:
+    bpy.app.handlers.load_pre.remove(_forget_file)
+    display.failed = False
+    display.stop()

@@ -1,0 +1,31 @@
+"""A GPU context in the module bpy: Blender gives one to render engines, also without a window."""
+
+from collections.abc import Callable
+
+import bpy
+
+
+def run_with_gpu(work: Callable[[], None]) -> None:
+    """Call `work` while a render engine with a GPU context renders; raises what it raised."""
+    errors: list[BaseException] = []
+
+    class Engine(bpy.types.RenderEngine):
+        bl_idname, bl_label, bl_use_gpu_context = "STGA_TEST_GPU", "Test", True
+
+        def render(self, depsgraph: object) -> None:
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+
+    scene = bpy.context.scene
+    before = scene.render.engine
+    bpy.utils.register_class(Engine)
+    try:
+        scene.render.engine = Engine.bl_idname
+        bpy.ops.render.render()
+    finally:
+        scene.render.engine = before
+        bpy.utils.unregister_class(Engine)
+    if errors:
+        raise errors[0]

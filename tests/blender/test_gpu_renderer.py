@@ -1,0 +1,136 @@
+"""The picture of the GPU renderer against that of the CPU rasterizer, in the module bpy."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+import torch
+from capture.factory import ball
+
+from stga_addon.avatar.embedding import WORLD, to_world
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.splats import Splats, no_strain_color
+from stga_addon.capture.camera import Camera, look_at
+from stga_addon.raster import reference
+from stga_addon.raster.cpu.compose import compose
+from stga_addon.raster.posed_splats import ComposedImage
+from stga_addon.scene.gpu.packing import View
+from stga_addon.scene.gpu.renderer import SplatRenderer
+from stga_addon.scene.layers import DisplaySettings, SceneLayer
+
+from .gpu_context import run_with_gpu
+
+MIN_PSNR_DB = 60.0
+TURNED = np.array([[0.6, -0.8, 0, 0.02], [0.8, 0.6, 0, -0.01], [0, 0, 1, 0.03], [0, 0, 0, 1]]) @ np.diag(
+    [1.3, 0.8, 1, 1]
+)
+
+
+def avatar(degree: int, strain: bool = False) -> Avatar:
+    """Splats of every size, opacity and color on a ball."""
+    vertices, faces = ball()
+    rng = np.random.default_rng(degree)
+    splats = lattice_splats(vertices, faces := faces.astype(np.int32), 3, sh_degree=degree)
+    count = len(splats)
+    splats = replace(
+        splats,
+        xyz=splats.xyz + rng.normal(0, 1e-3, (count, 3)).astype(np.float32),
+        rotation=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scale=rng.normal(-6, 0.6, (count, 3)).astype(np.float32),
+        opacity=rng.normal(0, 2, count).astype(np.float32),
+        sh=rng.normal(0, 0.3, splats.sh.shape).astype(np.float32),
+        strain_color=rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32) if strain else no_strain_color(count),
+    )
+    return Avatar(splats, "stga", vertices.astype(np.float32), faces)
+
+
+def layer(of: Avatar, pose: np.ndarray | None = None, antialiased: bool = False, **more: Any) -> SceneLayer:
+    mesh = of.neutral * [1.1, 0.9, 1.05]
+    return SceneLayer(of.splats, of.frames(mesh), np.eye(4) if pose is None else pose, antialiased, **more)
+
+
+def unembedded(of: Avatar) -> SceneLayer:
+    world: Splats = to_world(of.splats, of.frames(of.neutral))
+    return SceneLayer(world, WORLD, TURNED)
+
+
+def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
+    size = float(np.ptp(avatar(0).neutral))
+    near = look_at((0.3 * size, 0.2 * size, 1.5 * size), (0, 0, 0), 160, 200, 220)
+    far = look_at((0, 100 * size, 1500 * size), (0, 0, 0), 60, 80, 90_000)
+    inside = look_at((0, 0, 0.3 * size), (0, 0, 0), 160, 200, 120)
+    display = DisplaySettings(0.7, 0.3, 60.0, False, True, False)
+    frozen = np.arange(len(avatar(0).faces)) % 3 == 0
+    return {
+        "sh 0": ([layer(avatar(0))], near),
+        "sh 3": ([layer(avatar(3))], near),
+        "sh 1, strain": ([layer(avatar(1, strain=True))], near),
+        "antialiased": ([layer(avatar(0), antialiased=True)], near),
+        "rotated and scaled": ([layer(avatar(3), TURNED)], near),
+        "orthographic": ([layer(avatar(3))], far),
+        "inside": ([layer(avatar(2))], inside),
+        "two and world": ([layer(avatar(3)), layer(avatar(0, True), TURNED), unembedded(avatar(2))], near),
+        "display settings": ([layer(avatar(2, True), settings=display, frozen=frozen)], near),
+        "selected only": ([layer(avatar(0), settings=DisplaySettings(selected_only=True), frozen=frozen)], near),
+    }  # fmt: skip
+
+
+def render(layers: list[SceneLayer], camera: Camera, exact: bool) -> ComposedImage:
+    """By the CPU rasterizer, or for one untransformed layer by the reference in float64.
+
+    Far from the camera the former sorts by depths that float32 has rounded.
+    """
+    if not exact:
+        return compose([one.posed() for one in layers], camera, with_depth=True)
+    world = to_world(layers[0].splats, layers[0].frames)
+    values = (torch.as_tensor(getattr(world, name), dtype=torch.float64) for name in
+              ("xyz", "rotation", "log_scale", "opacity", "sh"))  # fmt: skip
+    rgb, alpha, depth = (image.numpy() for image in reference.render(*values, camera, world.sh_degree))
+    return ComposedImage(rgb, alpha, depth / np.maximum(alpha, 1e-12))
+
+
+@pytest.fixture
+def gpu(empty_scene: None) -> None:
+    """Skips where this machine gives Blender no GPU context, not even in software."""
+    try:
+        run_with_gpu(lambda: (SplatRenderer(), None)[1])
+    except SystemError as error:
+        pytest.skip(f"no GPU context: {error}")
+
+
+def psnr_db(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.mean((found - expected) ** 2), 1e-12)))
+
+
+def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact: bool) -> None:
+    expected = render(layers, camera, exact)
+    print(f"{psnr_db(found.rgb, expected.rgb):.1f} dB, alpha {psnr_db(found.alpha, expected.alpha):.1f} dB")
+    assert psnr_db(found.rgb, expected.rgb) >= MIN_PSNR_DB
+    assert psnr_db(found.alpha, expected.alpha) >= MIN_PSNR_DB
+    assert expected.alpha.mean() > 0.05, "nothing to compare"
+    opaque = expected.alpha > 0.5
+    assert expected.depth is not None
+    assert found.depth is not None
+    error = np.abs(found.depth - expected.depth)[opaque]
+    assert np.sqrt(np.mean(error**2)) < 1e-3 * np.ptp(expected.depth[opaque])
+
+
+@pytest.mark.usefixtures("gpu")
+@pytest.mark.parametrize("name", cases())
+def test_picture_equals_the_rasterizers(name: str) -> None:
+    """Catches another projection, order, color, filter, pose or setting than that of the CPU rasterizer."""
+    layers, camera = cases()[name]
+    found: list[ComposedImage] = []
+
+    def draw() -> None:
+        renderer = SplatRenderer()
+        renderer.draw(layers, View(camera))
+        found.append(renderer.read(with_depth=True))
+
+    run_with_gpu(draw)
+    check(found[0], layers, camera, exact=name == "orthographic")
