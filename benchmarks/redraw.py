@@ -59,27 +59,30 @@ def median_ms(work: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
+def measure(count: int, view: View, repeats: int) -> None:
+    avatar = head_avatar(count)
+    layer = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
+    static, block = StaticSplats([layer]), frame_block(layer.frames)
+
+    def moving_view() -> None:
+        drawing_order(static, posed_frames([layer], [block], view), view)
+        table(static, [layer], view)
+
+    def playback() -> None:
+        posed = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
+        drawing_order(static, posed_frames([posed], [frame_block(posed.frames)], view), view)
+        table(static, [posed], view)
+
+    for name, work in (("moving view", moving_view), ("playback", playback)):
+        print(f"{count} splats, {name}: {median_ms(work, repeats):.2f} ms")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=20)
-    repeats = parser.parse_args().repeats
     view = View(look_at((0.1, 0.1, 0.6), (0, 0, 0), 1600, 1000, 1500))
     for count in (65_536, 200_000):
-        avatar = head_avatar(count)
-        layer = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
-        static, block = StaticSplats([layer]), frame_block(layer.frames)
-
-        def moving_view() -> None:
-            drawing_order(static, posed_frames([layer], [block], view), view)
-            table(static, [layer], view)
-
-        def playback() -> None:
-            posed = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
-            drawing_order(static, posed_frames([posed], [frame_block(posed.frames)], view), view)
-            table(static, [posed], view)
-
-        for name, work in (("moving view", moving_view), ("playback", playback)):
-            print(f"{count} splats, {name}: {median_ms(work, repeats):.2f} ms")
+        measure(count, view, parser.parse_args().repeats)
 
 
 if __name__ == "__main__":

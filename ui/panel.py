@@ -10,13 +10,16 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display.display_modes import AS_TRAINED
 from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
-from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
+from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
+from ..stga_addon.scene.gpu import viewport_display
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
 from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
 from .sidebar import SidebarPanel
+from .text import draw_text
 from .train_panel import TrainPanel
 
 DISPLAY_INPUTS = (
@@ -72,6 +75,10 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
             if identifier is not None:
                 owner, prop = modifier_input_owner(modifier, identifier)
                 column.prop(owner, prop, text=name)
+        if viewport_display.display.problem:
+            draw_text(layout, context, viewport_display.display.problem, "ERROR")
+        if display_mode(splats) == AS_TRAINED:
+            return
         if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
             layout.label(text="Solid mode shows no splat colors", icon="INFO")
             preview = layout.operator("wm.context_set_enum", text="Use Material Preview")

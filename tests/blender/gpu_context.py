@@ -20,6 +20,9 @@ def run_with_gpu(work: Callable[[], None]) -> None:
 
     scene = bpy.context.scene
     before = scene.render.engine
+    if scene.camera is None:  # no engine is asked to render without one
+        scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+        scene.collection.objects.link(scene.camera)
     bpy.utils.register_class(Engine)
     try:
         scene.render.engine = Engine.bl_idname

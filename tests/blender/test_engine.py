@@ -128,6 +128,20 @@ def test_image_equals_render_avatar(convention, background, tmp_path):
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
 
 
+def test_rasterizer_renders_without_a_gpu(monkeypatch, tmp_path):
+    """Catches a machine without a GPU context that gets no image, or another one."""
+
+    def no_context() -> None:
+        raise SystemError("GPU functions are not available")
+
+    monkeypatch.setattr(engine, "SplatRenderer", no_context)
+    avatar = textured(avatar_of("stga"))
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(), shown)
+    expected = render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
+    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -41,7 +41,8 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
 def _as_trained(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
     """Nothing in a viewport, where `gpu.viewport_display` draws; points in images by other engines than STGA Splats."""
     points = nodes.group(MODES[POINTS], splats, visible, size)
-    return nodes.switch("GEOMETRY", nodes.out("GeometryNodeIsViewport"), points, None)
+    is_viewport = nodes.out("GeometryNodeIsViewport")
+    return nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": points}, input_type="GEOMETRY")
 
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:

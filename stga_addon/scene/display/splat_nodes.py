@@ -11,7 +11,7 @@ import bpy
 from .. import tags
 from ..layers import FROZEN_COLOR
 from .color_nodes import DEFORMED, SH_BANDS, SRGB_TO_LINEAR, STRAIN, constant_color, view_color, view_direction
-from .display_modes import MODES, POINTS, displayed
+from .display_modes import AS_TRAINED, MODES, displayed
 from .frame_nodes import FRAMES, PLACED
 from .materials import DISPLAY_COLOR
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
@@ -93,7 +93,7 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
     if embedded:
         add(HEAD, "Object", "The animated head whose triangles carry the splats")
         add(NEUTRAL, "Object", "The neutral mesh that the splats were trained on")
-    add(DISPLAY, "Menu", "How splats are displayed; the STGA Splats render engine renders them exactly")
+    add(DISPLAY, "Menu", "How splats are displayed in viewports, and in images by Cycles and EEVEE")
     add(SIZE, "Float", "Factor on the splats' size", default_value=1.0, min_value=0.0)
     fraction = {"default_value": 0.0, "min_value": 0.0, "max_value": 1.0}
     add(OPACITY_THRESHOLD, "Float", "Hide splats with a lower opacity", **fraction)
@@ -124,7 +124,7 @@ def _build(nodes: Nodes, convention: str | None, degree: int, strained: bool) ->
     splats = nodes.store(splats, DISPLAY_COLOR, color, "FLOAT_COLOR")
     nodes.finish("NodeGroupOutput", {"Geometry": displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE])})
     display = next(item for item in nodes.tree.interface.items_tree if item.name == DISPLAY)
-    display.default_value = POINTS  # the menu has items only once it is linked
+    display.default_value = AS_TRAINED  # the menu has items only once it is linked
 
 
 def _strain(nodes: Nodes, inputs: Any, head: Any) -> Any:

@@ -19,6 +19,7 @@ from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage, PosedSplats
 from ...raster.render_client import RenderClient, missing_packages
 from ..display.colors import linear_to_srgb, srgb_to_linear
+from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer
 from ..gpu.viewport_display import ENGINE, is_drawn_by_engine, region_view, world_color
@@ -64,7 +65,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_idname = ENGINE
     bl_label = "STGA Splats"
     bl_use_eevee_viewport = True  # Material Preview stays EEVEE's
-    bl_use_gpu_context = True
+    bl_use_gpu_context = has_gpu_context()
 
     # No __init__: its signature differs between Blender's versions. Created when a viewport is first drawn.
     _viewport: "Viewport | None" = None
@@ -95,7 +96,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             image = _client.compose([layer.posed() for layer in layers], camera, with_depth=True)
         result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
         passes = result.layers[0].passes
-        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, background(scene)))
+        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, _background(scene)))
         if "Depth" in passes:
             assert image.depth is not None
             covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
@@ -168,7 +169,7 @@ class Viewport:
         camera = viewport_camera(context.region_data, region.width, region.height)
         if not self.renderer.is_busy():
             _interpreter.update()
-        return self.renderer.request(RenderRequest(self._posed, camera, background(depsgraph.scene)))
+        return self.renderer.request(RenderRequest(self._posed, camera, _background(depsgraph.scene)))
 
     def _update_layers(self, context: Any, depsgraph: Any) -> bool:
         """Read the scene if it has changed; returns False, and sets `error`, where that fails."""
@@ -183,7 +184,7 @@ class Viewport:
         return True
 
     def _draw(self, context: Any, depsgraph: Any) -> None:
-        color = background(depsgraph.scene)
+        color = _background(depsgraph.scene)
         if color is not None:
             gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
         if not is_drawn_by_engine(context) or not self._update_layers(context, depsgraph) or not self._layers:
@@ -198,6 +199,8 @@ class Viewport:
 
 def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:
     """A final image drawn by the GPU; None where this Blender has no GPU context, or not the memory."""
+    if not has_gpu_context():
+        return None
     try:
         renderer = SplatRenderer()
         renderer.draw(layers, View(camera))
@@ -230,7 +233,7 @@ def combined(rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] |
     return image
 
 
-def background(scene: Any) -> tuple[float, ...] | None:
+def _background(scene: Any) -> tuple[float, ...] | None:
     """Scene-linear color behind the splats, None where the film is transparent.
 
     From the world's Background node if its inputs are constants, else its viewport color; black without a world.

@@ -1,0 +1,129 @@
+"""The GPU display as far as it needs no window: what it draws, from where, and that it leaves nothing behind."""
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.avatar.embedding import WORLD  # noqa: E402
+from stga_addon.capture.camera import look_at  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
+from stga_addon.scene.display.splat_attributes import avatar_attributes  # noqa: E402
+from stga_addon.scene.display.splat_object import (  # noqa: E402
+    display_mode,
+    set_input,
+    show_avatar,
+    show_world_splats,
+    update_splats,
+)
+from stga_addon.scene.gpu import viewport_display  # noqa: E402
+from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames  # noqa: E402
+from stga_addon.scene.gpu.viewport_display import GpuDisplay, region_view  # noqa: E402
+from stga_addon.scene.layers import DisplaySettings, SceneLayer  # noqa: E402
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+
+from .test_splat_object import animated_head, avatar_of, random_splats  # noqa: E402
+
+
+class Region:
+    """A RegionView3D one meter before the origin, looking along −z."""
+
+    def __init__(self, is_perspective: bool) -> None:
+        from mathutils import Matrix
+
+        near, far, f = 0.1, 10.0, 2.0
+        self.is_perspective, self.use_clip_planes = is_perspective, False
+        self.view_matrix = Matrix.Translation((0, 0, -1))
+        if is_perspective:
+            rows = [(0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)), (0, 0, -1, 0)]
+        else:
+            rows = [(0, 0, -2 / (far - near), -(far + near) / (far - near)), (0, 0, 0, 1)]
+        self.window_matrix = Matrix(((f, 0, 0, 0), (0, f, 0, 0), *rows))
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_depth_of_a_view(is_perspective):
+    """Catches splats that are hidden by, or hide, the wrong objects, and a clip range of another length."""
+    region = Region(is_perspective)
+    view, (a, b, c, d) = region_view(region, 300, 200)
+    point = np.array([0.05, 0.02, -0.4, 1.0])
+    clip = np.array(region.window_matrix) @ np.array(region.view_matrix) @ point
+    (pixel,), (z,) = view.camera.project(point[None, :3])
+    assert (a + b * z) / (c + d * z) == pytest.approx(clip[2] / clip[3], abs=1e-6)
+    expected = [(clip[0] / clip[3] + 1) * 150, (1 - clip[1] / clip[3]) * 100]
+    assert pixel == pytest.approx(expected, abs=0.2)
+    back = z - 1.4
+    assert (view.near, view.far) == pytest.approx((0.1 + back, 10 + back), rel=1e-5)
+
+
+@pytest.mark.parametrize("distance", [0.5, 1000.0])
+@pytest.mark.parametrize("spread", [0.2, 400.0])
+def test_drawing_order(distance, spread):
+    """Catches splats out of order, whatever their distance and depth, and those behind the camera."""
+    rng = np.random.default_rng(1)
+    splats = random_splats(1, 3000)
+    xyz = rng.normal(0, spread / 4, (3000, 3)).astype(np.float32)
+    object.__setattr__(splats, "xyz", xyz)
+    layer = SceneLayer(splats, WORLD, np.eye(4))
+    view = View(look_at((0, 0, distance), (0, 0, 0), 100, 100, 100))
+    static = StaticSplats([layer])
+    order = drawing_order(static, posed_frames([layer], [frame_block(WORLD)], view), view).astype(int)
+    depth = distance - xyz[:, 2].astype(np.float64)
+    assert sorted(order) == sorted(np.flatnonzero(depth >= view.near))
+    wrong = np.diff(depth[order]).max()
+    assert wrong <= max(1e-4 * depth[order].min(), 1e-6 * np.abs(depth).max())
+
+
+def test_display_settings_reach_the_layer():
+    """Catches a setting of the modifier that the GPU display does not follow."""
+    shown = show_world_splats(random_splats(1, 10), "scan")
+    assert display_mode(shown) == AS_TRAINED
+    for name, value in ((splat_nodes.SIZE, 0.5), (splat_nodes.OPACITY_THRESHOLD, 0.25), (splat_nodes.PERCENTAGE, 40.0)):
+        set_input(shown, name, value)
+    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    assert layer.settings == DisplaySettings(0.5, 0.25, 40.0)
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
+    assert display_mode(shown) == POINTS
+
+
+def test_cache_follows_new_splats_and_shapes():
+    """Catches splats of an earlier training state, and frames of an earlier pose."""
+    avatar = avatar_of("stga")
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown, cache = show_avatar(avatar, head), SplatCache()
+
+    def layer(frame: int) -> SceneLayer:
+        bpy.context.scene.frame_set(frame)
+        return visible_layers(bpy.context.evaluated_depsgraph_get(), cache)[0]
+
+    first, again, later = layer(1), layer(1), layer(5)
+    assert first.splats is again.splats is later.splats
+    assert first.frames is again.frames
+    assert np.abs(first.frames.origin - later.frames.origin).max() > 1e-4
+    moved = avatar.splats.xyz + 1
+    object.__setattr__(avatar.splats, "xyz", moved)
+    update_splats(shown, avatar_attributes(avatar))
+    assert np.array_equal(layer(5).splats.xyz, moved)
+
+
+def test_nothing_is_drawn_by_nodes():
+    """Catches points drawn over the GPU's picture in viewports, and images of other engines that lack the splats."""
+    show_world_splats(random_splats(1, 10), "scan")
+    kinds = {instance.object.type for instance in bpy.context.evaluated_depsgraph_get().object_instances}
+    assert "POINTCLOUD" not in kinds
+
+
+def test_an_error_ends_the_display(monkeypatch, capsys):
+    """Catches an error that is raised in every redraw, and splats that are gone from then on."""
+    shown = show_world_splats(random_splats(1, 10), "scan")
+    display = GpuDisplay()
+    monkeypatch.setattr(viewport_display, "display", display)
+    monkeypatch.setattr(display, "_draw_region", lambda context: 1 / 0)
+    display._draw()
+    assert display.failed
+    assert "ZeroDivisionError" in display.problem
+    assert capsys.readouterr().out.count("STGA:") == 1
+    viewport_display.show_points()
+    assert display_mode(shown) == POINTS
+    bpy.app.timers.unregister(viewport_display.show_points)

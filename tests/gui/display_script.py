@@ -1,0 +1,184 @@
+"""Runs inside a Blender with a window, started by test_display.py: shows splats in every shading mode.
+
+`blender --python display_script.py -- FOLDER`: reads FOLDER/avatar.npz, writes pictures of the viewport, the views they
+were taken from (views.npz) and what else was seen (result.json).
+"""
+
+import contextlib
+import io
+import json
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from mathutils import Matrix
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.errors import StgaError
+from stga_addon.scene.arrays import triangle_mesh
+from stga_addon.scene.display.display_modes import POINTS
+from stga_addon.scene.display.splat_object import display_mode, show_avatar
+from stga_addon.scene.gpu import viewport_display
+from stga_addon.scene.gpu.viewport_display import display, region_view
+from stga_addon.scene.render import engine
+
+FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
+seen: dict[str, Any] = {"version": bpy.app.version_string, "pictures": {}}
+views: dict[str, np.ndarray] = {}
+
+
+def no_python() -> str:
+    raise StgaError("no training environment")
+
+
+def viewport() -> tuple[Any, Any, Any]:
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    return window, area, next(region for region in area.regions if region.type == "WINDOW")
+
+
+def set_up() -> Any:
+    """The avatar's head, hidden, at a turned and scaled place, and nothing else."""
+    for candidate in list(bpy.data.objects):
+        bpy.data.objects.remove(candidate)
+    avatar = read_avatar(FOLDER / "avatar.npz")
+    head = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
+    bpy.context.scene.collection.objects.link(head)
+    head.matrix_world = Matrix(
+        ((0.0, -1.2, 0.0, 0.01), (1.2, 0.0, 0.0, 0.0), (0.0, 0.0, 1.2, 0.02), (0.0, 0.0, 0.0, 1.0))
+    )
+    shown = show_avatar(avatar, head)
+    head.hide_set(True)
+    _, area, _ = viewport()
+    space = area.spaces.active
+    space.overlay.show_overlays = space.show_gizmo = space.show_region_ui = space.show_region_toolbar = False
+    space.show_region_header = space.show_region_tool_header = False
+    space.shading.background_type = "VIEWPORT"
+    space.shading.background_color = (0.2, 0.3, 0.4)
+    bpy.context.scene.world = None
+    view = space.region_3d
+    view.view_perspective, view.view_distance, view.view_location = "PERSP", 0.6, (0.0, 0.0, 0.02)
+    view.view_rotation = (0.75, 0.6, 0.1, 0.2)
+    bpy.context.view_layer.update()
+    views["pose"] = np.array(shown.matrix_world, np.float64)
+    return shown
+
+
+def redraw(times: int = 2) -> float:
+    """Milliseconds of one redraw."""
+    begin = perf_counter()
+    bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=times)
+    return 1e3 * (perf_counter() - begin) / times
+
+
+def picture(name: str) -> None:
+    """A screenshot, where the viewport is in it, and its view."""
+    took = redraw()
+    subprocess.run(["import", "-window", "root", str(FOLDER / f"{name}.png")], check=True)
+    window, area, region = viewport()
+    camera = region_view(area.spaces.active.region_3d, region.width, region.height)[0].camera
+    views[name] = np.array([camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy])
+    views[f"{name} pose"] = camera.world_to_camera
+    seen["pictures"][name] = {"x": region.x, "y": window.height - region.y - region.height, "ms": took}
+    seen["problem"] = display.problem
+
+
+def pictures(shown: Any) -> None:
+    _, area, _ = viewport()
+    space, scene = area.spaces.active, bpy.context.scene
+    for mode in ("SOLID", "WIREFRAME", "MATERIAL"):
+        space.shading.type = mode
+        picture(mode.lower())
+    space.shading.type = "SOLID"
+    space.region_3d.view_perspective = "ORTHO"
+    picture("orthographic")
+    space.region_3d.view_perspective = "PERSP"
+    scene.view_settings.view_transform = "Filmic"
+    picture("filmic")
+    scene.render.engine, space.shading.type = engine.ENGINE, "RENDERED"
+    picture("engine filmic")
+    scene.view_settings.view_transform = "Standard"
+    picture("engine")
+    scene.render.engine = "BLENDER_WORKBENCH"
+    space.shading.type = "SOLID"
+    shown.hide_set(True)
+    picture("hidden")
+    shown.hide_set(False)
+    quad = bpy.data.meshes.new("quad")
+    quad.from_pydata([(-1, -1, 0.02), (1, -1, 0.02), (1, 1, 0.02), (-1, 1, 0.02)], [], [(0, 1, 2, 3)])
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("quad", quad))
+    picture("quad")
+    bpy.data.objects.remove(bpy.data.objects["quad"])
+
+
+def failure() -> None:
+    """An error while drawing: reported once, the handler removed, points shown."""
+
+    def broken(*_: object) -> None:
+        raise MemoryError("out of memory")
+
+    display._renderer.draw = broken
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+        redraw(4)
+    seen["reports"] = output.getvalue().count("out of memory; points") + output.getvalue().count("MemoryError: out")
+    seen["failed"] = display.failed, display._handler is None, display.problem
+
+
+def after_failure(shown: Any) -> None:
+    seen["fallback"] = display_mode(shown)
+    viewport_display.unregister()
+    seen["unregistered"] = display._handler is None, display._renderer is None
+    viewport_display.register()
+    bpy.ops.wm.read_homefile(use_empty=True)
+
+
+def after_load() -> None:
+    seen["after load"] = display._handler is not None, display._renderer is None, display.problem
+
+
+def finish() -> None:
+    np.savez(FOLDER / "views.npz", **views)
+    seen["device"] = gpu.platform.backend_type_get()
+    seen["points"] = POINTS
+    (FOLDER / "result.json").write_text(json.dumps(seen))
+    bpy.ops.wm.quit_blender()
+
+
+def steps() -> Any:
+    viewport_display.register()
+    engine.register(no_python)
+    shown = set_up()
+    yield
+    pictures(shown)
+    yield
+    failure()
+    yield
+    yield
+    after_failure(shown)
+    yield
+    after_load()
+
+
+def play() -> float | None:
+    try:
+        next(running)
+        return 0.3
+    except StopIteration:
+        pass
+    except Exception:
+        seen["traceback"] = traceback.format_exc()
+    finish()
+    return None
+
+
+running = steps()
+bpy.app.timers.register(play, first_interval=0.5, persistent=True)

@@ -1,0 +1,102 @@
+"""The GPU display in a Blender with a window, as on screen, against the CPU rasterizer: see test_scenario.py."""
+
+import json
+import os
+import shlex
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+from blender.test_gpu_renderer import avatar, psnr_db
+from PIL import Image
+
+from stga_addon.avatar.file import write_avatar
+from stga_addon.capture.camera import Camera
+from stga_addon.raster.cpu.compose import compose
+from stga_addon.raster.posed_splats import PosedSplats
+from stga_addon.scene.display.colors import linear_to_srgb
+
+ROOT = Path(__file__).resolve().parents[2]
+BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
+pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
+MIN_PSNR_DB = 42.0
+BEHIND = linear_to_srgb(np.array([0.2, 0.3, 0.4]))
+BLACK = np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder with the pictures, and what display_script.py saw."""
+    folder = tmp_path_factory.mktemp("display")
+    write_avatar(folder / "avatar.npz", avatar(3))
+    backend = os.environ.get("STGA_GPU_BACKEND")
+    arguments = ["--factory-startup", *(["--gpu-backend", backend] if backend else [])]
+    script = Path(__file__).with_name("display_script.py")
+    command = [*BLENDER, *arguments, "--python", str(script), "--", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert (folder / "result.json").exists(), done.stdout[-3000:] + done.stderr[-3000:]
+    result = json.loads((folder / "result.json").read_text())
+    print({name: result[name] for name in ("version", "device", "pictures")})
+    assert "traceback" not in result, result["traceback"]
+    return folder, result
+
+
+def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarray, Camera]:
+    """(3, H, W) sRGB of the viewport in the screenshot, and its camera."""
+    with np.load(folder / "views.npz") as views:
+        width, height, *lens = views[name].tolist()
+        camera = Camera(int(width), int(height), *lens, views[f"{name} pose"])
+    x, y = (int(result["pictures"][name][axis]) for axis in "xy")
+    with Image.open(folder / f"{name}.png") as screenshot:
+        pixels = np.asarray(screenshot.convert("RGB"), np.float32)[y : y + camera.height, x : x + camera.width]
+    return pixels.transpose(2, 0, 1) / 255, camera
+
+
+@pytest.mark.parametrize(
+    ("name", "behind"),
+    [("solid", BEHIND), ("wireframe", BEHIND), ("orthographic", BEHIND), ("filmic", BEHIND), ("engine", BLACK)],
+)
+def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name: str, behind: np.ndarray) -> None:
+    """Catches colors that a view transform, a blend or an offset of the viewport changes."""
+    folder, result = shown
+    found, camera = on_screen(folder, result, name)
+    with np.load(folder / "views.npz") as views:
+        pose = views["pose"]
+    expected = avatar(3)
+    layer = PosedSplats(expected.splats, expected.frames(expected.neutral), pose, expected.antialiased)
+    image = compose([layer], camera)
+    picture = np.clip(image.rgb + (1 - image.alpha) * behind[:, None, None], 0, 1)
+    print(f"{name}: {psnr_db(found, picture):.1f} dB")
+    assert image.alpha.mean() > 0.02, "nothing to compare"
+    assert psnr_db(found, picture) >= MIN_PSNR_DB
+
+
+def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
+    """Catches splats of a hidden object, splats that ignore other objects' depth, and modes without splats."""
+    folder, result = shown
+    assert result["problem"] == ""
+    pictures = {name: on_screen(folder, result, name)[0] for name in result["pictures"]}
+    assert np.ptp(pictures["hidden"], axis=(1, 2)).max() < 0.02
+    for name in ("material", "engine filmic"):
+        assert pictures[name].std() > 0.02, name
+    with_quad = np.abs(pictures["quad"] - pictures["solid"]).max(0) > 0.1
+    splats = np.abs(pictures["solid"] - pictures["hidden"]).max(0) > 0.05
+    assert 0.2 < (with_quad & splats).sum() / splats.sum() < 0.8, "the quad cuts the ball in half"
+
+
+def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
+    """Catches an error in every redraw, and a handler or textures that outlive the add-on or the file."""
+    _, result = shown
+    failed, removed, problem = result["failed"]
+    assert failed
+    assert removed
+    assert "out of memory" in problem
+    assert result["reports"] == 2, "a traceback and a sentence"
+    assert result["fallback"] == result["points"]
+    assert result["unregistered"] == [True, True]
+    assert result["after load"] == [True, True, ""]
