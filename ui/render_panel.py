@@ -6,6 +6,7 @@ import bpy
 
 from ..operators.environment import has_training_python
 from ..stga_addon.raster.render_client import missing_packages
+from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.render.engine import ENGINE
 
 
@@ -25,7 +26,7 @@ class RenderPanel(bpy.types.Panel):
         layout.use_property_split = True
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
-        if missing_packages():
+        if missing_packages() and not has_gpu_context():
             has_environment = has_training_python(context)
             renderer = "Rendered by the training environment" if has_environment else "No Python here can render"
             layout.label(text=f"{renderer}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")

@@ -143,10 +143,8 @@ bpy.ops.stga.select(threshold=0.002)
 bpy.ops.stga.show_avatar(filepath=avatar)
 scene = bpy.context.scene
 scene.frame_set(scene.frame_end)
-instances = bpy.context.evaluated_depsgraph_get().object_instances
-shown = next(instance.object.data for instance in instances if instance.object.type == "POINTCLOUD")
-xyz = [0.0] * 3 * len(shown.points)
-shown.attributes["position"].data.foreach_get("vector", xyz)
+splat_object = sys.modules[f"{module}.stga_addon.scene.display.splat_object"]
+xyz = splat_object.evaluated_splats(scene.stga.splats)[0].ravel().tolist()
 result["frame"], result["xyz"] = scene.frame_current, xyz
 result["groups"] = sum(group.name.startswith("stga_") for group in scene.stga.head.vertex_groups)
 

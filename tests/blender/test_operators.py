@@ -19,6 +19,7 @@ from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
 from stga_addon.scene.vertex_groups import closure, read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
@@ -307,6 +308,7 @@ def test_show_selection_after_select(extension, mesh_capture, tmp_path):
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
+    set_input(scene.stga.splats, splat_nodes.DISPLAY, POINTS)
     set_input(scene.stga.splats, splat_nodes.SHOW_SELECTION, True)
     scene.frame_set(3)
     points = next(

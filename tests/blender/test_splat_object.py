@@ -14,7 +14,7 @@ from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import ELLIPSOIDS, QUADS  # noqa: E402
+from stga_addon.scene.display.display_modes import ELLIPSOIDS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT  # noqa: E402
 from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
@@ -159,7 +159,8 @@ def test_attributes_hold_activated_values():
 
 
 def displayed_colors(shown) -> np.ndarray:
-    """(N, 3) scene-linear colors of the displayed points."""
+    """(N, 3) scene-linear colors of the splats as points."""
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     points = next(i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD")
     color = np.empty(4 * len(points.points), np.float32)

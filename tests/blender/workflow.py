@@ -74,12 +74,9 @@ def can_train() -> bool:
 def positions() -> list[float]:
     """Of the splats that are displayed, in the capture's coordinates."""
     bpy.context.scene.frame_set(4)
-    for instance in bpy.context.evaluated_depsgraph_get().object_instances:
-        if instance.object.type == "POINTCLOUD":
-            values = [0.0] * 3 * len(instance.object.data.points)
-            instance.object.data.attributes["position"].data.foreach_get("vector", values)
-            return values
-    return []
+    splat_object = importlib.import_module(MODULE + ".stga_addon.scene.display.splat_object")
+    positions, _, _ = splat_object.evaluated_splats(bpy.context.scene.stga.splats)
+    return list(positions.ravel().tolist())
 
 
 if __name__ == "__main__":

@@ -24,7 +24,11 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
 
     visible: field, which splats; size: factor on their standard deviations.
     """
-    geometries = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
+    made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
+    # Nothing in viewports, where `gpu.viewport_display` draws; points in images by engines other than STGA Splats.
+    is_viewport = nodes.out("GeometryNodeIsViewport")
+    in_images = nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": made[POINTS]}, input_type="GEOMETRY")
+    geometries = {AS_TRAINED: in_images, **made}
     native = native_splats(nodes.tree, geometries[POINTS])
     if native is not None:
         geometries[NATIVE] = native
@@ -36,13 +40,6 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
         nodes.tree.links.new(geometry, menu.inputs[name])
     nodes.tree.links.new(mode, menu.inputs["Menu"])
     return menu.outputs[0]
-
-
-def _as_trained(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    """Nothing in a viewport, where `gpu.viewport_display` draws; points in images by other engines than STGA Splats."""
-    points = nodes.group(MODES[POINTS], splats, visible, size)
-    is_viewport = nodes.out("GeometryNodeIsViewport")
-    return nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": points}, input_type="GEOMETRY")
 
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
@@ -106,7 +103,6 @@ def _quad_transform(nodes: Nodes, size: Any) -> bpy.types.NodeSocket:
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
 MODES = {
-    AS_TRAINED: NodeGroup("STGA As Trained", _INPUTS, "Geometry", _as_trained),
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     ELLIPSOIDS: NodeGroup("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
