@@ -6,7 +6,7 @@ from functools import cache
 
 import bpy
 
-EGL_OPENGL_API = 0x30A2
+EGL_PLATFORM_DEVICE = 0x313F
 
 
 @cache
@@ -20,12 +20,24 @@ def has_gpu_context() -> bool:
 
 
 def _has_egl_driver() -> bool:
+    """Whether EGL initializes its default display or, as Blender tries next, its first device."""
     try:
         egl = ctypes.CDLL("libEGL.so.1")
         ctypes.CDLL("libGL.so.1")
     except OSError:
         return False
-    egl.eglGetDisplay.restype, egl.eglGetDisplay.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
-    egl.eglInitialize.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
-    display = egl.eglGetDisplay(None)
-    return bool(display and egl.eglInitialize(display, None, None) and egl.eglBindAPI(EGL_OPENGL_API))
+    pointer, count = ctypes.c_void_p, ctypes.c_int()
+    egl.eglGetDisplay.restype, egl.eglGetDisplay.argtypes = pointer, [pointer]
+    egl.eglInitialize.argtypes = [pointer, pointer, pointer]
+    egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = pointer, [ctypes.c_char_p]
+    if egl.eglInitialize(egl.eglGetDisplay(None), None, None):
+        return True
+    query, open_device = (egl.eglGetProcAddress(name) for name in (b"eglQueryDevicesEXT", b"eglGetPlatformDisplayEXT"))
+    if not query or not open_device:
+        return False
+    device = pointer()
+    query_devices = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, pointer, pointer)(query)
+    if not query_devices(1, ctypes.byref(device), ctypes.byref(count)) or not count.value:
+        return False
+    display = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)(open_device)(EGL_PLATFORM_DEVICE, device, None)
+    return bool(display and egl.eglInitialize(display, None, None))
