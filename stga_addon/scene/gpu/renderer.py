@@ -136,4 +136,7 @@ def _texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
 
 def _pixels(texture: Any) -> np.ndarray:
     """(H, W, 4) float32, bottom row first."""
-    return np.asarray(texture.read(), np.float32).reshape(texture.height, texture.width, 4)
+    buffer = texture.read()
+    # Of several axes, a buffer tells numpy the wrong strides in some versions. The copy is made while it lives.
+    buffer.dimensions = (texture.height * texture.width * 4,)
+    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
