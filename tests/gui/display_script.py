@@ -1,7 +1,7 @@
 """Runs inside a Blender with a window, started by test_display.py: shows splats in every shading mode.
 
-`blender --python display_script.py -- FOLDER`: reads FOLDER/avatar.npz, writes pictures of the viewport, the views they
-were taken from (views.npz) and what else was seen (result.json).
+`blender --python display_script.py -- FOLDER`: reads FOLDER/avatar.npz, and packages that Blender lacks from
+FOLDER/packages; writes pictures of the viewport, their views (views.npz) and what else was seen (result.json).
 """
 
 import contextlib
@@ -19,7 +19,9 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
+FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.append(str(FOLDER / "packages"))
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.errors import StgaError
@@ -30,7 +32,6 @@ from stga_addon.scene.gpu import viewport_display
 from stga_addon.scene.gpu.viewport_display import display, region_view
 from stga_addon.scene.render import engine
 
-FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
 seen: dict[str, Any] = {"version": bpy.app.version_string, "pictures": {}}
 views: dict[str, np.ndarray] = {}
 

@@ -3,10 +3,12 @@
 import json
 import os
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numpy as np
 import pytest
 
@@ -34,6 +36,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     """The folder with the pictures, and what display_script.py saw."""
     folder = tmp_path_factory.mktemp("display")
     write_avatar(folder / "avatar.npz", avatar(3))
+    shutil.copytree(Path(filelock.__file__).parent, folder / "packages/filelock")
     backend = os.environ.get("STGA_GPU_BACKEND")
     arguments = ["--factory-startup", *(["--gpu-backend", backend] if backend else [])]
     script = Path(__file__).with_name("display_script.py")
