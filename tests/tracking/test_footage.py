@@ -77,7 +77,10 @@ def test_splits_are_one_rig(tmp_path):
     [
         ({"k1": "much"}, r"transforms.json: frames\[1\].k1: expected a finite number, not 'much'"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"frames\[1\].camera_model: 'EQUIRECTANGULAR' is not one of"),
-        ({"file_path": "images/none.png"}, r"none.png: does not exist, but .*frames\[1\] names it"),
+        (
+            {"file_path": "images/none.png"},
+            r"frames\[1\]: .* has no image, folder or video of the name 'images/none.png'",
+        ),
         ({"mask_path": "masks/none.png"}, r"masks/none.png: does not exist, but .*frames\[1\] names it"),
         ({"k1": -40.0}, r"frames\[1\]: the distortion of its lens folds the image"),
     ],
