@@ -49,7 +49,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--fps", type=real_number, default=25.0, help="frames per second of the video (default 25)")
     parser.add_argument(
         "--seconds", type=real_number, default=TURNTABLE_S, metavar="S",
-        help=f"least duration of a turntable (default {TURNTABLE_S:g}); motion shorter than that is repeated to and fro",
+        help=f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
     )  # fmt: skip
     parser.add_argument("--capture", type=usable_path, help="whose meshes drive the avatar (default: the run's)")
     parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture, or of the motion")

@@ -27,7 +27,8 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     """Write an MP4 file: the block is given a function that appends an image (H, W, 3) uint8, sRGB.
 
     All images have the size of the first; odd sizes are extended by a row or column, which the format needs. The file
-    appears when the block ends without an exception. Raises StgaError where it cannot be written, or `fps` is not in 0…MAX_FPS.
+    appears when the block ends without an exception. Raises StgaError where it cannot be written, or no video has
+    such a frame rate.
     """
     if not 0 < fps <= MAX_FPS:
         raise StgaError(f"{path}: a video needs a frame rate above 0 and up to {MAX_FPS}, got {fps:g}")

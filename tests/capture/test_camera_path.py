@@ -12,7 +12,7 @@ CENTER = np.array([0.1, 0.2, -0.3])
 def camera(degrees: float, height: float = 0.1) -> Camera:
     """At one meter from the axis through the center, counterclockwise from +z seen from above."""
     angle = np.radians(degrees)
-    eye = CENTER + [np.sin(angle), height, np.cos(angle)]
+    eye = CENTER + np.array([np.sin(angle), height, np.cos(angle)])
     return look_at(tuple(eye), tuple(CENTER), 64, 48, 80.0)
 
 

@@ -1,5 +1,6 @@
 """Videos and image sequences, decoded again by FFmpeg and Pillow."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import av
@@ -47,9 +48,9 @@ def test_nothing_is_left_of_an_unfinished_video(tmp_path: Path) -> None:
     """Catches half a video after an error, and an older one that it destroyed."""
     path = tmp_path / "video.mp4"
     path.write_bytes(b"older")
-    with pytest.raises(ZeroDivisionError), video_writer(path, FPS) as write:
+    with suppress(KeyboardInterrupt), video_writer(path, FPS) as write:
         write(images()[0])
-        _ = 1 / 0
+        raise KeyboardInterrupt
     assert path.read_bytes() == b"older"
     assert len(list(tmp_path.iterdir())) == 1
 
