@@ -14,6 +14,9 @@ SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf")
 MIN_HD_LINES = 720
 """From here on, videos without a stated color matrix are in that of HD (BT.709)."""
 
+MAX_FRAMES_AHEAD = 100
+"""Frames that are decoded to reach a later one; further ahead, the key frame before it is sought."""
+
 
 @dataclass(frozen=True)
 class Video:
@@ -34,7 +37,7 @@ def read_video(path: Path) -> Video:
     av = _pyav(path)
     try:
         with av.open(str(path)) as container:
-            stream = _stream(container)
+            stream = container.streams.video[0]
             times = tuple(sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None))
             fps = float(stream.average_rate or stream.guessed_rate or 0)
             container.seek(min(times, default=0), stream=stream)
@@ -89,20 +92,15 @@ class VideoFrames:
         """The frame, decoded on from the last one, or from the key frame before it."""
         if self._container is None:
             self._container = _pyav(self.video.path).open(str(self.video.path))
+            self._container.streams.video[0].thread_type = "AUTO"
         time = self.video.times[number]
-        if self._decoder is None or number <= self._decoded:
-            stream = _stream(self._container)
+        if self._decoder is None or not 0 < number - self._decoded <= MAX_FRAMES_AHEAD:
+            stream = self._container.streams.video[0]
             self._container.seek(time, stream=stream)
             self._decoder = self._container.decode(stream)
         frame = next(frame for frame in self._decoder if frame.pts is not None and frame.pts >= time)
         self._decoded = number
         return frame
-
-
-def _stream(container: Any) -> Any:
-    stream = container.streams.video[0]
-    stream.thread_type = "AUTO"
-    return stream
 
 
 def _pixels(frame: Any) -> np.ndarray:

@@ -1,31 +1,20 @@
-"""Footage opened from a calibration file."""
+"""Footage of transforms files."""
 
 import json
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
 
-WIDTH, HEIGHT = 40, 30
-
-
-def rig(count=3):
-    return [look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), WIDTH, HEIGHT, 50.0) for a in 0.4 * np.arange(count)]
+from .scenes import HEIGHT, rig, write_image
 
 
 def entry(camera, path, **values):
     intrinsics = {key: getattr(camera, key) for key in ("fl_x", "fl_y", "cx", "cy")}
     pose = {"transform_matrix": camera.camera_to_world_gl.tolist()}
     return {"file_path": path, "w": camera.width, "h": camera.height, **intrinsics, **pose, **values}
-
-
-def write_image(path, value=128):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (WIDTH, HEIGHT), (value, 10, 20)).save(path)
 
 
 def write_transforms(folder, frames, name="transforms.json", **top):
