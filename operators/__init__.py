@@ -16,6 +16,7 @@ from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
+from .pose import PoseHead
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
 from .train import CancelTraining, DismissTraining, Train
@@ -37,6 +38,7 @@ CLASSES = (
     MakeEnvironment,
     TestEnvironment,
     CancelEnvironment,
+    PoseHead,
     ShowAvatar,
     StandardView,
     MoreBounces,
