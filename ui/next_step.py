@@ -16,6 +16,7 @@ from ..stga_addon.scene.rig.flame_rig import rig_of
 from .sidebar import SidebarPanel
 from .text import draw_text
 from .train_panel import draw_environment_setup, draw_train_button
+from .video import draw_video
 
 
 class NextStepPanel(SidebarPanel, bpy.types.Panel):
@@ -62,6 +63,7 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
         if posing:
             draw_text(column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO")
     _draw_selection_toggle(column, settings.splats)
+    draw_video(column, context)
 
 
 def _draw_selection_toggle(layout: Any, splats: Any) -> None:
