@@ -16,6 +16,7 @@ from ..stga_addon.capture.camera import Camera
 from ..stga_addon.capture.camera_path import TURNTABLE_S, to_and_fro
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.video_job import Recorder, VideoJob, remove_video_job, worker_arguments
+from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
 from ..stga_addon.scene.render.engine import srgb_background
@@ -246,7 +247,7 @@ class _Recording:
     def __init__(self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None) -> None:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
-        self._cache = SplatCache()
+        self._cache, self._layers = SplatCache(), dict[int, list[PosedSplats]]()
         folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
         job = VideoJob(output, len(frames), _fps(context.scene), srgb_background(context.scene))
         self._recorder = Recorder(folder, job)
@@ -263,10 +264,17 @@ class _Recording:
     def record_next(self) -> bool:
         """Record an image; whether there are more. Raises StgaError, as where the head is gone."""
         index = self.video.recorded
-        self._scene.frame_set(self._frames[index])
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        camera = scene_camera(depsgraph) if self._cameras is None else self._cameras[index]
-        self._recorder.add(visible_layers(depsgraph, self._cache), camera)
+        frame = self._frames[index]
+        if frame not in self._layers:
+            self._scene.frame_set(frame)
+            if self._cameras is None:
+                self._layers.clear()  # each frame comes once
+            self._layers[frame] = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
+        if self._cameras is None:
+            camera = scene_camera(bpy.context.evaluated_depsgraph_get())
+        else:
+            camera = self._cameras[index]
+        self._recorder.add(self._layers[frame], camera)
         self.video.recorded += 1
         return self.video.is_recording
 
