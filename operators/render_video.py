@@ -270,10 +270,8 @@ class _Recording:
             if self._cameras is None:
                 self._layers.clear()  # each frame comes once
             self._layers[frame] = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
-        if self._cameras is None:
-            camera = scene_camera(bpy.context.evaluated_depsgraph_get())
-        else:
-            camera = self._cameras[index]
+        own = self._cameras is None
+        camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[index]
         self._recorder.add(self._layers[frame], camera)
         self.video.recorded += 1
         return self.video.is_recording
