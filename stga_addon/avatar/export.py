@@ -19,7 +19,7 @@ from .splats import Splats
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
 
-DEFAULT_FPS = 24.0
+DEFAULT_FPS = 25.0
 Meshes = Iterable[tuple[int, np.ndarray]]
 """Pairs of a number and a posed mesh (V, 3) meters."""
 

@@ -112,6 +112,14 @@ def frame_span(text: str) -> tuple[int, int]:
     return first, last
 
 
+def degrees(text: str) -> float:
+    """An angle up to a full turn. Raises argparse.ArgumentTypeError for anything else."""
+    value = real_number(text)
+    if not 0 < value <= 360:
+        raise argparse.ArgumentTypeError(f"'{text}' is not an angle above 0 and up to 360 degrees")
+    return value
+
+
 def duration(text: str) -> float:
     """Seconds in "90", "90s", "10m", "1h30m", more than 0. Raises argparse.ArgumentTypeError for anything else."""
     match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII)
