@@ -24,8 +24,10 @@ from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
-from stga_addon.scene.vertex_groups import closure, read_selection  # noqa: E402
+from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
+
+from .captures import closure  # noqa: E402
 
 OPERATORS = (
     "import_capture",
