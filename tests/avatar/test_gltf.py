@@ -15,7 +15,8 @@ import trimesh
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.export import export_avatar
 from stga_addon.avatar.splats import SH_C0, Splats
-from tests.avatar.conftest import random_splats, rendered
+
+from .conftest import random_splats, rendered
 
 PREFIX = "KHR_gaussian_splatting:"
 SHAPES = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
