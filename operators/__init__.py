@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from . import analyze, ids, monitor
+from . import analyze, ids, monitor, render_video
 from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
@@ -16,6 +16,8 @@ from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
+from .pose import PoseHead
+from .render_video import CancelVideo, DismissVideo, RenderVideo
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
 from .train import CancelTraining, DismissTraining, Train
@@ -37,9 +39,13 @@ CLASSES = (
     MakeEnvironment,
     TestEnvironment,
     CancelEnvironment,
+    PoseHead,
     ShowAvatar,
     StandardView,
     MoreBounces,
+    RenderVideo,
+    CancelVideo,
+    DismissVideo,
     ApplyMotion,
     ImportPly,
     ExportAvatar,
@@ -71,6 +77,7 @@ def register() -> None:
 def unregister() -> None:
     monitor.unregister()
     analyze.stop()
+    render_video.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     unregister_classes(CLASSES)
