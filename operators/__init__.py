@@ -11,6 +11,7 @@ from .common import register_classes, unregister_classes
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
 from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
+from .export_cameras import ExportCameras
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
@@ -49,6 +50,7 @@ CLASSES = (
     ApplyMotion,
     ImportPly,
     ExportAvatar,
+    ExportCameras,
     OpenNpz,
     CaptureDrop,
     AvatarDrop,
@@ -65,6 +67,7 @@ def _import_menu(menu: Any, context: Any) -> None:
 
 def _export_menu(menu: Any, context: Any) -> None:
     menu.layout.operator(ids.EXPORT_AVATAR, text="Gaussian Head Avatar (STGA)")
+    menu.layout.operator(ids.EXPORT_CAMERAS, text="Cameras for Tracking (STGA)")
 
 
 def register() -> None:

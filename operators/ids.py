@@ -25,6 +25,7 @@ DISMISS_VIDEO = "stga.dismiss_video"
 IMPORT_PLY = "stga.import_ply"
 OPEN_NPZ = "stga.open_npz"
 EXPORT_AVATAR = "stga.export_avatar"
+EXPORT_CAMERAS = "stga.export_cameras"
 STANDARD_VIEW = "stga.standard_view"
 MORE_BOUNCES = "stga.more_bounces"
 
