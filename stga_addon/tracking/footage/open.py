@@ -179,7 +179,7 @@ def _identity(shot: Shot) -> object:
 
 def _pose(shot: Shot) -> bytes:
     # Adding zero turns -0 into 0, whose bytes differ.
-    return (np.round(shot.camera.world_to_camera, 6) + 0.0).tobytes()
+    return bytes((np.round(shot.camera.world_to_camera, 6) + 0.0).tobytes())
 
 
 def _views(name: str, shots: list[Shot]) -> dict[int, View]:
