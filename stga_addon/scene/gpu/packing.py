@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import FaceFrames
-from ...avatar.splats import Splats
+from ...avatar.splats import Splats, unit_quaternions
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ..layers import SceneLayer, random_percentage
@@ -80,7 +80,7 @@ def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
 def _axes(splats: Splats, layer: int) -> np.ndarray:
     """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a random value in
     0…100 for the display's percentage, and the layer's index."""
-    w, x, y, z = _unit(splats.rotation).T
+    w, x, y, z = unit_quaternions(splats.rotation).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -96,13 +96,6 @@ def _axes(splats: Splats, layer: int) -> np.ndarray:
     axes[:, 1, 3] = random_percentage(len(splats))
     axes[:, 2, 3] = layer
     return axes
-
-
-def _unit(rotation: np.ndarray) -> np.ndarray:
-    """(N, 4) float64 unit quaternions; zero counts as the identity."""
-    rotation = rotation.astype(np.float64)
-    length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    return np.where(length > 0, rotation / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
 
 
 def frame_block(frames: FaceFrames) -> np.ndarray:
