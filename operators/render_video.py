@@ -272,7 +272,8 @@ class _Recording:
             self._scene.frame_set(frame)
             if self._cameras is None:
                 self._layers.clear()  # each frame comes once
-            self._layers[frame] = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
+            layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
+            self._layers[frame] = [layer.posed() for layer in layers]
         own = self._cameras is None
         camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[index]
         self._recorder.add(self._layers[frame], camera)

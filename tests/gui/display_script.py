@@ -23,14 +23,14 @@ FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 sys.path.append(str(FOLDER / "packages"))
 
-from stga_addon.avatar.file import read_avatar
-from stga_addon.errors import StgaError
-from stga_addon.scene.arrays import triangle_mesh
-from stga_addon.scene.display.display_modes import POINTS
-from stga_addon.scene.display.splat_object import display_mode, show_avatar
-from stga_addon.scene.gpu import viewport_display
-from stga_addon.scene.gpu.viewport_display import display, region_view
-from stga_addon.scene.render import engine
+from stga_addon.avatar.file import read_avatar  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
+from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
+from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
+from stga_addon.scene.gpu import viewport_display  # noqa: E402
+from stga_addon.scene.gpu.viewport_display import display, region_view  # noqa: E402
+from stga_addon.scene.render import engine  # noqa: E402
 
 seen: dict[str, Any] = {"version": bpy.app.version_string, "pictures": {}}
 views: dict[str, np.ndarray] = {}
