@@ -32,6 +32,7 @@ from stga_addon.scene.gpu import viewport_display  # noqa: E402
 from stga_addon.scene.gpu.viewport_display import display, region_view  # noqa: E402
 from stga_addon.scene.render import engine  # noqa: E402
 
+bpy.context.preferences.view.show_splash = False
 seen: dict[str, Any] = {"version": bpy.app.version_string, "pictures": {}}
 views: dict[str, np.ndarray] = {}
 

@@ -21,7 +21,7 @@ VIEW_TEXELS = 3 + CLIP_PLANES
 LAYER_TEXELS = 5
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
-MAX_DEPTH_STEP = 1e-4
+MAX_DEPTH_STEP = 1e-5
 """Coarsest step of the sort's keys, as a share of the nearest splat's depth; where 16 bits are coarser, 32 are used."""
 
 

@@ -187,7 +187,7 @@ def _srgb(linear: Any) -> tuple[float, ...]:
     return tuple(linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist())
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def _forget_file(*_: Any) -> None:
     display.forget()
 
