@@ -85,9 +85,7 @@ def nearest_points(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
     return SurfacePoints(triangle, barycentric), distance[rows, best]
 
 
-def _with_pupils(
-    model: FlameModel, places: SurfacePoints, located: np.ndarray
-) -> tuple[SurfacePoints, list[int]]:
+def _with_pupils(model: FlameModel, places: SurfacePoints, located: np.ndarray) -> tuple[SurfacePoints, list[int]]:
     """The places with the centers of the irises on the foremost points of the eyeballs, where the model has any."""
     face, barycentric, moved = places.face.copy(), places.barycentric.copy(), []
     for joint in (JOINTS.index("left_eye"), JOINTS.index("right_eye")):

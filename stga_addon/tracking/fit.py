@@ -147,9 +147,7 @@ def _spread(timesteps: Sequence[int]) -> list[int]:
     return [timesteps[row] for row in rows]
 
 
-def _triangulation(
-    landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float
-) -> Triangulation:
+def _triangulation(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:
     """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a single camera's are."""
     found = triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     if len(landmarks.cameras) > 1:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +39,7 @@ def landmark_file(folder: Path, camera: str) -> Path:
     return folder / (re.sub(r"[^\w.-]", "_", camera) + ".npz")
 
 
-def detect_landmarks(
-    footage: Footage, detector: Detector, folder: Path, report: Report
-) -> dict[str, CameraLandmarks]:
+def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report: Report) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they are already.
 
     A frame with several faces counts as one without a face. Raises StgaError for a camera that often sees several.
@@ -52,7 +51,7 @@ def detect_landmarks(
         if path.exists():
             found[camera.name] = read_camera(path, camera)
         else:
-            found[camera.name] = _detect(camera, detector, lambda number: report("Landmarks", done + number, total))
+            found[camera.name] = _detect(camera, detector, partial(_count, report, done, total))
             write_camera(path, found[camera.name])
         done += len(camera.timesteps)
         report("Landmarks", done, total)
@@ -136,6 +135,10 @@ def timesteps_with_landmarks(found: Mapping[str, CameraLandmarks]) -> set[int]:
         for timestep, seen in zip(camera.timesteps, camera.confidence.any(1), strict=True)
         if seen
     }
+
+
+def _count(report: Report, done: int, total: int, number: int) -> None:
+    report("Landmarks", done + number, total)
 
 
 def _detect(camera: FootageCamera, detector: Detector, report: Callable[[int], None]) -> CameraLandmarks:

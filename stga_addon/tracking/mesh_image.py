@@ -51,7 +51,9 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[
     return triangle.reshape(shape), weights.reshape(*shape, 3)
 
 
-def shaded_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray | None = None) -> np.ndarray:
+def shaded_image(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray | None = None
+) -> np.ndarray:
     """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3) from 0 to 1, by default those of skin."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0

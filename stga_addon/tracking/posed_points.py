@@ -86,4 +86,6 @@ class PosedPoints:
 
     def _blend(self, values: np.ndarray) -> np.ndarray:
         """Values (N, …) at the points from those (3 N, …) at their triangles' corners."""
-        return np.asarray(np.einsum("nk,nk...->n...", self.barycentric, values.reshape(len(self.barycentric), 3, *values.shape[1:])))
+        return np.asarray(
+            np.einsum("nk,nk...->n...", self.barycentric, values.reshape(len(self.barycentric), 3, *values.shape[1:]))
+        )

@@ -84,7 +84,9 @@ def solve_identity(
     return Identity(state[:known] / scale, float(scale), frames)
 
 
-def solve_take(head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], start: np.ndarray) -> np.ndarray:
+def solve_take(
+    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], start: np.ndarray
+) -> np.ndarray:
     """Expression and pose (T, E + 18) of consecutive timesteps of a person whose identity is in the template.
 
     start (T, E + 18). Second differences over time are penalized, but for jumps: captures of single expressions, and
@@ -147,7 +149,7 @@ def _solve_window(
 
 def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray) -> None:
     """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure weights."""
-    count, size = state.shape
+    size = state.shape[1]
     second = state[:-2] - 2 * state[1:-1] + state[2:]
     weight = 1 / (1 + (second**2 * stiffness).mean(1) / JUMP_SCALE**2) ** 2
     for number, (difference, share) in enumerate(zip(second, weight, strict=True)):

@@ -137,8 +137,12 @@ def reprojection_errors(
 def _begin(out: Path, footage: Footage, head_file: Path) -> None:
     """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
     path = out / LANDMARKS_FOLDER / "footage.json"
-    source = {"footage": str(footage.root), "cameras": [camera.name for camera in footage.cameras],
-              "timesteps": list(footage.timesteps), "head_model": str(head_file.resolve())}
+    source = {
+        "footage": str(footage.root),
+        "cameras": [camera.name for camera in footage.cameras],
+        "timesteps": list(footage.timesteps),
+        "head_model": str(head_file.resolve()),
+    }
     if path.exists() and read_json(path) != source:
         raise StgaError(f"{out}: holds landmarks of other footage or frames; give another --out, or delete it")
     write_json(path, source)
@@ -174,8 +178,8 @@ def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[flo
         if value > MIN_OUTLIER_SHARE and (not others or value > OUTLIER_FACTOR * float(np.median(others))):
             worst = max(errors[name], key=lambda timestep: errors[name][timestep][1])
             raise StgaError(
-                f"camera {name}: its landmarks are off by {errors[name][worst][0]:.0f} pixels at timestep {worst}, far "
-                "more than those of the other cameras; check its calibration, synchronization and that it is not mirrored"
+                f"camera {name}: its landmarks are off by {errors[name][worst][0]:.0f} pixels at timestep {worst}, "
+                "far more than those of the other cameras; check its calibration, synchronization and mirroring"
             )
 
 

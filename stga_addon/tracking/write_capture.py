@@ -58,8 +58,8 @@ def flame_frame(parameters: np.ndarray) -> FlameFrame:
 
 def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     """A Wavefront OBJ of triangles; vertices in micrometer precision."""
-    lines = ["v %.6f %.6f %.6f" % tuple(vertex) for vertex in vertices.tolist()]
-    lines += ["f %d %d %d" % tuple(face) for face in (faces + 1).tolist()]
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="ascii")
 
