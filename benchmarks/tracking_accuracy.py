@@ -2,8 +2,8 @@
 
     python benchmarks/tracking_accuracy.py CAPTURE --model HEAD [--flame FILE] [--timesteps 8]
 
-CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were made
-with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
+CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were
+made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
 `shapedirs`, `faces`). Prints in millimeters, over the vertices within 9 cm of the face's landmarks: distances from the
 capture's surface and, where both have the same topology, from its vertices. Needs mediapipe, or landmark files with
 --landmarks.
@@ -76,7 +76,8 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         shift = 1000 * np.linalg.norm(local[face] - true.mesh(timestep)[face], axis=1).mean() if same else np.nan
         print(f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |")
     print(
-        f"\n{len(list(footage.views()))} images, {seconds:.1f} s, reprojection {result.median_px:.2f} px, scale {result.scale:.4f}"
+    print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
+    print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
     )
 
 

@@ -154,9 +154,8 @@ def _triangulation(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.
         return found
     camera, pixels = landmarks.cameras[0], landmarks.points[0]
     origin, directions = rays(camera, pixels)
-    guess = np.empty_like(head)
-    guess[:] = pose_from_one_camera(camera, pixels[reliable], head[reliable] / scale).mean(0)
-    guess[reliable] = pose_from_one_camera(camera, pixels[reliable], head[reliable] / scale)
+    guess = np.tile(origin, (len(head), 1))
+    guess[found.seen] = pose_from_one_camera(camera, pixels[found.seen], head[found.seen] / scale)
     depth = ((guess - origin) * directions).sum(1, keepdims=True)
     return replace(found, position=origin + depth * directions)
 

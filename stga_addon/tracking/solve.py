@@ -28,6 +28,8 @@ EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.
 JUMP_SCALE = 3.0
 """Root mean square of a second difference, in standard deviations, beyond which it is a cut rather than a motion."""
 IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
+CONVERGED_STEP = 1e-3
+"""Largest change of a parameter (standard deviations, radians, meters) after which iterations stop."""
 WINDOW, OVERLAP = 192, 24
 """Timesteps solved at once, and how many of them two windows share: memory does not grow with the take."""
 
@@ -76,7 +78,10 @@ def solve_identity(
             block, gradient = normal_equations(points, values, observation)
             matrix[np.ix_(rows, rows)] += block
             right[rows] += gradient
-        state += np.linalg.solve(matrix, right)
+        step = np.linalg.solve(matrix, right)
+        state += step
+        if np.abs(step).max() < CONVERGED_STEP:
+            break
     scale = 1 + SCALE_SIGMA * state[known]
     frames = state[shared:].reshape(len(observations), own)
     frames[:, :expressions] /= scale
@@ -143,7 +148,10 @@ def _solve_window(
                 band[offset, number * size : (number + 1) * size - offset] = np.diagonal(block, offset)
         if count > 2:
             _add_smoothness(band, right, state, stiffness)
-        state = state + solveh_banded(band, right.ravel(), lower=True).reshape(count, size)
+        step = solveh_banded(band, right.ravel(), lower=True)
+        state += step.reshape(count, size)
+        if np.abs(step).max() < CONVERGED_STEP:
+            break
     return state
 
 

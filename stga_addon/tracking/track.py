@@ -174,8 +174,8 @@ def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[flo
     """Raise StgaError for a camera whose landmarks do not fit the head that the others see."""
     share = {name: float(np.median([part for _, part in own.values()])) for name, own in errors.items() if own}
     for name, value in share.items():
-        others = [other for other_name, other in share.items() if other_name != name]
-        if value > MIN_OUTLIER_SHARE and (not others or value > OUTLIER_FACTOR * float(np.median(others))):
+        others = [other for other_name, other in share.items() if other_name != name] or [value]
+        if value > max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(others))):
             worst = max(errors[name], key=lambda timestep: errors[name][timestep][1])
             raise StgaError(
                 f"camera {name}: its landmarks are off by {errors[name][worst][0]:.0f} pixels at timestep {worst}, "
@@ -186,7 +186,7 @@ def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[flo
 def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit) -> tuple[str, ...]:
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     blind = [name for name, own in found.items() if not own.confidence.any()]
-    warnings = []
+    warnings = list(footage.warnings)
     if missing:
         listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
         warnings.append(f"no face at {len(missing)} of {len(footage.timesteps)} timesteps, interpolated: {listed}")

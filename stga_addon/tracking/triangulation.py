@@ -23,7 +23,7 @@ class Triangulation:
     information  (N, 3, 3) weighted mean over the rays of I − d dᵀ: (x − position)ᵀ information (x − position) is the
                  mean squared distance of x from the rays, up to a constant
     residual     (N,) median distance of the rays from `position`, 0 where there is none
-    seen         (N,) bool: at least one ray
+    seen         (N,) bool: by two cameras at least, or by the only one
     """
 
     position: np.ndarray
@@ -62,7 +62,7 @@ def triangulate(cameras: Sequence[Camera], points: np.ndarray, confidence: np.nd
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
         floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
         weights = confidence / (1 + (distance / np.maximum(scale, floor)) ** 2) ** 2
-    seen = (confidence > 0).any(0)
+    seen = (confidence > 0).sum(0) >= min(2, len(cameras))
     return Triangulation(position, information, _median(distance, confidence > 0), seen)
 
 
