@@ -75,10 +75,8 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         same = len(found.faces) == len(true.faces) or len(true.mesh(timestep)) - len(local) == 120
         shift = 1000 * np.linalg.norm(local[face] - true.mesh(timestep)[face], axis=1).mean() if same else np.nan
         print(f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |")
-    print(
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
     print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
-    )
 
 
 if __name__ == "__main__":
