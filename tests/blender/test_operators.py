@@ -46,6 +46,7 @@ OPERATORS = (
     "more_bounces",
     "import_ply",
     "export_avatar",
+    "export_cameras",
     "open_npz",
 )
 
@@ -119,6 +120,7 @@ SET_BY_PANEL = {
     "apply_motion": {"filter_glob"},
     "show_avatar": {"hide_head", "filter_glob"},
     "export_avatar": {"format", "filter_glob", "check_existing"},
+    "export_cameras": {"selected_only", "filter_glob", "check_existing"},
     "heat_map": set(),
     "copy_report": set(),
 }
