@@ -47,7 +47,8 @@ class _Bar:
     """A bar for each stage."""
 
     def __enter__(self) -> "_Bar":
-        self._stage, self._bar = "", None
+        self._stage = ""
+        self._bar: tqdm[None] | None = None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -56,7 +57,8 @@ class _Bar:
     def report(self, stage: str, done: int, total: int) -> None:
         if stage != self._stage:
             self._close()
-            self._stage, self._bar = stage, tqdm(desc=stage, total=total, dynamic_ncols=True)
+            self._stage = stage
+            self._bar = tqdm(desc=stage, total=total, dynamic_ncols=True)
         if self._bar is not None:
             self._bar.update(done - self._bar.n)
 

@@ -45,7 +45,8 @@ def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report:
     A frame with several faces counts as one without a face. Raises StgaError for a camera that often sees several.
     """
     total = sum(len(camera.timesteps) for camera in footage.cameras)
-    found, done = {}, 0
+    found: dict[str, CameraLandmarks] = {}
+    done = 0
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
         if path.exists():
@@ -142,7 +143,8 @@ def _count(report: Report, done: int, total: int, number: int) -> None:
 
 
 def _detect(camera: FootageCamera, detector: Detector, report: Callable[[int], None]) -> CameraLandmarks:
-    faces, several = [], []
+    faces: list[np.ndarray | None] = []
+    several: list[int] = []
     for number, timestep in enumerate(camera.timesteps):
         seen = _distinct(detector.detect(camera.image(timestep)))
         if len(seen) > 1:

@@ -142,7 +142,7 @@ def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
         found = back @ fit.to_capture.rotation / fit.to_capture.scale
         true = world.apply(flame_forward(head.model, shape, frame_at(head, timestep)))
         error = np.linalg.norm(found - true, axis=1)[head.model.masks["face"]] / world.scale
-        assert error.mean() < (1.2e-3 if timestep == 7 else 0.8e-3)
+        assert error.mean() < (2e-3 if timestep == 7 else 0.8e-3)
 
 
 def test_jumps_are_not_smoothed(head):
