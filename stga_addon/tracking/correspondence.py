@@ -76,13 +76,14 @@ def nearest_points(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
     _, near = cKDTree(corners.mean(1)).query(points, candidates)
     near = near.reshape(len(points), candidates)
     repeated = np.repeat(points, candidates, axis=0)
-    closest = closest_point(corners[near.ravel()], repeated).reshape(len(points), candidates, 3)
+    closest = closest_point(corners[near.ravel()], repeated)  # type: ignore[no-untyped-call]
+    closest = closest.reshape(len(points), candidates, 3)
     distance = np.linalg.norm(closest - points[:, None], axis=2)
     best = distance.argmin(1)
     rows = np.arange(len(points))
     triangle, nearest = near[rows, best], closest[rows, best]
-    barycentric = np.nan_to_num(points_to_barycentric(corners[triangle], nearest), nan=1 / 3)
-    return SurfacePoints(triangle, barycentric), distance[rows, best]
+    barycentric = points_to_barycentric(corners[triangle], nearest)  # type: ignore[no-untyped-call]
+    return SurfacePoints(triangle, np.nan_to_num(barycentric, nan=1 / 3)), distance[rows, best]
 
 
 def _with_pupils(model: FlameModel, places: SurfacePoints, located: np.ndarray) -> tuple[SurfacePoints, list[int]]:

@@ -26,7 +26,7 @@ ABSENT_SIGMA = 1e-6
 EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.25, 0.015, 0.0015
 """Standard deviations of second differences from one timestep to the next."""
 JUMP_SCALE = 3.0
-"""Root mean square of a second difference, in standard deviations, beyond which it is a cut rather than a motion."""
+"""Standard deviations of a second difference beyond which it is a cut rather than a motion."""
 IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations stop."""
@@ -159,13 +159,13 @@ def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stif
     """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure weights."""
     size = state.shape[1]
     second = state[:-2] - 2 * state[1:-1] + state[2:]
-    weight = 1 / (1 + (second**2 * stiffness).mean(1) / JUMP_SCALE**2) ** 2
+    weight = stiffness / (1 + second**2 * stiffness / JUMP_SCALE**2) ** 2
     for number, (difference, share) in enumerate(zip(second, weight, strict=True)):
         for row, first in enumerate((1.0, -2.0, 1.0)):
-            right[number + row] -= share * stiffness * first * difference
+            right[number + row] -= share * first * difference
             for column, other in enumerate((1.0, -2.0, 1.0)[: row + 1]):
                 at = (number + column) * size
-                band[(row - column) * size, at : at + size] += share * stiffness * first * other
+                band[(row - column) * size, at : at + size] += share * first * other
 
 
 def _precision(head: HeadModel) -> np.ndarray:
