@@ -227,7 +227,10 @@ class DismissVideo(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return video_of(context.scene) is not None and not is_busy(context.scene)
+        if video_of(context.scene) is not None and not is_busy(context.scene):
+            return True
+        cls.poll_message_set("No video was made yet, or one is being made")
+        return False
 
     @reporting
     def execute(self, context: Any) -> set[str]:

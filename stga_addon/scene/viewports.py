@@ -7,6 +7,7 @@ import bpy
 from mathutils import Vector
 
 from .arrays import evaluated_vertices
+from .compat import enable_nodes
 from .objects import COLLECTIONS, show_kind
 
 DISTANCE = 2.2
@@ -34,8 +35,13 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
 
 
 def frame_demo(head: Any, scene: Any, frames_per_second: int) -> None:
-    """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head."""
+    """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head.
+
+    The world is white, as behind the images of the demo's capture.
+    """
     scene.render.fps = frames_per_second
+    scene.world = bpy.data.worlds.new("World")
+    enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, scene.view_layers[0], False)
     frame_head(head, scene.camera, bpy.data.screens)

@@ -130,7 +130,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_job(case / "job", TrainingJob(capture, None, "vhap", read_run(case / "run").settings))
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
     (case / "head").mkdir()
-    head = {"capture": str(capture), "flame": None, "avatar": str(case / "run/avatar.npz"), "principal_point": "vhap"}
+    head = {
+        "capture": str(capture),
+        "flame": None,
+        "avatar": str(case / "run/avatar.npz"),
+        "principal_point": "vhap",
+        "fps": 24.0,
+    }
     (case / "head/head.json").write_text(json.dumps(head))
     np.savez(case / "motion.npz", expr=np.zeros((2, 2)), pose=np.zeros((2, 15)), shape=np.zeros(4))
     case.rename(folder / "template")
@@ -324,10 +330,15 @@ def render(rng: random.Random, case: Path) -> list[str]:
 
 def export(rng: random.Random, case: Path) -> list[str]:
     arguments = [some_path(rng, case, "run", "tracked", "run/avatar.npz", "tracked/avatar.npz", "unfinished")]
-    arguments += ["--format", rng.choice(["ply", "ply", "ply-sequence", "gaussian-avatars", "obj"])]
+    arguments += [
+        "--format",
+        rng.choice(["ply", "ply", "ply-sequence", "gaussian-avatars", "usd", "gltf", "spz", "obj"]),
+    ]
     arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
     arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
     arguments += option(rng, 0.3, "--timestep", "1", *NUMBERS)
+    arguments += option(rng, 0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS)
+    arguments += option(rng, 0.2, "--fps", "25", *NUMBERS)
     return [*arguments, *output(rng, case, "exported")]
 
 

@@ -95,12 +95,14 @@ def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat from numpy's."""
+    from ...scene import tags
     from ...scene.blend_file import current_scene, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats, hide_object, show_avatar
     from ...scene.timeline import go_to_frame
     from ...scene.viewports import frame_demo
 
     shown = show_avatar(avatar, head)
+    shown[tags.AVATAR] = "//avatar.npz"
     hide_object(head, current_scene())
     name = shown.name
     go_to_frame(capture.timesteps[0])

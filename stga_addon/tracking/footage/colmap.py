@@ -11,6 +11,7 @@ from ...errors import StgaError, shorten
 from .lens import Lens
 from .reading import numbers, pinhole, read_bytes, read_text
 from .shots import Shot
+from .sources import natural_order
 
 MODEL_NAMES = (
     "SIMPLE_PINHOLE",
@@ -78,7 +79,6 @@ class _Intrinsics:
 
 @dataclass(frozen=True)
 class _Image:
-    number: int
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
     camera: int
@@ -92,7 +92,7 @@ def find_colmap(folder: Path) -> Path | None:
 
 
 def read_colmap(folder: Path) -> list[Shot]:
-    """One shot an image, in the order of their numbers; the label is the image's name.
+    """One shot an image, in natural order of their names, which are the labels; COLMAP's numbers vary from run to run.
 
     World and unit are the model's. Raises StgaError that names file, camera and image.
     """
@@ -101,7 +101,9 @@ def read_colmap(folder: Path) -> list[Shot]:
         raise StgaError(f"{folder}: is no COLMAP model; expected cameras.bin and images.bin, or .txt")
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     cameras = (_binary_cameras if suffix == ".bin" else _text_cameras)(cameras_file)
-    images = sorted((_binary_images if suffix == ".bin" else _text_images)(images_file), key=lambda i: i.number)
+    images = sorted(
+        (_binary_images if suffix == ".bin" else _text_images)(images_file), key=lambda image: natural_order(image.name)
+    )
     return [_shot(image, cameras, cameras_file, images_file) for image in images]
 
 
@@ -183,7 +185,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
         if len(words) < 10:
             raise StgaError(f"{where}: expected number, quaternion, translation, camera and name of an image")
         pose = numbers(words[1:8], where, 7)
-        yield _Image(_whole(words[0], where), tuple(pose[:4]), tuple(pose[4:]), _whole(words[8], where), words[9])
+        yield _Image(tuple(pose[:4]), tuple(pose[4:]), _whole(words[8], where), words[9])
         next(lines, None)
 
 
@@ -239,8 +241,8 @@ def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
 def _binary_images(path: Path) -> Iterator[_Image]:
     cursor = _Cursor(path)
     for _ in range(cursor.count()):
-        number, *pose, camera = cursor.unpack("I7dI")
+        _, *pose, camera = cursor.unpack("I7dI")
         name = cursor.name()
-        yield _Image(int(number), tuple(pose[:4]), tuple(pose[4:]), int(camera), name)
+        yield _Image(tuple(pose[:4]), tuple(pose[4:]), int(camera), name)
         points = cursor.count()
         cursor.offset += 24 * points  # x, y and number of each
