@@ -1,6 +1,7 @@
 """Track a head through footage of one or more cameras, and write a capture."""
 
-from argparse import ArgumentParser, Namespace
+import re
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 
 from tqdm import tqdm
 
@@ -23,6 +24,14 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--start", type=whole_number(0), default=0, help="first timestep")
     parser.add_argument("--stop", type=whole_number(1), help="timestep to stop before")
     parser.add_argument("--step", type=whole_number(1), default=1, help="use every nth timestep")
+    parser.add_argument(
+        "--offset",
+        type=_offset,
+        action="append",
+        default=[],
+        metavar="CAMERA=FRAMES",
+        help="frames by which a camera's recording is later; may be repeated",
+    )
     parser.add_argument("--meshes", action="store_true", help="write an OBJ per timestep as well")
 
 
@@ -31,7 +40,7 @@ def run(options: Namespace) -> None:
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import track
 
-    frames = FrameRange(options.start, options.stop, options.step)
+    frames = FrameRange(options.start, options.stop, options.step, dict(options.offset))
     footage = open_footage(options.footage, options.cameras, frames, options.focal)
     with _Bar() as bar:
         result = track(
@@ -41,6 +50,13 @@ def run(options: Namespace) -> None:
         print(f"warning: {warning}")
     print(f"reprojection error: {result.median_px:.2f} px (median); by camera and timestep in tracking.json")
     print(f"capture: {options.out}")
+
+
+def _offset(text: str) -> tuple[str, int]:
+    name, separator, frames = text.rpartition("=")
+    if not separator or not re.fullmatch(r"-?\d{1,9}", frames):
+        raise ArgumentTypeError(f"expected a camera and a number of frames, as in left=-3, not {text!r}")
+    return name, int(frames)
 
 
 class _Bar:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_json, write_json
+from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
 from .fit import HeadFit, TimestepLandmarks, fit_head
@@ -25,9 +26,9 @@ from .landmarks import (
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
-from .write_capture import SPLIT_FILES, write_capture
+from .write_capture import SPLIT_FILES, posed_mesh, write_capture
 
-REPORT_FILE, LANDMARKS_FOLDER = "tracking.json", "landmarks"
+REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER = "tracking.json", "contact_sheet.png", "landmarks"
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the others, and by this share
 of the face's size."""
@@ -97,6 +98,16 @@ def track(
         _warnings(footage, found, fit),
     )
     write_json(out / REPORT_FILE, _as_json(result))
+    report("Contact sheet", 0, 1)
+    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
+    write_contact_sheet(
+        out / SHEET_FILE,
+        footage,
+        cameras,
+        lambda timestep: posed_mesh(fit, parameters[timestep]),
+        fit.head.model.faces,
+        result.reprojection_px,
+    )
     write_capture(out, footage, fit, parameters, meshes, report)
     return result
 

@@ -97,6 +97,15 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
     written = np.array([line.split()[1:] for line in mesh if line.startswith("v ")], float)
     np.testing.assert_allclose(written, capture.mesh(1), atol=2e-6)
     assert read_json(folder / "out/tracking.json")["interpolated"] == [2]
+    assert (folder / "out/contact_sheet.png").is_file()
+
+
+@pytest.mark.parametrize("offset", ["cam0", "cam0=soon", "=", "cam0=1.5"])
+def test_offsets_that_are_none(recorded, capsys, offset):
+    """Catches an offset that is left out without a word."""
+    with pytest.raises(SystemExit, match="2"):
+        command(recorded[0], "--offset", offset)
+    assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
 
 
 def test_a_linear_model_gives_a_mesh_capture(recorded, head):
