@@ -259,7 +259,10 @@ def test_objects_are_sorted_together(tmp_path):
     reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
     view = expected_camera(camera, bpy.data.objects["still"])
     expected = render_splats(reference, view, (0.0,) * 3)
-    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
+    difference = np.abs(displayed(render(tmp_path), 0.0) - expected)
+    # Colors reach 2 here: where rounding decides whether an alpha of 1/255 counts, that is 2/255.
+    assert difference.max() < 2 * TOLERANCE
+    assert (difference > TOLERANCE).mean() < 1e-3
 
 
 def _merged(scans, spaces, eye):

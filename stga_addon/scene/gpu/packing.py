@@ -150,13 +150,14 @@ def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.n
         depth = depth[inside]
     nearest, farthest = float(depth.min()), float(depth.max())
     if farthest - nearest <= 65535 * MAX_DEPTH_STEP * (nearest + frames.base):
-        key = ((farthest - depth) * (65535 / max(farthest - nearest, 1e-30))).astype(np.uint16)
+        key = ((depth - nearest) * (65535 / max(farthest - nearest, 1e-30))).astype(np.uint16)
         order = np.argsort(key, kind="stable")  # of 16 bits: a radix sort
     else:
-        key = ((farthest - depth.astype(np.float64)) * ((2**32 - 1) / (farthest - nearest))).astype(np.uint32)
+        key = ((depth.astype(np.float64) - nearest) * ((2**32 - 1) / (farthest - nearest))).astype(np.uint32)
         order = np.argsort(key.astype(np.uint16), kind="stable")
         order = order[np.argsort((key >> 16).astype(np.uint16)[order], kind="stable")]
-    return np.asarray(inside[order], np.float32)
+    # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
+    return np.asarray(inside[order[::-1]], np.float32)
 
 
 def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.ndarray:
