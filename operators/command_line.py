@@ -15,7 +15,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
-from ..stga_addon.scene.timeline import iterate_frames
+from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
@@ -72,6 +72,7 @@ def _open_head() -> "OpenHead | None":
         flame=Path(model) if model else None,
         principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
         avatar=file_path(avatar, "avatar") if avatar else None,
+        fps=frames_per_second(bpy.context.scene),
         selection=lambda: training_selection(head),
         played=lambda capture: _played(head, capture),
     )

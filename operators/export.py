@@ -1,19 +1,28 @@
-"""Exports an avatar to the files of other viewers."""
+"""Exports an avatar to the files of other viewers and tools."""
 
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.avatar.export import export_avatar
+from ..stga_addon.avatar.export import FORMATS, Meshes, check_free_space, export_avatar, range_bytes
 from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.errors import StgaError
+from ..stga_addon.format import format_bytes
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display.splat_object import check_head
 from ..stga_addon.scene.rig.motion import sample_motion
-from ..stga_addon.scene.timeline import iterate_frames
+from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from . import ids
 from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
+from .export_range import RangeExport
+
+STEP_INTERVAL_S = 0.005
+SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
 
 
 class ExportAvatar(bpy.types.Operator, ExportHelper):
@@ -25,7 +34,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
 
     filepath: bpy.props.StringProperty(
         name="File or Folder",
-        description="A file for the format PLY, a folder for the others",
+        description="A folder for PLY Sequence and GaussianAvatars, a file for the other formats",
         subtype="FILE_PATH",
         options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
@@ -38,18 +47,12 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     format: bpy.props.EnumProperty(
         name="Format",
         description="File format",
-        items=(
-            ("ply", "PLY", "The current frame in world space, for any 3D Gaussian Splatting viewer"),
-            ("ply-sequence", "PLY Sequence", "One PLY in world space for each frame of the scene"),
-            (
-                "gaussian-avatars",
-                "GaussianAvatars",
-                "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads",
-            ),
-        ),
+        items=tuple((name, format.label, format.description) for name, format in FORMATS.items()),
     )
 
-    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    _range: RangeExport | None = None
+    _is_invoked = False
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -58,36 +61,108 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     @property
     def filename_ext(self) -> str:
         """What ExportHelper appends to the path."""
-        return ".ply" if self.format == "ply" else ""
+        return next(iter(FORMATS[self.format].suffixes), "")
 
     def check(self, context: Any) -> bool:
         """Keep the path's extension in step with the format; whether it changed."""
-        path = self.filepath.removesuffix(".ply")
-        if self.format == "ply":
-            path = bpy.path.ensure_ext(path, ".ply")
+        path = self.filepath
+        if not path.lower().endswith(FORMATS[self.format].suffixes or ("/",)):
+            for suffix in SUFFIXES:
+                path = path.removesuffix(suffix)
+            path += self.filename_ext
         changed, self.filepath = path != self.filepath, path
         return changed
 
+    def draw(self, context: Any) -> None:
+        self.layout.use_property_split = True
+        self.layout.prop(self, "format")
+        self.layout.prop(self, "avatar")
+        if FORMATS[self.format].source == "range":
+            frames = _frames(context)
+            column = self.layout.column()
+            column.label(text=f"Frames {frames[0]} to {frames[-1]} of the scene", icon="TIME")
+            column.label(text=self._size(context, len(frames)), icon="DISK_DRIVE")
+
+    def _size(self, context: Any, frames: int) -> str:
+        try:
+            source = self._source(context)
+            return f"About {format_bytes(_size(source, source.stat().st_mtime, self.format, frames))}"
+        except (StgaError, OSError) as error:
+            return str(error)
+
+    def _source(self, context: Any) -> Path:
+        return file_path(self.avatar or scene_settings(context).avatar, "avatar")
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        self._is_invoked = True
+        return super().invoke(context, event)  # type: ignore[no-any-return]
+
     @reporting
     def execute(self, context: Any) -> set[str]:
-        head = head_of(context)
-        path = file_path(self.filepath, "export")
-        source = file_path(self.avatar or scene_settings(context).avatar, "avatar")
-        avatar = read_avatar(source)
-        check_head(avatar, head)
-        if self.format == "ply" and not path.suffix:
-            path = path.with_suffix(".ply")
-        motion = None
-        if self.format == "gaussian-avatars":
-            own = flame_of(capture_of(head), head.name)
-            motion = sample_motion(head, own, _frames(context), self._warn)
-        frames = iterate_frames(_frames(context)) if self.format == "ply-sequence" else (context.scene.frame_current,)
-        export_avatar(path, avatar, self.format, ((frame, evaluated_vertices(head)) for frame in frames), motion)
-        self.report({"INFO"}, f"Exported {len(avatar.splats)} splats to {path}")
+        head, frames = head_of(context), _frames(context)
+        path, write = self._writer(context, head, frames)
+        if FORMATS[self.format].source != "range":
+            write((frame, evaluated_vertices(head)) for frame in (context.scene.frame_current,))
+        elif not self._is_invoked:
+            write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
+        else:
+            self._range = RangeExport(head, frames, write)
+            self._timer = context.window_manager.event_timer_add(STEP_INTERVAL_S, window=context.window)
+            context.window_manager.modal_handler_add(self)
+            return {"RUNNING_MODAL"}
+        self.report({"INFO"}, f"Exported to {path}")
         return {"FINISHED"}
+
+    def _writer(self, context: Any, head: Any, frames: range) -> tuple[Path, Callable[[Meshes], Any]]:
+        """Where the file comes to lie, and what writes it. Raises StgaError for what can be known before."""
+        format = FORMATS[self.format]
+        path = file_path(self.filepath, "export")
+        if format.suffixes and not path.suffix:
+            path = path.with_suffix(self.filename_ext)
+        avatar = read_avatar(self._source(context))
+        check_head(avatar, head)
+        motion = None
+        if format.source == "range":
+            check_free_space(path, range_bytes(avatar, self.format, len(frames)))
+        elif format.source == "motion":
+            motion = sample_motion(head, flame_of(capture_of(head), head.name), frames, self._warn)
+        fps = frames_per_second(context.scene)
+        return path, lambda meshes: export_avatar(path, avatar, self.format, meshes, motion, fps)
+
+    def modal(self, context: Any, event: Any) -> set[str]:
+        """Export one frame a timer event; Esc cancels."""
+        job = self._range
+        assert job is not None
+        if event.type == "ESC" or event.type == "TIMER":
+            is_running = False if event.type == "ESC" else job.step()
+            context.workspace.status_text_set(f"Exporting frame {job.done} of {job.total}   Esc: Cancel")
+            if not is_running:
+                return self._end(context, job)
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context: Any) -> None:
+        """Blender closes, or the file dialog is left."""
+        if self._range is not None:
+            self._end(context, self._range)
+
+    @reporting
+    def _end(self, context: Any, job: RangeExport) -> set[str]:
+        context.window_manager.event_timer_remove(self._timer)
+        context.workspace.status_text_set(None)
+        if job.finish():
+            self.report({"INFO"}, f"Exported {job.total} frames to {self.filepath}")
+            return {"FINISHED"}
+        self.report({"WARNING"}, f"Export cancelled after {job.done} of {job.total} frames")
+        return {"CANCELLED"}
 
     def _warn(self, sentence: str) -> None:
         self.report({"WARNING"}, sentence)
+
+
+@lru_cache(maxsize=8)
+def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
+    """`range_bytes` of an avatar file last modified at this time. Raises StgaError where it cannot be read."""
+    return range_bytes(read_avatar(avatar), format, frames)
 
 
 def _frames(context: Any) -> range:

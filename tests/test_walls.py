@@ -24,6 +24,7 @@ LAYERS = (
     {"capture"},
     {"avatar", "selection"},
     {"raster"},
+    {"tracking"},
     {"training"},
     {"effects"},
     {"report"},

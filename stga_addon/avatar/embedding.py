@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from .splats import SH_C0, Splats, no_strain_color
+from .splats import SH_C0, Splats, no_strain_color, unit_quaternions
 from .strain import StrainBasis, face_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
@@ -123,7 +123,7 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
     """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
-    rotation = quaternion_multiply(frames.quaternion[face], _unit_quaternion(splats.rotation))
+    rotation = quaternion_multiply(frames.quaternion[face], unit_quaternions(splats.rotation))
     log_scale = splats.log_scale + np.log(np.maximum(scale, MIN_DIVISOR))[:, None]
     return replace(
         splats,
@@ -150,7 +150,7 @@ def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
     scale = np.maximum(frames.scale[face], MIN_DIVISOR)
     xyz = np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face]) / scale[:, None]
     inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
-    rotation = quaternion_multiply(inverse, _unit_quaternion(world.rotation))
+    rotation = quaternion_multiply(inverse, unit_quaternions(world.rotation))
     return replace(
         world,
         xyz=xyz.astype(np.float32),
@@ -239,11 +239,3 @@ def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
     normal = np.where(no_normal, substitute, normal)
     normal = normal - _dot(normal, first)[:, None] * first
     return first, normal / _length(normal)[:, None]
-
-
-def _unit_quaternion(q: np.ndarray) -> np.ndarray:
-    """Normalised in float64; a zero quaternion counts as the identity."""
-    q = np.asarray(q, np.float64)
-    largest = np.max(np.abs(q), axis=-1, keepdims=True)
-    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -1,34 +1,70 @@
-"""Export of an avatar as files that other splat viewers open."""
+"""Export of an avatar as files that other viewers and tools open."""
 
-from collections.abc import Iterable
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
+from ..format import format_bytes
 from .embedding import to_world
 from .file import Avatar
 from .gaussian_avatars import MOTION_NAME, PLY_NAME, write_gaussian_avatars
-from .ply import write_ply
+from .gltf import write_gltf
+from .ply import PROPERTIES, write_ply
+from .splats import Splats
+from .spz import write_spz
+from .usd import usd_bytes, write_usd
 
-FORMATS = ("ply", "ply-sequence", "gaussian-avatars")
+DEFAULT_FPS = 25.0
+Meshes = Iterable[tuple[int, np.ndarray]]
+"""Pairs of a number and a posed mesh (V, 3) meters."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """What `export_avatar` writes: its name in menus, what it is for, and what it is made of.
+
+    suffixes  of the file, the usual one first; none: a folder
+    source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and its FLAME parameters
+    """
+
+    label: str
+    description: str
+    suffixes: tuple[str, ...]
+    source: str
+
+
+FORMATS = {
+    "ply": Format("PLY", "The current frame in world space, for any 3D Gaussian Splatting viewer", (".ply",), "frame"),
+    "ply-sequence": Format("PLY Sequence", "One PLY in world space for each frame of the scene", (), "range"),
+    "gaussian-avatars": Format(
+        "GaussianAvatars", "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads", (), "motion"
+    ),
+    "usd": Format("USD", "The frames of the scene as an animated particle field", (".usdc", ".usdz"), "range"),
+    "gltf": Format("glTF", "The current frame, for viewers with KHR_gaussian_splatting", (".glb",), "frame"),
+    "spz": Format("SPZ", "The current frame compressed, a tenth of a PLY's size", (".spz",), "frame"),
+}
 
 
 def export_avatar(
     path: Path,
     avatar: Avatar,
     format: str,
-    meshes: Iterable[tuple[int, np.ndarray]] = (),
+    meshes: Meshes = (),
     sequence: FlameSequence | None = None,
+    fps: float = DEFAULT_FPS,
 ) -> list[Path]:
     """Write an avatar in one of FORMATS; returns the files written.
 
-    format   "ply": world-space splats on the first of `meshes`, in the file `path`;
-             "ply-sequence": one such file a mesh in the folder `path`, named 00000.ply after the mesh's number;
-             "gaussian-avatars": point_cloud.ply and flame_param.npz of `sequence` in the folder `path`
-    meshes   pairs of a number and a posed mesh (V, 3) meters, taken one at a time
+    path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its number) and
+             "gaussian-avatars" (point_cloud.ply and flame_param.npz)
+    meshes   taken one at a time; a "frame" takes the first
     sequence the FLAME motion, for "gaussian-avatars"
+    fps      meshes per second
     Raises StgaError where the format needs what is not given, or a file cannot be written.
     """
     if format == "gaussian-avatars":
@@ -36,12 +72,54 @@ def export_avatar(
             raise StgaError(f"{path}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture")
         write_gaussian_avatars(path, avatar, sequence)
         return [path / PLY_NAME, path / MOTION_NAME]
-    files = []
+    frames = _world_frames(path, avatar, meshes)
+    match format:
+        case "usd":
+            write_usd(path, frames, fps, _has_moving_color(avatar))
+        case "ply-sequence":
+            return [_write_numbered_ply(path, number, world) for number, world in frames]
+        case "ply":
+            write_ply(path, next(frames)[1])
+        case "gltf":
+            write_gltf(path, next(frames)[1])
+        case "spz":
+            write_spz(path, next(frames)[1], avatar.antialiased)
+    return [path]
+
+
+def range_bytes(avatar: Avatar, format: str, frames: int) -> int:
+    """Size of the files that a range of frames takes in a format of the source "range"."""
+    if format == "usd":
+        return usd_bytes(avatar.splats, frames, _has_moving_color(avatar))
+    return 4 * len(PROPERTIES) * len(avatar.splats) * frames
+
+
+def check_free_space(path: Path, size: int) -> None:
+    """Raise StgaError where the disk that `path` is to be written to has less than `size` bytes free."""
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise StgaError(
+            f"{path}: needs {format_bytes(size)}, but {format_bytes(free)} are free there; choose fewer frames"
+        )
+
+
+def _world_frames(path: Path, avatar: Avatar, meshes: Meshes) -> Iterator[tuple[int, Splats]]:
+    """The avatar's splats on each mesh. Raises StgaError where there is no mesh or no splat."""
+    if not len(avatar.splats):
+        raise StgaError(f"{path}: the avatar has no splats to export")
+    number = None
     for number, mesh in meshes:
-        files.append(path if format == "ply" else path / f"{number:05d}.ply")
-        write_ply(files[-1], to_world(avatar.splats, avatar.frames(mesh)))
-        if format == "ply":
-            break
-    if not files:
+        yield number, to_world(avatar.splats, avatar.frames(mesh))
+    if number is None:
         raise StgaError(f"{path}: there is no posed mesh to export")
-    return files
+
+
+def _has_moving_color(avatar: Avatar) -> bool:
+    return avatar.splats.strain_color.shape[1] > 0
+
+
+def _write_numbered_ply(folder: Path, number: int, world: Splats) -> Path:
+    path = folder / f"{number:05d}.ply"
+    write_ply(path, world)
+    return path

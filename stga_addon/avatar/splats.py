@@ -46,6 +46,18 @@ class Splats:
     def sh_degree(self) -> int:
         return math.isqrt(self.sh.shape[1]) - 1
 
+    def unit_rotations(self) -> np.ndarray:
+        """(N, 4) float32 wxyz, normalized."""
+        return unit_quaternions(self.rotation).astype(np.float32)
+
+    def scales(self) -> np.ndarray:
+        """(N, 3) float32: standard deviations, linear."""
+        return np.exp(self.log_scale)
+
+    def opacities(self) -> np.ndarray:
+        """(N,) float32 in 0 to 1."""
+        return (1 / (1 + np.exp(-self.opacity.astype(np.float64)))).astype(np.float32)
+
     def rows(self, index: np.ndarray) -> "Splats":
         """The splats at `index` (a boolean mask or integer array)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
@@ -54,3 +66,11 @@ class Splats:
 def no_strain_color(count: int) -> np.ndarray:
     """An empty `strain_color` for `count` splats."""
     return np.zeros((count, 0, 3), np.float32)
+
+
+def unit_quaternions(q: np.ndarray) -> np.ndarray:
+    """(..., 4) normalized in float64; a zero quaternion counts as the identity."""
+    q = np.asarray(q, np.float64)
+    largest = np.max(np.abs(q), axis=-1, keepdims=True)
+    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -74,6 +74,34 @@ class Camera:
         )
 
 
+def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: float) -> Camera:
+    """The camera turned by `angle` radians, counterclockwise seen from above, about the axis `up` (3,) through `center`
+    (3,) in world meters: it sees the center at the same place of the image from another side."""
+    x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = np.eye(4)
+    turn[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    turn[:3, 3] = center - turn[:3, :3] @ center
+    return replace(camera, world_to_camera=camera.world_to_camera @ np.linalg.inv(turn))
+
+
+def central_camera(cameras: Sequence[Camera]) -> int:
+    """Index of the camera that looks most nearly in the mean viewing direction; for a head captured from the front and
+    both sides, the one that sees the face."""
+    forward = np.array([camera.world_to_camera[2, :3] for camera in cameras])
+    return int((forward @ forward.mean(0)).argmax())
+
+
+def azimuths(cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float]) -> np.ndarray:
+    """Angle of each camera about the axis `up` (3,) through `center` (3,), in radians from that of `start`, -π to π:
+    what `orbited` turns `start` by to get to its side."""
+    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+    arms = np.array([camera.position for camera in (start, *cameras)]) - center
+    first = arms[0] - arms[0] @ axis * axis
+    angles: np.ndarray = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)
+    return angles
+
+
 def camera_from_gl(
     camera_to_world: np.ndarray, width: int, height: int, fl_x: float, fl_y: float, cx: float, cy: float
 ) -> Camera:

@@ -95,6 +95,31 @@ def real_number(text: str) -> float:
     return value
 
 
+def frame_rate(text: str) -> float:
+    """A number above 0. Raises argparse.ArgumentTypeError for anything else."""
+    value = real_number(text)
+    if not value:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number above 0")
+    return value
+
+
+def frame_span(text: str) -> tuple[int, int]:
+    """ "10:20", both included. Raises argparse.ArgumentTypeError for anything else."""
+    match = re.fullmatch(r"(\d{1,18}):(\d{1,18})", text, re.ASCII)
+    first, last = (int(part) for part in match.groups()) if match else (1, 0)
+    if first > last:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 10:20")
+    return first, last
+
+
+def degrees(text: str) -> float:
+    """An angle up to a full turn. Raises argparse.ArgumentTypeError for anything else."""
+    value = real_number(text)
+    if not 0 < value <= 360:
+        raise argparse.ArgumentTypeError(f"'{text}' is not an angle above 0 and up to 360 degrees")
+    return value
+
+
 def duration(text: str) -> float:
     """Seconds in "90", "90s", "10m", "1h30m", more than 0. Raises argparse.ArgumentTypeError for anything else."""
     match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII)

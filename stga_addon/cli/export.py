@@ -1,16 +1,14 @@
-"""Export an avatar as a GaussianAvatars pair, a world-space PLY or a sequence of them."""
+"""Export an avatar for other viewers and tools: one frame, a range of frames, or splats with their FLAME motion."""
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator
 
-import numpy as np
-
-from ..avatar.export import FORMATS, export_avatar
+from ..avatar.export import DEFAULT_FPS, FORMATS, Meshes, check_free_space, export_avatar, range_bytes
 from ..avatar.file import Avatar
 from ..capture.model import Capture
 from ..errors import StgaError
+from ..format import format_bytes
 from ..jobs.delegate import OpenHead
-from .arguments import add_avatar, usable_path, whole_number
+from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
 from .inputs import open_avatar
 
 NAME, HELP = "export", "write an avatar in another format"
@@ -18,27 +16,66 @@ NAME, HELP = "export", "write an avatar in another format"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_avatar(parser, "avatar", "RUN|AVATAR", head)
-    parser.add_argument("--format", choices=FORMATS, required=True)
+    parser.add_argument("--format", choices=tuple(FORMATS), required=True)
     parser.add_argument("--capture", type=usable_path, help="whose frames to bake (default: the run's)")
     parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture")
-    parser.add_argument("--timestep", type=whole_number(0), help="frame of a single PLY (default: the neutral mesh)")
+    parser.add_argument(
+        "--timestep", type=whole_number(0), help="of a format that holds one frame (default: the neutral mesh)"
+    )
+    parser.add_argument(
+        "--frames", type=frame_span, metavar="FIRST:LAST", help="of a format that holds several (default: all)"
+    )
+    parser.add_argument(
+        "--fps", type=frame_rate, default=DEFAULT_FPS if head is None else head.fps, help="frames per second of usd"
+    )
     parser.add_argument("--out", type=usable_path, required=True)
 
 
 def run(options: Namespace) -> None:
     avatar, capture = open_avatar(options.avatar, options)
-    sequence = None if capture is None else capture.flame
-    export_avatar(options.out, avatar, options.format, _posed_meshes(avatar, capture, options), sequence)
+    source = FORMATS[options.format].source
+    for option, belongs_to in (("timestep", "frame"), ("frames", "range")):
+        if getattr(options, option) is not None and source != belongs_to:
+            names = [name for name, format in FORMATS.items() if format.source == belongs_to]
+            raise StgaError(
+                f"--{option} cannot be combined with --format {options.format}, only with {', '.join(names)}"
+            )
+    if source == "motion":
+        meshes: Meshes = ()
+    elif source == "range":
+        meshes = _range(avatar, capture, options)
+    else:
+        meshes = _frame(avatar, capture, options.timestep)
+    export_avatar(options.out, avatar, options.format, meshes, None if capture is None else capture.flame, options.fps)
 
 
-def _posed_meshes(avatar: Avatar, capture: Capture | None, options: Namespace) -> Iterator[tuple[int, np.ndarray]]:
-    """(timestep, mesh) to export: all of a sequence, the one that was asked for, or the neutral mesh."""
-    if options.format == "ply" and options.timestep is None:
+def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> Meshes:
+    """The mesh of one timestep, or the neutral mesh."""
+    if timestep is None:
         yield 0, avatar.neutral
         return
+    capture = _required(capture)
+    if timestep not in capture.timesteps:
+        raise StgaError(f"{capture.root}: has no timestep {timestep}")
+    yield timestep, capture.mesh(timestep)
+
+
+def _range(avatar: Avatar, capture: Capture | None, options: Namespace) -> Meshes:
+    """The meshes of --frames, with a progress bar; says how much room they take, and refuses what the disk lacks."""
+    from tqdm import tqdm
+
+    capture = _required(capture)
+    first, last = options.frames or (capture.timesteps[0], capture.timesteps[-1])
+    timesteps = [timestep for timestep in capture.timesteps if first <= timestep <= last]
+    if not timesteps:
+        raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
+    size = range_bytes(avatar, options.format, len(timesteps))
+    check_free_space(options.out, size)
+    print(f"{len(timesteps)} frames of {len(avatar.splats)} splats: about {format_bytes(size)}")
+    return ((timestep, capture.mesh(timestep)) for timestep in tqdm(timesteps, desc="Exporting", unit="frame"))
+
+
+def _required(capture: Capture | None) -> Capture:
     if capture is None:
         raise StgaError("frames other than the neutral mesh need a capture; give --capture")
-    for timestep in capture.timesteps if options.format == "ply-sequence" else (options.timestep,):
-        if timestep not in capture.timesteps:
-            raise StgaError(f"{capture.root}: has no timestep {timestep}")
-        yield timestep, capture.mesh(timestep)
+    return capture

@@ -1,15 +1,17 @@
-"""Render an avatar from the cameras of a file, one PNG per camera entry, named like its file_path."""
+"""Render an avatar: one PNG per camera entry, a video of its motion, or a turntable."""
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from ..avatar.file import read_avatar
 from ..avatar.ply import read_ply
-from ..capture.model import Capture, View
+from ..capture.camera import Camera, central_camera
+from ..capture.camera_path import TURNTABLE_S, covered_angles, to_and_fro, turntable
+from ..capture.model import View
 from ..capture.open import open_capture
 from ..capture.transforms import read_transforms
 from ..errors import StgaError
@@ -17,15 +19,38 @@ from ..files import replacing
 from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
 from ..jobs.delegate import OpenHead
-from .arguments import add_avatar, add_principal_point, color, usable_path
+from .arguments import add_avatar, add_principal_point, color, degrees, real_number, usable_path, whole_number
 from .inputs import avatar_path, check_topology, open_avatar
 
-NAME, HELP = "render", "render an avatar, one PNG per camera entry"
+NAME, HELP = "render", "render an avatar as pictures, video or turntable"
+AUTO = -1.0
+"""Degrees of a turntable that covers what the cameras saw."""
+MAX_TURNTABLE_IMAGES = 100_000
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_avatar(parser, "source", "RUN|AVATAR|PLY", head)
-    parser.add_argument("--cameras", type=usable_path, required=True, metavar="TRANSFORMS.json")
+    output = parser.add_mutually_exclusive_group(required=True)
+    output.add_argument("--out", type=usable_path, metavar="DIR", help="folder for PNGs")
+    output.add_argument("--video", type=usable_path, metavar="FILE.mp4", help="every timestep from one camera, as MP4")
+    parser.add_argument(
+        "--cameras",
+        type=usable_path,
+        metavar="TRANSFORMS.json",
+        help="one PNG per entry; for a video, where its camera is from (default: the capture)",
+    )
+    parser.add_argument(
+        "--turntable", type=degrees, nargs="?", const=AUTO, metavar="DEGREES",
+        help="move one camera around the head: 360 for a full turn, less to both sides (default: what cameras saw)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--camera", type=whole_number(0), metavar="INDEX", help="camera of the video (default: the central one)"
+    )
+    parser.add_argument("--fps", type=real_number, default=25.0, help="frames per second of the video (default 25)")
+    parser.add_argument(
+        "--seconds", type=real_number, default=TURNTABLE_S, metavar="S",
+        help=f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
+    )  # fmt: skip
     parser.add_argument("--capture", type=usable_path, help="whose meshes drive the avatar (default: the run's)")
     parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture, or of the motion")
     parser.add_argument(
@@ -34,27 +59,97 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         metavar="FILE",
         help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
     )
-    parser.add_argument("--out", type=usable_path, required=True, metavar="DIR")
     parser.add_argument("--background", type=color, default="white", help="white, black or R,G,B in 0…1")
     add_principal_point(parser)
 
 
 def run(options: Namespace) -> None:
+    if options.video is not None and options.video.suffix.lower() != ".mp4":
+        raise StgaError(f"{options.video}: a video's name ends in .mp4")
+    if options.cameras is None and options.video is None and options.turntable is None:
+        raise StgaError("--out needs --cameras, which says what to render, or --turntable")
+    principal_point = options.principal_point or _principal_point(options.source)
+    views = None
+    if options.cameras is not None:
+        views = [frame.view for frame in read_transforms(options.cameras, principal_point)]
+    subject = _subject(options) if options.motion is None else _reenacted(options)
+    if options.video is not None or options.turntable is not None:
+        _film(options, subject, subject.views if views is None else views)
+    else:
+        assert views is not None
+        _write_pictures(options.out, subject, views if options.motion is None else _every_timestep(subject, views))
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """What is rendered.
+
+    image      view -> image (3, H, W)
+    timesteps  of its motion, ascending; none where nothing moves
+    center     of the head or splats at the first timestep, (3,) meters
+    views      of its capture
+    """
+
+    image: Callable[[View], np.ndarray]
+    timesteps: tuple[int, ...]
+    center: Callable[[], np.ndarray]
+    views: Sequence[View] = ()
+
+
+def _write_pictures(folder: Path, subject: _Subject, views: list[View]) -> None:
     from PIL import Image
     from tqdm import tqdm
 
     from ..raster.render import to_uint8
 
-    principal_point = options.principal_point or _principal_point(options.source)
-    views = [frame.view for frame in read_transforms(options.cameras, principal_point)]
-    if options.motion is None:
-        render = _renderer(options)
-    else:
-        render, views = _reenactment(options, views)
     names = _unique_names([view.name for view in views])
     for view, name in zip(tqdm(views, desc="Rendering", unit="image"), names, strict=True):
-        with replacing(options.out / name) as partial:
-            Image.fromarray(to_uint8(render(view))).save(partial, format="PNG")
+        with replacing(folder / name) as partial:
+            Image.fromarray(to_uint8(subject.image(view))).save(partial, format="PNG")
+
+
+def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
+    """Write the subject's motion as one camera sees it, which stands still or orbits."""
+    from tqdm import tqdm
+
+    from ..raster.render import to_uint8
+    from ..raster.video import sequence_writer, video_writer
+
+    start = _chosen_camera(options, views)
+    timesteps: Sequence[int] = subject.timesteps or (0,)
+    path = [start] * len(timesteps)
+    if options.turntable is not None:
+        count = max(len(timesteps), round(min(options.seconds * options.fps, MAX_TURNTABLE_IMAGES)), 1)
+        timesteps = to_and_fro(timesteps, count)
+        cameras = _turntable(options.turntable, start, views, subject.center(), count)
+        path = [replace(start, camera=camera) for camera in cameras]
+    path = [replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)]
+    writer = sequence_writer(options.out) if options.video is None else video_writer(options.video, options.fps)
+    with writer as write:
+        for view in tqdm(path, desc="Rendering", unit="image"):
+            write(to_uint8(subject.image(view)))
+
+
+def _turntable(turn: float, start: View, views: Sequence[View], center: np.ndarray, count: int) -> list[Camera]:
+    """turn: degrees, or AUTO."""
+    if turn == AUTO:
+        angles = covered_angles([view.camera for view in views], start.camera, center)
+    else:
+        angles = -np.radians(turn) / 2, np.radians(turn) / 2
+    return turntable(start.camera, center, count, angles)
+
+
+def _chosen_camera(options: Namespace, views: Sequence[View]) -> View:
+    """The first view of the camera to film with."""
+    first = {view.camera_index: view for view in reversed(views)}
+    if not first:
+        raise StgaError(f"{options.source}: there is no camera to render from; give --cameras")
+    if options.camera is None:
+        indices = sorted(first)
+        return first[indices[central_camera([first[index].camera for index in indices])]]
+    if options.camera not in first:
+        raise StgaError(f"--camera {options.camera}: there are only {', '.join(map(str, sorted(first)))}")
+    return first[options.camera]
 
 
 def _principal_point(source: Path) -> str:
@@ -62,21 +157,34 @@ def _principal_point(source: Path) -> str:
     return "vhap" if source.suffix.lower() == ".ply" else read_avatar(avatar_path(source)).principal_point
 
 
-def _renderer(options: Namespace) -> Callable[[View], np.ndarray]:
-    """View -> image (3, H, W), for an avatar with its capture or a plain world-space PLY."""
+def _subject(options: Namespace) -> _Subject:
+    """An avatar with its capture, or a plain world-space PLY."""
     from ..raster.render import render, render_avatar
 
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
-        return lambda view: render(splats, view.camera, options.background)
+        return _Subject(
+            lambda view: render(splats, view.camera, options.background), (), lambda: np.median(splats.xyz, axis=0)
+        )
     avatar, capture = open_avatar(options.source, options)
     if capture is None:
         raise StgaError(f"{options.source}: an avatar needs the meshes of a capture to follow; give --capture")
-    return lambda view: render_avatar(avatar, _mesh(capture, view), view.camera, options.background)
+
+    def mesh(view: View) -> np.ndarray:
+        if view.timestep not in capture.timesteps:
+            raise StgaError(f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for")
+        return np.asarray(capture.mesh(view.timestep))
+
+    return _Subject(
+        lambda view: render_avatar(avatar, mesh(view), view.camera, options.background),
+        capture.timesteps,
+        lambda: _middle(capture.mesh(capture.timesteps[0])),
+        [view for views in capture.views.values() for view in views],
+    )
 
 
-def _reenactment(options: Namespace, views: list[View]) -> tuple[Callable[[View], np.ndarray], list[View]]:
-    """An avatar moved by another person's FLAME motion; each timestep is seen from the first pose of each camera."""
+def _reenacted(options: Namespace) -> _Subject:
+    """An avatar moved by another person's FLAME motion."""
     from ..raster.render import render_avatar
     from ..training.run.folder import read_run
 
@@ -89,20 +197,30 @@ def _reenactment(options: Namespace, views: list[View]) -> tuple[Callable[[View]
         raise StgaError(f"{options.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
     check_topology(motion, avatar)
     sequence = transferred_motion(motion.flame, avatar.neutral)
+
+    def mesh(timestep: int) -> np.ndarray:
+        return sequence_mesh(sequence, timestep)
+
+    return _Subject(
+        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background),
+        tuple(sequence.timesteps),
+        lambda: _middle(mesh(sequence.timesteps[0])),
+    )
+
+
+def _middle(vertices: np.ndarray) -> np.ndarray:
+    """(3,) center of the vertices' bounding box."""
+    return np.asarray((vertices.min(0) + vertices.max(0)) / 2)
+
+
+def _every_timestep(subject: _Subject, views: list[View]) -> list[View]:
+    """Each timestep of the motion as the first pose of each camera sees it."""
     cameras = {view.camera_index: view for view in reversed(views)}
-    placed = [
+    return [
         replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")
-        for timestep in sequence.timesteps
+        for timestep in subject.timesteps
         for index in sorted(cameras)
     ]
-    background = options.background
-    return lambda view: render_avatar(avatar, sequence_mesh(sequence, view.timestep), view.camera, background), placed
-
-
-def _mesh(capture: Capture, view: View) -> np.ndarray:
-    if view.timestep not in capture.timesteps:
-        raise StgaError(f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for")
-    return np.asarray(capture.mesh(view.timestep))
 
 
 def _unique_names(paths: list[str]) -> list[str]:

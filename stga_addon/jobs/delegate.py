@@ -1,5 +1,6 @@
 """Running a CLI command on the open .blend file: its head as a folder that another Python reads."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ HEAD, SELECTION, PLAYED = "head.json", "selection.npz", "played.npz"
 class OpenHead:
     """The head of the .blend file that Blender has open: what a command works on where nothing is named.
 
+    fps        frames per second of the scene
     selection  what the file's vertex groups train, timestep -> (F,) bool; None without any
     played     the capture -> the same with the scene's frames: its meshes are the head's, however it is animated
     """
@@ -29,6 +31,7 @@ class OpenHead:
     flame: Path | None
     principal_point: str
     avatar: Path | None
+    fps: float
     selection: Callable[[], Mapping[int, np.ndarray] | None]
     played: Callable[[Capture], Capture]
 
@@ -40,7 +43,7 @@ def write_head(folder: Path, head: OpenHead, played: bool) -> None:
     """
     paths = {"capture": head.capture, "flame": head.flame, "avatar": head.avatar}
     values = {name: None if path is None else str(path) for name, path in paths.items()}
-    write_json(folder / HEAD, {**values, "principal_point": head.principal_point})
+    write_json(folder / HEAD, {**values, "principal_point": head.principal_point, "fps": head.fps})
     selection = head.selection()
     if selection is not None:
         write_npz(folder / SELECTION, {str(timestep): faces for timestep, faces in selection.items()})
@@ -55,6 +58,8 @@ def read_head(folder: Path) -> OpenHead:
     values = read_json(path)
     if not isinstance(values, dict) or values.get("principal_point") not in PRINCIPAL_POINTS:
         raise StgaError(f"{path}: is not the head of an open .blend file (principal_point is missing)")
+    if not isinstance(values.get("fps"), float) or not 0 < values["fps"] < math.inf:
+        raise StgaError(f"{path}: fps is {shorten(values.get('fps'))}, expected a number above 0")
     for name, needed in (("capture", True), ("flame", False), ("avatar", False)):
         value = values.get(name)
         if not isinstance(value, str) and (needed or value is not None):
@@ -68,7 +73,7 @@ def read_head(folder: Path) -> OpenHead:
         meshes = _by_timestep(folder / PLAYED)
         return replace(capture, timesteps=tuple(sorted(meshes)), mesh=meshes.__getitem__, flame=None)
 
-    return OpenHead(Path(values["capture"]), flame, values["principal_point"], avatar, selection, played)
+    return OpenHead(Path(values["capture"]), flame, values["principal_point"], avatar, values["fps"], selection, played)
 
 
 def _by_timestep(path: Path) -> dict[int, np.ndarray]:

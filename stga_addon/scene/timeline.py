@@ -1,8 +1,14 @@
-"""The scene's current frame."""
+"""The scene's frames: their rate, the current one, and one after the other."""
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import bpy
+
+
+def frames_per_second(scene: Any) -> float:
+    """At which the scene plays."""
+    return float(scene.render.fps / scene.render.fps_base)
 
 
 def go_to_frame(frame: int) -> None:

@@ -11,6 +11,7 @@ REQUIREMENTS = {
     "tqdm": "tqdm>=4.60,<5",
     "filelock": "filelock>=4,<5",
     "matplotlib": "matplotlib>=3.8,<4",
+    "av": "av>=14,<19",
 }
 """Imported module -> requirement as pip reads it."""
 GPU_REQUIREMENT = "warp-lang>=1.19,<2"

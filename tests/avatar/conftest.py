@@ -5,6 +5,7 @@ import pytest
 
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
+from stga_addon.capture.camera import look_at
 
 
 def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Splats:
@@ -29,6 +30,13 @@ def random_mesh(seed: int, vertices: int = 20, faces: int = 30) -> tuple[np.ndar
     rng = np.random.default_rng(seed)
     corners = rng.permuted(np.tile(np.arange(vertices, dtype=np.int32), (faces, 1)), axis=1)[:, :3]
     return rng.normal(size=(vertices, 3)) * 0.1, np.ascontiguousarray(corners)
+
+
+def rendered(world: Splats) -> np.ndarray:
+    """(3, 48, 64) picture of world-space splats."""
+    from stga_addon.raster.render import render
+
+    return np.asarray(render(world, look_at((0.3, 0.2, 1), (0, 0, 0), width=64, height=48, focal_length=90)))
 
 
 @pytest.fixture

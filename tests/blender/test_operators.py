@@ -1,5 +1,7 @@
 """The operators, called as a script calls them, from the checkout registered as an extension."""
 
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +13,14 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
+from stga_addon.avatar.export import export_avatar  # noqa: E402
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
@@ -205,6 +209,71 @@ def test_exports_read_back(extension, mesh_capture, tmp_path):
     assert bpy.context.scene.frame_current == 3
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
+
+
+def test_exports_for_other_tools(extension, mesh_capture, tmp_path):
+    """Catches formats that Blender cannot write, frames left out, and a rate that is not the scene's."""
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    bpy.context.scene.render.fps = 30
+    for name in ("a.usdz", "a.glb", "a.spz"):
+        format = {"usdz": "usd", "glb": "gltf", "spz": "spz"}[name.partition(".")[2]]
+        assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / name), format=format) == {"FINISHED"}
+        assert (tmp_path / name).stat().st_size > 0
+    stage = usd.Stage.Open(str(tmp_path / "a.usdz"))
+    assert stage.GetTimeCodesPerSecond() == 30
+    positions = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions")
+    assert positions.GetTimeSamples() == [0, 1, 2, 3]
+    capture = open_capture(mesh_capture)
+    for frame in range(4):
+        expected = expected_world(avatar, capture.mesh(frame)).xyz
+        np.testing.assert_allclose(positions.Get(frame), expected, atol=1e-5)
+
+
+def range_export(extension, folder: Path, frames: range, stop_after: int | None = None) -> list[Path]:
+    """The files of a range exported step by step, as the dialog does; cancelled after some steps."""
+    module = sys.modules[f"{extension.__name__}.operators.export_range"]
+
+    def write(meshes):
+        export_avatar(folder, read_avatar(folder.parent / "avatar.npz"), "ply-sequence", meshes)
+
+    job = module.RangeExport(bpy.context.scene.stga.head, frames, write)
+    while job.step() and (stop_after is None or job.done < stop_after):
+        time.sleep(0.001)
+    assert job.finish() == (stop_after is None)
+    return sorted(folder.glob("*.ply"))
+
+
+def test_a_range_is_exported_step_by_step(extension, mesh_capture, tmp_path):
+    """Catches a dialog's export that differs from a script's, and one that leaves traces where it was cancelled."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.context.scene.frame_set(1)
+    files = range_export(extension, tmp_path / "whole", range(4))
+    assert [path.name for path in files] == [f"{frame:05d}.ply" for frame in range(4)]
+    expected = expected_world(avatar, open_capture(mesh_capture).mesh(3)).xyz
+    np.testing.assert_allclose(read_ply(files[3]).xyz, expected, atol=1e-5)
+    assert len(range_export(extension, tmp_path / "cut", range(4), stop_after=2)) <= 2
+    assert not list((tmp_path / "cut").glob(".*"))
+    assert bpy.context.scene.frame_current == 1
+
+
+def test_a_range_that_cannot_be_written_says_why(extension, mesh_capture, tmp_path):
+    """Catches an export whose thread fails in silence, or for which Blender waits for ever."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    module = sys.modules[f"{extension.__name__}.operators.export_range"]
+
+    def write(meshes):
+        next(iter(meshes))
+        raise StgaError("no room")
+
+    job = module.RangeExport(bpy.context.scene.stga.head, range(50), write)
+    while job.step():
+        time.sleep(0.001)
+    with pytest.raises(StgaError, match="no room"):
+        job.finish()
 
 
 def test_gaussian_avatars_export(extension, tmp_path):

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -222,6 +223,45 @@ def test_export_a_sequence(trained: Path, tmp_path: Path) -> None:
     assert pictures(tmp_path / "s") == ["00000.ply", "00001.ply", "00003.ply"]
     low = [read_ply(path).xyz[:, 1].min() for path in sorted((tmp_path / "s").iterdir())]
     assert low[0] > low[1] > low[2]
+
+
+def test_export_a_range_as_usd(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches timesteps outside the range, and a size that is not told before."""
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    out = tmp_path / "a.usdc"
+    assert main(["export", str(trained), "--format", "usd", "--frames", "1:3", "--fps", "50", "--out", str(out)]) == 0
+    assert "2 frames of" in capsys.readouterr().out
+    stage = usd.Stage.Open(str(out))
+    assert stage.GetTimeCodesPerSecond() == 50
+    assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [1, 3]
+
+
+@pytest.mark.parametrize(("format", "magic"), [("gltf", b"glTF"), ("spz", b"\x1f\x8b")])
+def test_export_one_frame(trained: Path, tmp_path: Path, format: str, magic: bytes) -> None:
+    """Catches a format that the command cannot write, or writes for another frame than asked for."""
+    files = [tmp_path / "neutral", tmp_path / "frame"]
+    for out, chosen in zip(files, ([], ["--timestep", "3"]), strict=True):
+        assert main(["export", str(trained), "--format", format, "--out", str(out), *chosen]) == 0
+    neutral, frame = (out.read_bytes() for out in files)
+    assert neutral.startswith(magic)
+    assert neutral != frame
+
+
+def test_export_refuses_what_does_not_fit(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches options that are ignored, and a range that fills the disk."""
+    out = ["--out", tmp_path / "o"]
+    message = refused(capsys, "export", trained, "--format", "gltf", "--frames", "0:1", *out)
+    assert "--frames cannot be combined with --format gltf, only with ply-sequence, usd" in message
+    message = refused(capsys, "export", trained, "--format", "usd", "--timestep", 1, *out)
+    assert "--timestep cannot be combined with --format usd" in message
+    message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)
+    assert "has no timestep from 7 to 9" in message
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
+    message = refused(capsys, "export", trained, "--format", "ply-sequence", *out)
+    assert "1.0 kB are free there" in message
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

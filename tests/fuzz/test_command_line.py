@@ -130,7 +130,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_job(case / "job", TrainingJob(capture, None, "vhap", read_run(case / "run").settings))
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
     (case / "head").mkdir()
-    head = {"capture": str(capture), "flame": None, "avatar": str(case / "run/avatar.npz"), "principal_point": "vhap"}
+    head = {
+        "capture": str(capture),
+        "flame": None,
+        "avatar": str(case / "run/avatar.npz"),
+        "principal_point": "vhap",
+        "fps": 24.0,
+    }
     (case / "head/head.json").write_text(json.dumps(head))
     np.savez(case / "motion.npz", expr=np.zeros((2, 2)), pose=np.zeros((2, 15)), shape=np.zeros(4))
     case.rename(folder / "template")
@@ -306,21 +312,33 @@ def train(rng: random.Random, case: Path) -> list[str]:
 
 def render(rng: random.Random, case: Path) -> list[str]:
     source = some_path(rng, case, "run", "tracked", "run/avatar.npz", "splats.ply", "unfinished")
-    arguments = [source, "--cameras", some_path(rng, case, "mesh/transforms_val.json", "flame/transforms_test.json")]
+    cameras = some_path(rng, case, "mesh/transforms_val.json", "flame/transforms_test.json")
+    arguments = [source, *option(rng, 0.8, "--cameras", cameras)]
+    arguments += option(rng, 0.2, "--turntable", "90", "360", *NUMBERS)
+    arguments += option(rng, 0.2, "--camera", "0", "2", *NUMBERS)
+    # A turntable always has few images: each takes as long as one of any other render.
+    arguments += ["--seconds", rng.choice(["0", "0.1"]), *option(rng, 0.1, "--fps", "10", "0", "-1", "nan")]
     arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
     arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
     arguments += option(rng, 0.2, "--motion", some_path(rng, case, "motion.npz", "flame"))
     arguments += option(rng, 0.2, "--background", "black", "0,0.5,1", "nan,0,0", "1,2", "1e400,0,0", *TEXTS)
     arguments += option(rng, 0.1, "--principal-point", "vhap", "opencv", *TEXTS)
+    if rng.random() < 0.2:
+        return [*arguments, "--video", some_path(rng, case, "new.mp4", "new.avi")]
     return [*arguments, *output(rng, case, "pictures")]
 
 
 def export(rng: random.Random, case: Path) -> list[str]:
     arguments = [some_path(rng, case, "run", "tracked", "run/avatar.npz", "tracked/avatar.npz", "unfinished")]
-    arguments += ["--format", rng.choice(["ply", "ply", "ply-sequence", "gaussian-avatars", "obj"])]
+    arguments += [
+        "--format",
+        rng.choice(["ply", "ply", "ply-sequence", "gaussian-avatars", "usd", "gltf", "spz", "obj"]),
+    ]
     arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
     arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
     arguments += option(rng, 0.3, "--timestep", "1", *NUMBERS)
+    arguments += option(rng, 0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS)
+    arguments += option(rng, 0.2, "--fps", "25", *NUMBERS)
     return [*arguments, *output(rng, case, "exported")]
 
 

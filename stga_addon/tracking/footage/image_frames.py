@@ -1,0 +1,33 @@
+"""Frames of one camera that are image files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...capture.images import read_image, read_mask
+from ...capture.model import View
+
+
+@dataclass(frozen=True)
+class ImageFrames:
+    """`views`: timestep -> the image as recorded, ascending; its camera says how large the image must be."""
+
+    views: Mapping[int, View]
+
+    @property
+    def timesteps(self) -> tuple[int, ...]:
+        return tuple(self.views)
+
+    def image(self, timestep: int) -> np.ndarray:
+        return read_image(self.views[timestep])
+
+    def mask(self, timestep: int) -> np.ndarray | None:
+        return read_mask(self.views[timestep])
+
+    def source(self, timestep: int) -> str:
+        return str(self.views[timestep].image)
+
+    def file(self, timestep: int) -> Path | None:
+        return self.views[timestep].image

@@ -1,0 +1,96 @@
+"""Footage: the cameras of a rig and their synchronized frames, undistorted and decoded on request."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ...capture.camera import Camera
+from .undistort import Undistortion
+
+
+class Frames(Protocol):
+    """The frames of one camera as they were recorded. Not thread-safe: a video has one decoder."""
+
+    @property
+    def timesteps(self) -> tuple[int, ...]:
+        """Timesteps that have a frame, ascending."""
+
+    def image(self, timestep: int) -> np.ndarray:
+        """(H, W, 3) uint8 sRGB. Raises StgaError that names the file; KeyError for a timestep without a frame."""
+
+    def mask(self, timestep: int) -> np.ndarray | None:
+        """(H, W) uint8, 255 inside; None where the frame has none. Raises as `image` does."""
+
+    def source(self, timestep: int) -> str:
+        """What a message calls the frame: its file, in a video with the number of the frame."""
+
+    def file(self, timestep: int) -> Path | None:
+        """The image file that holds the frame; None in a video."""
+
+
+@dataclass(frozen=True)
+class FootageCamera:
+    """A calibrated camera and its frames, as an ideal pinhole sees them.
+
+    name       unique in the footage
+    camera     of the undistorted images, with OpenCV axes; its world has the scale and orientation of the calibration
+    frames     as recorded
+    undistortion  from the recorded frames to those of `camera`; None where the lens has no distortion
+    """
+
+    name: str
+    camera: Camera
+    frames: Frames
+    undistortion: Undistortion | None = None
+
+    @property
+    def timesteps(self) -> tuple[int, ...]:
+        """Timesteps at which this camera has a frame, ascending."""
+        return self.frames.timesteps
+
+    def image(self, timestep: int) -> np.ndarray:
+        """The undistorted frame (H, W, 3) uint8 sRGB; transparent pixels are laid over white.
+
+        Reading a video in order is fast; going back decodes again from the last key frame.
+        Raises StgaError that names the file; KeyError where the camera has no frame at the timestep.
+        """
+        image = self.frames.image(timestep)
+        return image if self.undistortion is None else self.undistortion(image)
+
+    def mask(self, timestep: int) -> np.ndarray | None:
+        """The undistorted foreground mask (H, W) uint8, 255 inside; None where there is none. Raises as `image`."""
+        mask = self.frames.mask(timestep)
+        return mask if mask is None or self.undistortion is None else self.undistortion(mask)
+
+    def source(self, timestep: int) -> str:
+        """What a message calls the frame: its file, in a video with the number of the frame."""
+        return self.frames.source(timestep)
+
+    def file(self, timestep: int) -> Path | None:
+        """An image file with the same pixels as `image`; None for frames of videos and of distorted lenses."""
+        return self.frames.file(timestep) if self.undistortion is None else None
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What was filmed: cameras with unique names, in the order of the calibration.
+
+    timesteps   all that any camera has a frame of, ascending
+    fps         frames per second of the videos; None for images
+    calibrated  False for one camera whose focal length is a guess, not read from a file or given
+    """
+
+    root: Path
+    cameras: tuple[FootageCamera, ...]
+    timesteps: tuple[int, ...]
+    fps: float | None = None
+    calibrated: bool = True
+
+    def views(self) -> Iterator[tuple[int, FootageCamera]]:
+        """(timestep, camera) of every frame, camera by camera in order of time: the fast order for videos."""
+        for camera in self.cameras:
+            for timestep in camera.timesteps:
+                yield timestep, camera

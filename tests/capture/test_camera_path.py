@@ -1,0 +1,70 @@
+"""Camera paths, compared with cameras that `look_at` places."""
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.camera import Camera, azimuths, central_camera, look_at, orbited
+from stga_addon.capture.camera_path import UP, covered_angles, to_and_fro, turntable
+
+CENTER = np.array([0.1, 0.2, -0.3])
+
+
+def camera(degrees: float, height: float = 0.1) -> Camera:
+    """At one meter from the axis through the center, counterclockwise from +z seen from above."""
+    angle = np.radians(degrees)
+    eye = CENTER + np.array([np.sin(angle), height, np.cos(angle)])
+    return look_at(tuple(eye), tuple(CENTER), 64, 48, 80.0)
+
+
+def assert_same_pose(one: Camera, other: Camera) -> None:
+    np.testing.assert_allclose(one.world_to_camera, other.world_to_camera, atol=1e-12)
+
+
+def test_orbit() -> None:
+    """Catches a turn in the other direction, about another point, or one that loses the framing."""
+    for degrees in (0, 30, -100, 180):
+        assert_same_pose(orbited(camera(20), CENTER, UP, np.radians(degrees)), camera(20 + degrees))
+
+
+def test_azimuths_undo_the_orbit() -> None:
+    """Catches angles that do not lead from one camera to the other."""
+    start, others = camera(20), [camera(angle, height) for angle, height in ((20, 0.5), (-60, -0.2), (150, 0.1))]
+    np.testing.assert_allclose(np.degrees(azimuths(others, start, CENTER, (0, 2, 0))), (0, -80, 130), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("angles", "start", "expected"),
+    [
+        ((-70, -30, 0, 40, 80), 0, (-70, 80)),  # around the face
+        ((-70, -30, 0, 40, 80), -70, (0, 150)),  # the same from the outermost camera
+        ((110, 150, 180, 220, 250), 180, (-70, 70)),  # beyond ±180°
+        ((0, 90, 180, 270), 0, (-180, 180)),  # all around
+        ((30,), 30, (0, 0)),
+    ],
+)
+def test_covered_angles(angles: tuple[float, ...], start: float, expected: tuple[float, float]) -> None:
+    """Catches a turntable that shows a side which no camera saw, or leaves out one that they did."""
+    covered = covered_angles([camera(angle) for angle in angles], camera(start), CENTER)
+    np.testing.assert_allclose(np.degrees(covered), expected, atol=1e-9)
+
+
+def test_turntable() -> None:
+    """Catches a full turn that ends in its first view, and a partial one that leaves its limits or jumps."""
+    full = turntable(camera(10), CENTER, 8, (-np.pi, np.pi))
+    for index, each in enumerate(full):
+        assert_same_pose(each, camera(10 + 45 * index))
+    partial = turntable(camera(10), CENTER, 200, (np.radians(-30), np.radians(60)))
+    degrees = np.degrees(azimuths(partial, camera(10), CENTER, UP))
+    assert (degrees.min(), degrees.max()) == pytest.approx((-30, 60), abs=0.1)
+    assert np.abs(np.diff(np.append(degrees, degrees[0]))).max() < 2
+
+
+def test_central_camera() -> None:
+    """Catches a choice by order, or by position in a capture that is off center."""
+    assert central_camera([camera(angle) for angle in (80, -70, 5, 40, -30)]) == 2
+
+
+def test_to_and_fro() -> None:
+    """Catches a jump from the last timestep to the first, and a timestep shown twice at the turning points."""
+    assert to_and_fro((3, 5, 8), 9) == [3, 5, 8, 5, 3, 5, 8, 5, 3]
+    assert to_and_fro((4,), 3) == [4, 4, 4]

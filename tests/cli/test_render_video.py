@@ -1,0 +1,104 @@
+"""`stga render --video` and `--turntable`."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from capture import factory
+from PIL import Image
+
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.ply import write_ply
+from stga_addon.capture.camera import orbited
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+from stga_addon.raster.render import render_avatar, to_uint8
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> dict[str, Path]:
+    """A capture with three timesteps and three cameras, and an avatar whose every splat has its own color."""
+    root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 3), range(3))
+    capture = open_capture(root)
+    splats = lattice_splats(capture.neutral, capture.faces, order=0)
+    splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
+    write_avatar(tmp_path / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
+    return {"avatar": tmp_path / "a.npz", "capture": root}
+
+
+def render(parts: dict[str, Path], *more: object) -> int:
+    return main([str(a) for a in ("render", parts["avatar"], "--capture", parts["capture"], *more)])
+
+
+def decoded(path: Path) -> tuple[float, list[np.ndarray]]:
+    with av.open(str(path)) as container:
+        rate = container.streams.video[0].average_rate
+        assert rate is not None
+        return float(rate), [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Catches a video of another camera, or with timesteps missing, doubled or out of order."""
+    assert render(parts, "--video", tmp_path / "v.mp4", "--camera", 2, "--fps", 10) == 0
+    rate, images = decoded(tmp_path / "v.mp4")
+    assert (rate, len(images)) == (10, 3)
+    avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
+    camera = next(view.camera for views in capture.views.values() for view in views if view.camera_index == 2)
+    for image, timestep in zip(images, (0, 1, 3), strict=True):
+        errors = {
+            other: np.abs(to_uint8(render_avatar(avatar, capture.mesh(other), camera)).astype(int) - image).mean()
+            for other in capture.timesteps
+        }
+        assert min(errors, key=errors.__getitem__) == timestep
+        assert errors[timestep] < 12  # colors at half the resolution: splats are a few pixels wide
+
+
+def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Catches a turn about another point, one that leaves out a part of the circle, and motion that does not play."""
+    out = tmp_path / "turn"
+    assert render(parts, "--turntable", 360, "--out", out, "--seconds", 2, "--fps", 4, "--camera", 0) == 0
+    pictures = sorted(out.iterdir())
+    assert [path.name for path in pictures] == [f"{index:04d}.png" for index in range(1, 9)]
+    avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
+    start = next(view.camera for views in capture.views.values() for view in views if view.camera_index == 0)
+    first = capture.mesh(0)
+    center = (first.min(0) + first.max(0)) / 2
+    for index, timestep in ((0, 0), (2, 3), (3, 1), (5, 1)):
+        camera = orbited(start, center, (0, 1, 0), np.radians(45 * index))
+        expected = to_uint8(render_avatar(avatar, capture.mesh(timestep), camera)).astype(int)
+        assert np.abs(np.asarray(Image.open(pictures[index])) - expected).max() <= 1
+
+
+def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Catches a PLY, which has neither timesteps nor capture, that cannot be turned."""
+    ply, cameras = tmp_path / "scan.ply", parts["capture"] / "transforms_train.json"
+    write_ply(ply, read_avatar(parts["avatar"]).splats)
+    assert main(["render", str(ply), "--video", str(tmp_path / "v.mp4"), "--turntable"]) == 2
+    arguments = ["--turntable", "--cameras", str(cameras), "--seconds", "0.2"]
+    assert main(["render", str(ply), "--video", str(tmp_path / "v.mp4"), *arguments]) == 0
+    assert len(decoded(tmp_path / "v.mp4")[1]) == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--video", "v.avi"], "ends in .mp4"),
+        (["--video", "v.mp4", "--camera", "7"], "there are only 0, 1, 2"),
+        (["--video", "v.mp4", "--fps", "0"], "frame rate above 0"),
+        (["--out", "pictures"], "needs --cameras"),
+    ],
+)
+def test_mistakes(
+    parts: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], reason: str,
+) -> None:  # fmt: skip
+    """Catches a mistake that ends in a traceback, or in a file."""
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert render(parts, *arguments) == 2
+    assert reason in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before

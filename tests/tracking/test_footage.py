@@ -1,0 +1,103 @@
+"""Footage opened from a calibration file."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.capture.camera import look_at
+from stga_addon.errors import StgaError
+from stga_addon.tracking.footage.open import open_footage
+
+WIDTH, HEIGHT = 40, 30
+
+
+def rig(count=3):
+    return [look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), WIDTH, HEIGHT, 50.0) for a in 0.4 * np.arange(count)]
+
+
+def entry(camera, path, **values):
+    intrinsics = {key: getattr(camera, key) for key in ("fl_x", "fl_y", "cx", "cy")}
+    pose = {"transform_matrix": camera.camera_to_world_gl.tolist()}
+    return {"file_path": path, "w": camera.width, "h": camera.height, **intrinsics, **pose, **values}
+
+
+def write_image(path, value=128):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (WIDTH, HEIGHT), (value, 10, 20)).save(path)
+
+
+def write_transforms(folder, frames, name="transforms.json", **top):
+    for number, frame in enumerate(frames):
+        write_image(folder / frame["file_path"], 10 * number)
+    (folder / name).write_text(json.dumps({**top, "frames": frames}), encoding="utf-8")
+
+
+def test_a_capture_is_footage(tmp_path):
+    """Catches frames that belong to another camera or timestep than the file says, and a flipped principal point."""
+    frames = [
+        entry(camera, f"images/{t:05d}_{c:02d}.png", timestep_index=t, camera_index=c, camera_id=f"cam{c}", cy=12.0)
+        for t in (0, 3)
+        for c, camera in enumerate(rig(2))
+    ]
+    write_transforms(tmp_path, frames)
+    footage = open_footage(tmp_path)
+    assert [camera.name for camera in footage.cameras] == ["cam0", "cam1"]
+    assert footage.timesteps == (0, 3)
+    assert [camera.image(t)[0, 0, 0] for t, camera in footage.views()] == [0, 20, 10, 30]
+    assert footage.cameras[1].file(3) == tmp_path / "images/00003_01.png"
+    assert footage.cameras[0].camera.cy == HEIGHT - 12.0
+    np.testing.assert_allclose(footage.cameras[1].camera.world_to_camera, rig(2)[1].world_to_camera, atol=1e-9)
+
+
+def test_one_image_per_pose_is_one_timestep(tmp_path):
+    """Catches a nerfstudio file, whose images have no timesteps, taken for a sequence; and its `cy` turned over."""
+    write_transforms(
+        tmp_path, [entry(c, f"images/{n}.png", cy=12.0) for n, c in enumerate(rig())], camera_model="OPENCV"
+    )
+    footage = open_footage(tmp_path)
+    assert [camera.name for camera in footage.cameras] == ["images/0.png", "images/1.png", "images/2.png"]
+    assert footage.timesteps == (0,)
+    assert footage.cameras[0].camera.cy == 12.0
+
+
+def test_splits_are_one_rig(tmp_path):
+    """Catches a camera that is two because it appears in two splits."""
+    first, second = rig(2)
+    train = [entry(first, "a/0.png", timestep_index=0), entry(second, "a/1.png", timestep_index=0)]
+    write_transforms(tmp_path, train, "transforms_train.json")
+    write_transforms(tmp_path, [entry(first, "a/2.png", timestep_index=1)], "transforms_val.json")
+    footage = open_footage(tmp_path)
+    assert [camera.timesteps for camera in footage.cameras] == [(0, 1), (0,)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"k1": "much"}, r"transforms.json: frames\[1\].k1: expected a finite number, not 'much'"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"frames\[1\].camera_model: 'EQUIRECTANGULAR' is not one of"),
+        ({"file_path": "images/none.png"}, r"none.png: does not exist, but .*frames\[1\] names it"),
+        ({"mask_path": "masks/none.png"}, r"masks/none.png: does not exist, but .*frames\[1\] names it"),
+        ({"k1": -40.0}, r"frames\[1\]: the distortion of its lens folds the image"),
+    ],
+)
+def test_bad_entries_are_named(tmp_path, change, message):
+    """Catches a traceback, or a message without file and field."""
+    if change.get("k1") == -40.0:
+        pytest.importorskip("cv2")
+    first, second = rig(2)
+    write_transforms(tmp_path, [entry(first, "images/0.png"), entry(second, "images/1.png")])
+    values = json.loads((tmp_path / "transforms.json").read_text(encoding="utf-8"))
+    values["frames"][1].update(change)
+    (tmp_path / "transforms.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(StgaError, match=message):
+        open_footage(tmp_path)
+
+
+def test_two_images_of_one_moment(tmp_path):
+    """Catches a frame that silently replaces another."""
+    camera = rig(1)[0]
+    write_transforms(tmp_path, [entry(camera, "images/0.png"), entry(camera, "images/1.png")])
+    with pytest.raises(StgaError, match=r"frames\[1\]: camera .* has two images at timestep 0"):
+        open_footage(tmp_path)
