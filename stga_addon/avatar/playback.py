@@ -8,6 +8,8 @@ import numpy as np
 from ..capture.camera import Camera
 
 DEFAULT_FPS = 25.0
+MAX_VIEWS = 32
+"""Cameras that a page offers."""
 
 
 @dataclass(frozen=True)

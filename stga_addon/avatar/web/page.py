@@ -22,7 +22,7 @@ MODULES = (
     "stga-avatar.js",
 )
 """Modules of the custom element, each after those that it imports."""
-IMPORT = re.compile(r"^import\b[^;]*?from '\./[\w-]+\.js';\n", re.MULTILINE)
+IMPORT = re.compile(r"^import\b[^;]*?'\./[\w-]+\.js';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
 
 

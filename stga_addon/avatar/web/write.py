@@ -16,8 +16,11 @@ from .rig import WebRig, baked_rig, flame_rig
 
 SUFFIXES = (".html", ".stga")
 SCRIPT_NAME = "stga-avatar.js"
+BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
+"""About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
 RIG_NOTICE = (
-    "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides who may receive them."
+    "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
+    "who may receive them."
 )
 
 
@@ -48,6 +51,12 @@ def write_web(
         return [path, path.with_name(SCRIPT_NAME)]
     _write(path, page(playback.title, RIG_NOTICE if with_flame else "", data).encode("utf-8"))
     return [path]
+
+
+def web_bytes(avatar: Avatar) -> int:
+    """About the size of a page of the avatar."""
+    colors = avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
+    return round((BYTES_PER_SPLAT + BYTES_PER_COEFFICIENT * colors) * len(avatar.splats))
 
 
 def _rig(path: Path, sequence: FlameSequence | None, meshes: Iterable[np.ndarray]) -> WebRig:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import select
 import shutil
 import subprocess
 import time
@@ -12,9 +13,9 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = ("--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars",
-         "--disable-dev-shm-usage", "--disable-background-networking", "--no-first-run", "--js-flags=--expose-gc",
+         "--force-prefers-reduced-motion", "--disable-dev-shm-usage", "--disable-background-networking", "--no-first-run", "--js-flags=--expose-gc",
          "--remote-debugging-pipe")  # fmt: skip
-TIMEOUT_S = 120.0
+TIMEOUT_S = 60.0
 
 
 def find_browser() -> str:
@@ -67,7 +68,7 @@ class Browser:
         os.write(self._out, json.dumps(message).encode() + b"\0")
         deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
-            answer = self._receive()
+            answer = self._receive(deadline)
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer["error"]
                 return dict(answer["result"])
@@ -87,8 +88,11 @@ class Browser:
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
 
-    def _receive(self) -> dict[str, Any]:
+    def _receive(self, deadline: float) -> dict[str, Any]:
         while b"\0" not in self._buffer:
+            ready, _, _ = select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                raise TimeoutError(f"no answer from the browser within {TIMEOUT_S:g} s; errors: {self.errors}")
             part = os.read(self._in, 1 << 20)
             assert part, "the browser has closed"
             self._buffer += part
