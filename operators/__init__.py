@@ -4,18 +4,21 @@ from typing import Any
 
 import bpy
 
-from . import analyze, ids, monitor
+from . import analyze, ids, monitor, render_video
 from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
 from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
+from .export_cameras import ExportCameras
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
+from .pose import PoseHead
+from .render_video import CancelVideo, DismissVideo, RenderVideo
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
 from .train import CancelTraining, DismissTraining, Train
@@ -37,12 +40,17 @@ CLASSES = (
     MakeEnvironment,
     TestEnvironment,
     CancelEnvironment,
+    PoseHead,
     ShowAvatar,
     StandardView,
     MoreBounces,
+    RenderVideo,
+    CancelVideo,
+    DismissVideo,
     ApplyMotion,
     ImportPly,
     ExportAvatar,
+    ExportCameras,
     OpenNpz,
     CaptureDrop,
     AvatarDrop,
@@ -59,6 +67,7 @@ def _import_menu(menu: Any, context: Any) -> None:
 
 def _export_menu(menu: Any, context: Any) -> None:
     menu.layout.operator(ids.EXPORT_AVATAR, text="Gaussian Head Avatar (STGA)")
+    menu.layout.operator(ids.EXPORT_CAMERAS, text="Cameras for Tracking (STGA)")
 
 
 def register() -> None:
@@ -71,6 +80,7 @@ def register() -> None:
 def unregister() -> None:
     monitor.unregister()
     analyze.stop()
+    render_video.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     unregister_classes(CLASSES)

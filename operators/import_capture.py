@@ -9,10 +9,11 @@ from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.cameras import configure_scene, import_cameras
+from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.objects import capture_root, leave_edit_mode
+from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import import_head
+from ..stga_addon.scene.viewports import frame_head
 from . import ids
 from .common import FileImport, file_path, flame_model_path, flame_property, reporting, scene_settings
 
@@ -102,9 +103,13 @@ def bring_in(
     scene_settings(context).head = head
     _show_first_frame(context.scene, capture)
     _select_only(context, head)
-    _frame_in_viewports(context, head)
+    middle = central(cameras)
+    for kind in COLLECTIONS:
+        show_kind(head.parent, kind, context.view_layer, False)
+    if context.window is not None and not bpy.app.background:
+        frame_head(head, middle, [context.window.screen])
     if set_up_scene and cameras:
-        configure_scene(context.scene, capture, cameras[0], warn=warn)
+        configure_scene(context.scene, capture, middle, warn=warn)
     for sentence in capture.warnings:
         warn(sentence)
     counts = f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
@@ -124,14 +129,3 @@ def _select_only(context: Any, head: Any) -> None:
     if context.view_layer.objects.get(head.name) is head:
         head.select_set(True)
         context.view_layer.objects.active = head
-
-
-def _frame_in_viewports(context: Any, head: Any) -> None:
-    """Center the viewports on the head, which is small on Blender's scale; a view through a camera stays."""
-    if bpy.app.background or context.window is None or not head.visible_get(view_layer=context.view_layer):
-        return
-    for area in context.window.screen.areas:
-        if area.type == "VIEW_3D" and area.spaces.active.region_3d.view_perspective != "CAMERA":
-            region = next(region for region in area.regions if region.type == "WINDOW")
-            with context.temp_override(area=area, region=region):
-                bpy.ops.view3d.view_selected()

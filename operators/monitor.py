@@ -340,6 +340,7 @@ def _adopt(scene: Any) -> None:
         settings.head = heads[0]
         if settings.splats is None and len(shown) == 1:
             settings.splats = shown[0]
+            settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
 
 
 def register() -> None:

@@ -12,12 +12,14 @@ from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
 from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
+from ..stga_addon.scene.objects import layers_of
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
+from .next_step import NextStepPanel
 from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
 from .sidebar import SidebarPanel
-from .train_panel import TrainPanel
+from .train_panel import TrainOptionsPanel, TrainPanel
 
 DISPLAY_INPUTS = (
     splat_nodes.DISPLAY,
@@ -45,6 +47,15 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
             layout.label(
                 text=f"{len(settings.head[tags.TIMESTEPS])} timesteps, {len(settings.head.data.polygons)} triangles"
             )
+            _draw_visibility(layout, context, settings.head.parent)
+
+
+def _draw_visibility(layout: Any, context: Any, root: Any) -> None:
+    """Draw switches that show and hide the bones and the cameras in viewports."""
+    row = layout.row(align=True)
+    for kind, text, icon in ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DATA")):
+        for layer in layers_of(root, kind, context.view_layer) if root is not None else ():
+            row.prop(layer, "hide_viewport", text=text, icon=icon, toggle=True, invert_checkbox=True)
 
 
 class ShowPanel(SidebarPanel, bpy.types.Panel):
@@ -86,10 +97,12 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
 
 
 CLASSES = (
+    NextStepPanel,
     CapturePanel,
     SelectedFrames,
     SelectPanel,
     TrainPanel,
+    TrainOptionsPanel,
     EffectsPanel,
     ShowPanel,
     MotionPanel,

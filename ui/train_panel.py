@@ -1,7 +1,7 @@
 """The Train step: settings, progress, and result or failure."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -47,18 +47,39 @@ def _draw_choices(layout: Any, context: Any) -> None:
     if times:
         draw_text(layout, context, f"On this machine: {times}", "TIME")
     layout.prop(settings, "minutes")
-    layout.prop(settings, "strategy")
-    layout.prop(settings, "device")
-    layout.prop(settings, "show_result")
     row = layout.row(align=True)
-    for resume, text, icon in ((False, "Train", "PLAY"), (True, "Resume", "FRAME_NEXT")):
-        train = row.operator(ids.TRAIN, text=text, icon=icon)
-        train.directory, train.minutes, train.resume = settings.run_folder, settings.minutes, resume
-        train.strategy, train.preset, train.device = settings.strategy, settings.preset, settings.device
-        train.effects = " ".join(chosen_effects(settings))
+    draw_train_button(row, settings)
+    draw_train_button(row, settings, resume=True)
     if not has_training_python(context):
         layout.label(text="No training environment yet", icon="INFO")
-        layout.operator("preferences.addon_show", text="Set Up in Preferences").module = package()
+        draw_environment_setup(layout)
+
+
+def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
+    """Draw the button that starts, or resumes, training with the panel's settings."""
+    train = layout.operator(
+        ids.TRAIN, text="Resume" if resume else "Train", icon="FRAME_NEXT" if resume else "MOD_PARTICLES"
+    )
+    train.directory, train.minutes, train.resume = settings.run_folder, settings.minutes, resume
+    train.strategy, train.preset, train.device = settings.strategy, settings.preset, settings.device
+    train.effects = " ".join(chosen_effects(settings))
+
+
+def draw_environment_setup(layout: Any) -> None:
+    """Draw the button that opens the preferences, where a training environment is made."""
+    layout.operator("preferences.addon_show", text="Set Up in Preferences", icon="PREFERENCES").module = package()
+
+
+class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):
+    bl_idname = "STGA_PT_train_options"
+    bl_label = "Options"
+    bl_parent_id = TrainPanel.bl_idname
+    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Any) -> None:
+        settings = scene_settings(context)
+        for name in ("strategy", "device", "show_result", "live_preview"):
+            self.layout.prop(settings, name)
 
 
 def _draw_progress(layout: Any, context: Any, training: MonitorState) -> None:
@@ -69,8 +90,6 @@ def _draw_progress(layout: Any, context: Any, training: MonitorState) -> None:
     for line in (*describe_figures(status.figures), status.detail):
         draw_text(column, context, line)
     draw_curve(layout, training.folder)
-    layout.prop(scene_settings(context), "live_preview")
-    layout.prop(scene_settings(context), "show_result")
     layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
 
 

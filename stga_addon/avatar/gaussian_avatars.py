@@ -10,7 +10,7 @@ from ..files import write_npz
 from ..flame.sequence import FlameSequence
 from .embedding import face_frames, to_local, to_world
 from .file import Avatar
-from .ply import PROPERTIES, read_vertices, splat_columns, splats_from_columns, stack_columns, write_columns
+from .ply import PROPERTIES, splat_columns, write_columns
 from .splats import Splats
 
 PLY_NAME = "point_cloud.ply"
@@ -34,20 +34,6 @@ def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence
     columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
     write_columns(folder / PLY_NAME, [*PROPERTIES, BINDING], columns)
     write_npz(folder / MOTION_NAME, motion_arrays(sequence), compressed=True)
-
-
-def read_gaussian_avatars(path: Path) -> Splats:
-    """Read a GaussianAvatars point_cloud.ply: splats in the "gaussian_avatars" convention, face from binding_0.
-
-    Raises StgaError naming the file and the property that is missing, not finite or not a triangle number.
-    """
-    vertices = read_vertices(path)
-    if BINDING not in (vertices.dtype.names or ()):
-        raise StgaError(f"{path}: has no property {BINDING!r}, which binds a GaussianAvatars splat to its triangle")
-    binding = stack_columns(path, vertices, [BINDING])[:, 0]
-    if ((binding < 0) | (binding >= 2**24) | (binding != np.floor(binding))).any():
-        raise StgaError(f"{path}: property {BINDING!r} holds a value that is not a triangle number")
-    return replace(splats_from_columns(path, vertices), face=binding.astype(np.int32))
 
 
 def in_convention(avatar: Avatar, convention: str) -> Splats:

@@ -48,15 +48,15 @@ class Splats:
 
     def unit_rotations(self) -> np.ndarray:
         """(N, 4) float32 wxyz, normalized."""
-        return unit_quaternions(self.rotation).astype(np.float32)
+        return np.asarray(unit_quaternions(self.rotation), np.float32)
 
     def scales(self) -> np.ndarray:
         """(N, 3) float32: standard deviations, linear."""
-        return np.exp(self.log_scale)
+        return np.asarray(np.exp(self.log_scale))
 
     def opacities(self) -> np.ndarray:
         """(N,) float32 in 0 to 1."""
-        return (1 / (1 + np.exp(-self.opacity.astype(np.float64)))).astype(np.float32)
+        return np.asarray(1 / (1 + np.exp(-self.opacity.astype(np.float64))), np.float32)
 
     def rows(self, index: np.ndarray) -> "Splats":
         """The splats at `index` (a boolean mask or integer array)."""

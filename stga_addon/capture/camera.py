@@ -88,8 +88,12 @@ def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: floa
 def central_camera(cameras: Sequence[Camera]) -> int:
     """Index of the camera that looks most nearly in the mean viewing direction; for a head captured from the front and
     both sides, the one that sees the face."""
-    forward = np.array([camera.world_to_camera[2, :3] for camera in cameras])
-    return int((forward @ forward.mean(0)).argmax())
+    return most_central(np.array([camera.world_to_camera[2, :3] for camera in cameras]))
+
+
+def most_central(directions: np.ndarray) -> int:
+    """Index of the unit vector (N, 3) that is nearest to the mean."""
+    return int((directions @ directions.mean(0)).argmax())
 
 
 def azimuths(cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float]) -> np.ndarray:

@@ -21,7 +21,7 @@ from ..capture.open import open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, write_json, write_npz
 from ..training.optimize.device import choose_device
-from ..training.run.folder import SELECTION, Run
+from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
 from ..training.settings import DEVICES, TrainingSettings, from_json, to_json
 from ..worker.launch import prepare_status_folder
@@ -60,12 +60,12 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
     """Prepare a run's folder for the job's worker.
 
     selection: timestep -> (F,) bool, to be trained instead of what the rule selects.
-    Raises StgaError while a worker is in the folder, where it holds a run already (to resume: none, or one that was
-    trained on something else), or on a full disk.
+    Raises StgaError while a worker is in the folder, where it holds a run already (to resume: none), or on a full disk.
+    Whether a run to resume was trained on this capture, which takes reading it, the worker finds out.
     """
     folder = job_folder(run)
     if job.settings is None:
-        open_run(run, job.capture, job.flame, job.principal_point)
+        read_run(run)
     elif (run / "run.json").exists():
         raise StgaError(f"{run}: already holds a run; resume it, or choose another folder")
     prepare_status_folder(folder)

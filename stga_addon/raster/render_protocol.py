@@ -34,27 +34,39 @@ def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
-def pack_layers(layers: Sequence[PosedSplats]) -> dict[str, Any]:
-    """Layers as named arrays."""
+def pack_layers(layers: Sequence[PosedSplats], before: Sequence[PosedSplats] = ()) -> dict[str, Any]:
+    """Layers as named arrays; without the splats of those that have the same as the layer `before` at their index."""
     arrays: dict[str, Any] = {"layers": len(layers)}
     for index, layer in enumerate(layers):
-        arrays |= {f"{index} splats {name}": getattr(layer.splats, name) for name in SPLAT_FIELDS}
+        if index >= len(before) or not _same_splats(layer.splats, before[index].splats):
+            arrays |= {f"{index} splats {name}": getattr(layer.splats, name) for name in SPLAT_FIELDS}
         arrays |= {f"{index} frames {name}": getattr(layer.frames, name) for name in FRAME_FIELDS}
         arrays |= {f"{index} to_world": layer.to_world, f"{index} antialiased": layer.antialiased}
     return arrays
 
 
-def unpack_layers(arrays: Mapping[str, np.ndarray]) -> list[PosedSplats]:
-    """The inverse of `pack_layers`."""
+def unpack_layers(arrays: Mapping[str, np.ndarray], before: Sequence[PosedSplats] = ()) -> list[PosedSplats]:
+    """The inverse of `pack_layers`. Raises KeyError where splats are missing from the arrays and from `before`."""
+    names = [[f"{index} splats {name}" for name in SPLAT_FIELDS] for index in range(int(arrays["layers"]))]
+    splats = [
+        Splats(**{field: arrays[name] for field, name in zip(SPLAT_FIELDS, own, strict=True)})
+        if own[0] in arrays or index >= len(before)
+        else before[index].splats
+        for index, own in enumerate(names)
+    ]
     return [
         PosedSplats(
-            Splats(**{name: arrays[f"{index} splats {name}"] for name in SPLAT_FIELDS}),
+            splats[index],
             FaceFrames(**{name: arrays[f"{index} frames {name}"] for name in FRAME_FIELDS}),
             arrays[f"{index} to_world"],
             bool(arrays[f"{index} antialiased"]),
         )
-        for index in range(int(arrays["layers"]))
+        for index in range(len(splats))
     ]
+
+
+def _same_splats(one: Splats, other: Splats) -> bool:
+    return one is other or all(np.array_equal(getattr(one, name), getattr(other, name)) for name in SPLAT_FIELDS)
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:

@@ -30,18 +30,6 @@ def open_file(path: Path) -> None:
         raise StgaError(f"{path}: cannot be opened ({error})") from error
 
 
-def look_through_camera() -> None:
-    """Set the 3D viewports to the scene's camera and to Material Preview.
-
-    Blender's default view shows twenty meters of grid, in which a head is a dot.
-    """
-    for screen in bpy.data.screens:
-        for area in screen.areas:
-            if area.type == "VIEW_3D":
-                area.spaces.active.region_3d.view_perspective = "CAMERA"
-                area.spaces.active.shading.type = "MATERIAL"
-
-
 def current_scene() -> Any:
     """The scene of the open file."""
     return bpy.context.scene

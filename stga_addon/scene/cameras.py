@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..capture.camera import Camera
+from ..capture.camera import Camera, most_central
 from ..capture.model import Capture, View
 from ..errors import StgaError
 from . import compat, tags
@@ -17,7 +17,7 @@ from .objects import Warn, log_warning, place, remove
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # meters
-DISPLAY_SIZE = 0.1  # meters; Blender's default of one meter would cover the head with cameras
+DISPLAY_SIZE = 0.05  # meters; Blender's default of one meter would cover the head with cameras
 POSE_TOLERANCE = 1e-9  # of matrix entries
 INTRINSICS_TOLERANCE = 1e-6  # pixels
 
@@ -61,6 +61,15 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
         same_size = tuple(other[tags.IMAGE_SIZE]) == (width, height)
         if not same_size or abs(other[tags.PIXEL_ASPECT] - aspect) > INTRINSICS_TOLERANCE:
             warn(f"{other.name}: its images have another size or pixel aspect than the scene, set from {camera.name}")
+
+
+def central(cameras: list[Any]) -> Any:
+    """The camera object, of `import_cameras`, that sees the face (`capture.camera.central_camera`); None of none."""
+    if not cameras:
+        return None
+    bpy.context.view_layer.update()  # world matrices
+    forward = np.array([-np.array(camera.matrix_world.col[2][:3]) for camera in cameras])
+    return cameras[most_central(forward)]
 
 
 def _views_by_camera(capture: Capture) -> dict[int, list[View]]:

@@ -69,6 +69,13 @@ def push_down_action(owner: Any, extrapolation: str = "HOLD") -> None:
         strip.action_slot = slot
 
 
+def select_bones(rig: Any, names: set[str]) -> None:
+    """Select these bones of an armature object and no others; from Blender 5.0 on the pose has the selection."""
+    owners = rig.pose.bones if bpy.app.version >= (5, 0, 0) else rig.data.bones
+    for bone in owners:
+        bone.select = bone.name in names
+
+
 def set_modifier_input(modifier: Any, identifier: str, value: Any) -> None:
     """Set a geometry nodes modifier's input by its socket identifier ("Socket_2"); a menu's by its item's name."""
     if MODIFIER_INPUT_PROPERTIES:

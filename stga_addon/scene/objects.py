@@ -35,6 +35,44 @@ def capture_root(source: Path, name: str | None = None) -> Any:
     return root
 
 
+COLLECTIONS = {tags.RIG: "bones", tags.CAMERA: "cameras"}
+"""Kinds of object that have a collection of their own, so that they can be hidden together."""
+
+
+def collection_of(root: Any, kind: str) -> Any:
+    """The collection of the root's objects of this kind; None where none was placed yet."""
+    own = root.users_collection[0]
+    if kind not in COLLECTIONS:
+        return own
+    return next((child for child in own.children if child.get(tags.KIND) == kind), None)
+
+
+def _make_collection(root: Any, kind: str) -> Any:
+    collection = collection_of(root, kind)
+    if collection is None:
+        collection = bpy.data.collections.new(f"{root.name} {COLLECTIONS[kind]}")
+        collection[tags.KIND] = kind
+        root.users_collection[0].children.link(collection)
+    return collection
+
+
+def show_kind(root: Any, kind: str, view_layer: Any, show: bool) -> None:
+    """Show or hide the root's objects of this kind in viewports; renders and animation stay as they are."""
+    for layer in layers_of(root, kind, view_layer):
+        layer.hide_viewport = not show
+
+
+def layers_of(root: Any, kind: str, view_layer: Any) -> list[Any]:
+    """The layer collections of `collection_of`, which may be linked in several places."""
+    collection, waiting, found = collection_of(root, kind), [view_layer.layer_collection], []
+    while collection is not None and waiting:
+        layer = waiting.pop()
+        waiting += layer.children
+        if layer.collection == collection:
+            found.append(layer)
+    return found
+
+
 def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> Any:
     """An object of this kind under `root`, with new `data`; returns it.
 
@@ -44,7 +82,7 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
     obj = existing
     if obj is None:
         obj = bpy.data.objects.new(name, data)
-        root.users_collection[0].objects.link(obj)
+        _make_collection(root, kind).objects.link(obj)
         obj.parent = root
     else:
         leave_edit_mode()

@@ -17,6 +17,7 @@ IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
+AVATAR = "stga_avatar"  # on splats that were made without the panel: the avatar's file
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 
 # Kinds of object.

@@ -2,7 +2,7 @@
 
 A vertex group holds vertices and a selection holds triangles: a triangle counts as selected when all three of its
 vertices are in the group. Writing a selection and reading it back therefore keeps every selected triangle and adds
-those whose three corners all belong to selected ones (see `closure`).
+those whose three corners all belong to selected ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,13 +14,6 @@ from ..errors import StgaError
 from . import tags
 from .arrays import mesh_triangles, read_values
 from .display.splat_attributes import FACE
-
-
-def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: the triangles (F, 3) whose three vertices all belong to a selected triangle (F,) bool."""
-    in_group = np.zeros(int(faces.max(initial=-1)) + 1, bool)
-    in_group[faces[selected]] = True
-    return np.asarray(in_group[faces].all(1))
 
 
 def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:

@@ -15,7 +15,8 @@ import trimesh
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.export import export_avatar
 from stga_addon.avatar.splats import SH_C0, Splats
-from tests.avatar.conftest import random_splats, rendered
+
+from .conftest import random_splats, rendered
 
 PREFIX = "KHR_gaussian_splatting:"
 SHAPES = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
@@ -128,8 +129,8 @@ const found = {};
 gltf.scene.traverse((object) => {
   if (object.userData.gltfExtensions === undefined) return;
   found.extension = object.userData.gltfExtensions.KHR_gaussian_splatting;
-  for (const [name, attribute] of Object.entries(object.geometry.attributes))
-    found[name] = { size: attribute.itemSize, values: Array.from(attribute.array) };
+  for (const [name, attribute] of Object.entries(object.splatGeometry.attributes))
+    found[name] = Array.from(attribute.array);
 });
 console.log(JSON.stringify(found));
 """
@@ -149,5 +150,21 @@ def test_three_reads_it(avatar, tmp_path):
     found = json.loads(done.stdout)
     world = to_world(avatar.splats, avatar.frames(avatar.neutral))
     assert found["extension"]["kernel"] == "ellipse"
-    centers = [value for value in found.values() if value.get("size") == 3 and len(value["values"]) == world.xyz.size]
-    assert any(np.allclose(np.array(value["values"]).reshape(-1, 3), world.xyz) for value in centers), found.keys()
+    np.testing.assert_allclose(np.reshape(found["position"], (-1, 3)), world.xyz)
+    axes = quaternion_to_matrix(world.unit_rotations()) * world.scales()[:, None]
+    covariance = axes @ axes.transpose(0, 2, 1)
+    rows, columns = np.triu_indices(3)
+    np.testing.assert_allclose(np.reshape(found["covariance"], (-1, 6)), covariance[:, rows, columns], atol=1e-7)
+    np.testing.assert_allclose(np.reshape(found["color"], (-1, 4))[:, 3], world.opacities() * 255, atol=0.51)
+    assert "sphericalHarmonics3" in found
+
+
+def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of unit quaternions wxyz (N, 4)."""
+    w, x, y, z = q.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.array(rows).transpose(2, 0, 1)

@@ -13,7 +13,8 @@ from stga_addon.avatar.export import export_avatar
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.avatar.spz import write_spz
-from tests.avatar.conftest import random_splats, rendered
+
+from .conftest import random_splats, rendered
 
 
 def read(path: Path) -> tuple[Splats, int]:

@@ -14,7 +14,8 @@ from stga_addon.avatar.export import export_avatar, range_bytes
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
-from tests.avatar.conftest import rendered
+
+from .conftest import rendered
 
 FPS = 30.0
 

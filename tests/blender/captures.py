@@ -17,6 +17,11 @@ def strip(vertices: int) -> np.ndarray:
     return np.stack([first, first + 1, first + 2], 1).astype(np.int32)
 
 
+def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: the triangles (F, 3) whose three vertices all belong to a selected triangle (F,) bool."""
+    return np.isin(faces, faces[selected]).all(axis=1)
+
+
 def mesh_capture(
     root: Path,
     timesteps: Sequence[int] = (2, 3, 7),

@@ -9,15 +9,17 @@ from PIL import Image
 
 bpy = pytest.importorskip("bpy")
 
+from capture.factory import write_mesh_capture  # noqa: E402
 from mathutils import Vector  # noqa: E402
 
-from stga_addon.capture.camera import Camera, camera_from_gl  # noqa: E402
+from stga_addon.capture.camera import Camera, camera_from_gl, look_at  # noqa: E402
 from stga_addon.capture.model import Capture, View  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.cameras import configure_scene, import_cameras  # noqa: E402
-from stga_addon.scene.objects import capture_root  # noqa: E402
+from stga_addon.scene.cameras import central, configure_scene, import_cameras  # noqa: E402
+from stga_addon.scene.objects import capture_root, collection_of, layers_of, show_kind  # noqa: E402
+from stga_addon.scene.rig.head import import_head  # noqa: E402
 
 from .captures import mesh_capture  # noqa: E402
 
@@ -199,3 +201,29 @@ def test_other_cameras_are_refused(tmp_path):
     mine = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
     with pytest.raises(StgaError, match="mine"):
         configure_scene(bpy.context.scene, capture_of(tmp_path, {0: [camera()]}), mine)
+
+
+def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
+    """Catches an import that covers the head with cameras, or hides the head or the scene's camera along with them."""
+    capture = open_capture(write_mesh_capture(tmp_path / "capture", range(2), range(3)))
+    head = import_head(capture)
+    cameras = import_cameras(capture, capture_root(capture.root))
+    layer = bpy.context.view_layer
+    show_kind(head.parent, tags.CAMERA, layer, False)
+    assert head.visible_get()
+    assert not any(camera.visible_get() for camera in cameras)
+    assert collection_of(head.parent, tags.CAMERA).name == f"{head.parent.name} cameras"
+    assert [each.hide_viewport for each in layers_of(head.parent, tags.CAMERA, layer)] == [True]
+    again = import_cameras(capture, capture_root(capture.root))
+    assert again == cameras
+    assert len(collection_of(head.parent, tags.CAMERA).objects) == len(cameras)
+    show_kind(head.parent, tags.CAMERA, layer, True)
+    assert all(camera.visible_get() for camera in cameras)
+
+
+def test_the_central_camera_sees_the_face(tmp_path):
+    """Catches the first camera in place of the central one, as before world matrices are computed."""
+    turned = [look_at((np.sin(a), 0.0, np.cos(a)), (0, 0, 0), 40, 60, 80.0) for a in (0.9, -0.8, 0.1)]
+    cameras = import_cameras(capture_of(tmp_path, {i: [each] for i, each in enumerate(turned)}), capture_root(tmp_path))
+    assert central(cameras) is cameras[2]
+    assert central([]) is None

@@ -15,17 +15,18 @@ from capture.factory import ball, write_flame_capture, write_mesh_capture  # noq
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.export import export_avatar  # noqa: E402
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
-from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.avatar.ply import read_ply, write_ply  # noqa: E402
+from stga_addon.avatar.ply import read_ply, read_vertices, write_ply  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
-from stga_addon.scene.vertex_groups import closure, read_selection  # noqa: E402
+from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
+
+from .captures import closure  # noqa: E402
 
 OPERATORS = (
     "import_capture",
@@ -50,6 +51,7 @@ OPERATORS = (
     "more_bounces",
     "import_ply",
     "export_avatar",
+    "export_cameras",
     "open_npz",
 )
 
@@ -123,6 +125,7 @@ SET_BY_PANEL = {
     "apply_motion": {"filter_glob"},
     "show_avatar": {"hide_head", "filter_glob"},
     "export_avatar": {"format", "filter_glob", "check_existing"},
+    "export_cameras": {"selected_only", "filter_glob", "check_existing"},
     "heat_map": set(),
     "copy_report": set(),
 }
@@ -287,7 +290,8 @@ def test_gaussian_avatars_export(extension, tmp_path):
         "format": "gaussian-avatars",
     }
     assert bpy.ops.stga.export_avatar(**arguments) == {"FINISHED"}
-    np.testing.assert_array_equal(read_gaussian_avatars(tmp_path / "pair/point_cloud.ply").face, avatar.splats.face)
+    bound_to = read_vertices(tmp_path / "pair/point_cloud.ply")["binding_0"]
+    np.testing.assert_array_equal(bound_to, avatar.splats.face)
     assert (tmp_path / "pair/flame_param.npz").is_file()
 
 

@@ -85,6 +85,7 @@ def draw(extension) -> list[str]:
         preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0), addons=bpy.context.preferences.addons),
         space_data=SimpleNamespace(shading=SimpleNamespace(type="SOLID")),
         view_layer=bpy.context.view_layer,
+        screen=SimpleNamespace(is_animation_playing=False),
     )
     layout = Layout()
     for cls in panels(extension):

@@ -27,8 +27,7 @@ from PIL import Image
 from training.test_folder import make_checkpoint, make_run
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.gaussian_avatars import read_gaussian_avatars
-from stga_addon.avatar.ply import PROPERTIES, read_ply, splat_columns, write_columns, write_ply
+from stga_addon.avatar.ply import PROPERTIES, read_ply, splat_columns, write_ply
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.meshes import read_mesh, read_regions
@@ -63,11 +62,6 @@ def small_avatar() -> Avatar:
     neutral, faces = random_mesh(1, 20)
     splats = random_splats(2, 6, len(faces))
     return Avatar(splats, "stga", neutral.astype(np.float32), faces, regions={"nose": np.ones(len(faces), bool)})
-
-
-def bound_splats(path: Path) -> None:
-    splats = random_splats(3, 5, 4)
-    write_columns(path, [*PROPERTIES, "binding_0"], np.column_stack([splat_columns(splats), np.arange(5)]))
 
 
 def ascii_splats(path: Path) -> None:
@@ -132,7 +126,6 @@ TARGETS = {
     "avatar": Target("a.npz", lambda path: write_avatar(path, small_avatar()), read_avatar),
     "splats": Target("a.ply", lambda path: write_ply(path, random_splats(1, 4, 1)), read_ply),
     "splats as text": Target("a.ply", ascii_splats, read_ply),
-    "gaussian avatars": Target("a.ply", bound_splats, read_gaussian_avatars),
     "flame npz": Target("a.npz", lambda path: np.savez(path, **random_arrays(vertices=6)), read_flame),
     "flame pickle 2": Target("a.pkl", flame_pickle(2), read_flame),
     "flame pickle 5": Target("a.pkl", flame_pickle(5), read_flame),

@@ -80,10 +80,20 @@ def test_refusals(tmp_path, capture):
         write_job(run, new_job(capture))
     write_job(run, TrainingJob(capture, None, "vhap", None))
     assert read_job(run).settings is None
-    with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
-        write_job(run, TrainingJob(capture, None, "opencv", None))
     with status_writer(job_folder(run)), pytest.raises(StgaError, match="another worker is running"):
         write_job(run, TrainingJob(capture, None, "vhap", None))
+
+
+def test_the_worker_refuses_another_run(tmp_path, capture):
+    """Catches a run continued with another principal point: reading the capture is left to the worker."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
+    write_job(run, TrainingJob(capture, None, "opencv", None))
+    with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
+        run_training_job(run)
+    assert inspect_worker(job_folder(run)).status.error.startswith(f"{run}: was trained with principal point")
+    assert not (run / "avatar.npz").exists()
 
 
 HEADER = {"format": "stga-job", "version": 2}

@@ -26,6 +26,8 @@ from .capture import CaptureOptions, make_capture
 from .pictures import selection_picture, side_by_side
 
 SEED = 0
+FRAMES_PER_SECOND = 8
+"""Of demo.blend: its capture has a second of motion at this rate."""
 MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
@@ -62,7 +64,7 @@ def _import_and_select(capture: Capture, model: Path) -> tuple[object, dict[int,
     """Make a Blender scene with head, cameras and a vertex group per frame; returns head and selection read back."""
     from ...scene import tags
     from ...scene.blend_file import current_scene, new_file
-    from ...scene.cameras import configure_scene, import_cameras
+    from ...scene.cameras import central, configure_scene, import_cameras
     from ...scene.objects import capture_root
     from ...scene.rig.head import import_head
     from ...scene.vertex_groups import read_selection, write_selection
@@ -71,7 +73,7 @@ def _import_and_select(capture: Capture, model: Path) -> tuple[object, dict[int,
     head = import_head(capture)
     head[tags.FLAME_MODEL] = str(model.resolve())  # so that Train works in the saved file
     cameras = import_cameras(capture, capture_root(capture.root))
-    configure_scene(current_scene(), capture, cameras[len(cameras) // 2])
+    configure_scene(current_scene(), capture, central(cameras))
     write_selection(head, select_capture(capture, SelectionOptions()))
     return head, read_selection(head)
 
@@ -93,15 +95,18 @@ def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat from numpy's."""
-    from ...scene.blend_file import current_scene, look_through_camera, object_named, open_file, save_file
+    from ...scene import tags
+    from ...scene.blend_file import current_scene, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats, hide_object, show_avatar
     from ...scene.timeline import go_to_frame
+    from ...scene.viewports import frame_demo
 
     shown = show_avatar(avatar, head)
+    shown[tags.AVATAR] = "//avatar.npz"
     hide_object(head, current_scene())
     name = shown.name
     go_to_frame(capture.timesteps[0])
-    look_through_camera()
+    frame_demo(head, current_scene(), FRAMES_PER_SECOND)
     save_file(path)
     open_file(path)
     worst = 0.0

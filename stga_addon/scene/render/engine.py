@@ -169,6 +169,15 @@ def combined(rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] |
     return image
 
 
+def srgb_background(scene: Any) -> tuple[float, float, float] | None:
+    """Color behind the splats as in `_background`, in sRGB 0…1."""
+    linear = _background(scene)
+    if linear is None:
+        return None
+    red, green, blue = linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist()
+    return red, green, blue
+
+
 def _background(scene: Any) -> tuple[float, ...] | None:
     """Scene-linear color behind the splats, None where the film is transparent.
 

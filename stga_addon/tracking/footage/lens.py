@@ -5,14 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 MIN_RADIUS = 1e-9
-"""Below it, an angle and its tangent are the same number."""
+"""Below it, an angle and its tangent are the same number; and parameters have no effect."""
 
 
 @dataclass(frozen=True)
 class Lens:
     """Distortion of normalized image points, applied in this order.
 
-    projection  how the angle θ off the axis becomes a radius: "perspective" (tan θ), "fisheye" (θ)
+    projection  how the angle θ off the axis becomes a radius: "perspective" (tan θ), "fisheye" (θ), "field of view"
+                (2 tan θ tan ω/2 → its arc tangent / ω) or "division" (r with r / (1 + k r²) = tan θ)
+    parameter   ω (radians) of "field of view", k of "division"
     radial      k1, k2, … of 1 + k1 r² + k2 r⁴ + …, any number
     rational    the same for the denominator (k4 to k6 of OpenCV's rational model)
     tangential  p1, p2 as OpenCV counts them: x += 2 p1 x y + p2 (r² + 2 x²), y += p1 (r² + 2 y²) + 2 p2 x y
@@ -26,6 +28,7 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     affine: tuple[float, float] = (0.0, 0.0)
+    parameter: float = 0.0
 
     @property
     def is_ideal(self) -> bool:
@@ -47,9 +50,16 @@ class Lens:
     def _projected(self, points: np.ndarray) -> np.ndarray:
         if self.projection == "perspective":
             return points
-        radius = np.linalg.norm(points, axis=-1, keepdims=True)
-        factor = np.where(radius < MIN_RADIUS, 1.0, np.arctan(radius) / np.maximum(radius, MIN_RADIUS))
-        return np.asarray(points * factor)
+        tangent = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), MIN_RADIUS)
+        return np.asarray(points * self._radius(tangent) / tangent)
+
+    def _radius(self, tangent: np.ndarray) -> np.ndarray:
+        if self.projection == "fisheye" or abs(self.parameter) < MIN_RADIUS:
+            return np.arctan(tangent) if self.projection == "fisheye" else tangent
+        if self.projection == "field of view":
+            return np.asarray(np.arctan(2 * tangent * np.tan(self.parameter / 2)) / self.parameter)
+        with np.errstate(invalid="ignore"):  # NaN beyond the widest angle that the lens shows
+            return np.asarray(2 * tangent / (1 + np.sqrt(1 - 4 * self.parameter * tangent**2)))
 
 
 def _polynomial(coefficients: tuple[float, ...], square: np.ndarray) -> np.ndarray:

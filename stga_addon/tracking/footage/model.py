@@ -81,6 +81,7 @@ class Footage:
     timesteps   all that any camera has a frame of, ascending
     fps         frames per second of the videos; None for images
     calibrated  False for one camera whose focal length is a guess, not read from a file or given
+    warnings    one sentence each
     """
 
     root: Path
@@ -88,6 +89,7 @@ class Footage:
     timesteps: tuple[int, ...]
     fps: float | None = None
     calibrated: bool = True
+    warnings: tuple[str, ...] = ()
 
     def views(self) -> Iterator[tuple[int, FootageCamera]]:
         """(timestep, camera) of every frame, camera by camera in order of time: the fast order for videos."""

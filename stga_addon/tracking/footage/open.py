@@ -1,82 +1,187 @@
-"""Opening footage: a calibration file and the frames of its cameras."""
+"""Opening footage: a calibration and the frames of its cameras."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import partial
 from os.path import isdir, isfile
 from pathlib import Path
 
 import numpy as np
 
+from ...capture.camera import Camera, camera_from_gl
+from ...capture.images import image_size
 from ...capture.model import View
-from ...capture.transforms import SPLITS
 from ...errors import StgaError
+from . import video
+from .calibrations import EXPECTED, find_calibration, read_calibration
 from .image_frames import ImageFrames
-from .model import Footage, FootageCamera
-from .nerfstudio import read_nerfstudio
+from .lens import Lens
+from .model import Footage, FootageCamera, Frames
+from .sequences import FrameRange, Sequence, frames_per_second, open_sequence, sequence_size, synchronized
 from .shots import Shot
+from .sources import Sources, find_sources, sequence_files, sequence_names, still_image
 from .undistort import undistortion
 
-TRANSFORMS = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
+ALL_FRAMES = FrameRange()
+GUESSED_FOCAL_SHARE = 1.2
+"""Focal length of an unknown camera, as a share of the image's longer side: that of a phone's, or a 43 mm lens."""
 
 
-def open_footage(folder: Path, cameras: Path | None = None, principal_point: str | None = None) -> Footage:
+def open_footage(
+    path: Path,
+    cameras: Path | None = None,
+    frames: FrameRange = ALL_FRAMES,
+    focal: float | None = None,
+    principal_point: str | None = None,
+) -> Footage:
     """Open footage: cameras and file names now, frames when they are asked for.
 
-    cameras: the calibration file; None: the one that `folder` holds.
-    principal_point: what `cy` means in transforms files, as in `read_transforms`; None: by the file's author.
+    path     folder with an image, a folder of images or a video for each camera; or one video
+    cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
+    focal    focal length in pixels of a single camera without a calibration; None: a guess, and not `calibrated`
+    principal_point  what `cy` means in transforms files, as in `read_transforms`; None: by the file's author
+    Cameras with a folder or video show sequences; where all have one image, it shows one moment.
     Raises StgaError in one sentence naming file, field and what was expected, also for a missing image.
     """
-    if not isdir(folder):
-        raise StgaError(f"{folder}: is not a folder; expected that of the footage")
-    root = folder.resolve()
-    shots = [shot for path in _calibration_files(root, cameras) for shot in read_nerfstudio(path, principal_point)]
-    return _footage(root, _cameras(shots))
+    sources, root = _sources(path)
+    calibration = cameras if cameras is not None else find_calibration(root) if isdir(path) else None
+    if calibration is None:
+        return _single_camera(root, sources, frames, focal)
+    if focal is not None:
+        raise StgaError(f"{calibration}: has focal lengths; expected none besides")
+    shots, warnings = read_calibration(calibration, principal_point, partial(_image_size, sources))
+    if any(shot.timestep is not None for shot in shots):
+        found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
+        return _footage(root, found, warnings=warnings)
+    names = sequence_names(sources, (shot.label for shot in shots))
+    if any(names):
+        rig = _by_name(shots, names, root)
+        sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
+        return replace(_rig(root, sources, sequences, rig, frames), warnings=warnings)
+    return _footage(root, _listed_cameras(_with_stills(shots, sources), calibration), warnings=warnings)
 
 
-def _calibration_files(root: Path, given: Path | None) -> list[Path]:
-    if given is not None:
-        return [given]
-    found = [root / name for name in TRANSFORMS if (root / name).is_file()]
-    if not found:
-        raise StgaError(f"{root}: has no cameras; expected {' or '.join(TRANSFORMS[:2])}")
-    return found[:1] if found[0].name == TRANSFORMS[0] else found
+def _sources(path: Path) -> tuple[Sources, Path]:
+    root = path.resolve()
+    if isdir(path):
+        return find_sources(root), root
+    if isfile(path) and path.suffix.lower() in video.SUFFIXES:
+        return Sources(root.parent, videos={root.stem: [root]}), root.parent
+    raise StgaError(f"{path}: is neither a folder nor a video; expected footage")
 
 
-def _footage(root: Path, cameras: tuple[FootageCamera, ...]) -> Footage:
+def _footage(
+    root: Path, cameras: tuple[FootageCamera, ...], fps: float | None = None, warnings: tuple[str, ...] = ()
+) -> Footage:
     timesteps = {timestep for camera in cameras for timestep in camera.timesteps}
-    return Footage(root, cameras, tuple(sorted(timesteps)))
+    return Footage(root, cameras, tuple(sorted(timesteps)), fps, warnings=warnings)
 
 
-def _cameras(shots: Iterable[Shot]) -> tuple[FootageCamera, ...]:
+# Sequences: a folder of images or a video for each camera
+
+
+def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str, Shot]:
+    """Camera -> its shot. Raises StgaError for a camera without recording, and for two with the same."""
+    found: dict[str, Shot] = {}
+    for shot, name in zip(shots, names, strict=True):
+        if name is None:
+            raise StgaError(f"{shot.where}: {root} has no folder or video of this camera, though it has of others")
+        if name in found:
+            raise StgaError(
+                f"{shot.where}: and {found[name].where} are both of camera {name}; expected different names"
+            )
+        found[name] = shot
+    return found
+
+
+def _rig(
+    root: Path, sources: Sources, sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], frames: FrameRange
+) -> Footage:
+    fps = frames_per_second(sequences)
+    recorded = synchronized(sequences, shots, sources, frames)
+    return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps)
+
+
+def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
+    found = undistortion(shot.camera, shot.lens, shot.where)
+    return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
+
+
+def _single_camera(root: Path, sources: Sources, frames: FrameRange, focal: float | None) -> Footage:
+    """Footage of one camera without a calibration; its world is the camera's, y up."""
+    names = sorted({*sources.videos, *sources.folders})
+    if len(names) != 1:
+        found = f"{len(names)} cameras" if names else "neither images nor videos"
+        raise StgaError(f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera")
+    sequence: Sequence = open_sequence(sequence_files(sources, names[0]))
+    width, height = sequence_size(sequence)
+    pixels = focal if focal is not None else GUESSED_FOCAL_SHARE * max(width, height)
+    if pixels < 1:
+        raise StgaError(f"Focal length: expected at least 1 pixel, not {pixels:g}")
+    camera = camera_from_gl(np.eye(4), width, height, pixels, pixels, width / 2, height / 2)
+    name = names[0] or root.name
+    shot = Shot(name, camera, Lens(), str(root))
+    return replace(_rig(root, sources, {name: sequence}, {name: shot}, frames), calibrated=focal is not None)
+
+
+# Images that the calibration lists
+
+
+def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
+    """Shots with their image, which shows the only moment."""
+    found = []
+    for shot in shots:
+        listed = shot.image if shot.image is not None and isfile(shot.image) else None
+        image = listed or still_image(sources, shot.label, shot.where)
+        inside = image.is_relative_to(sources.root)
+        mask = shot.mask or (sources.mask_of(image) if inside else None)
+        found.append(replace(shot, image=image, mask=mask, timestep=0))
+    return found
+
+
+def _image_size(sources: Sources, label: str) -> tuple[int, int]:
+    """Size of the images of a label; for calibrations that do not hold it."""
+    name = sequence_names(sources, [label])[0]
+    if name is not None:
+        return sequence_size(open_sequence(sequence_files(sources, name)))
+    return image_size(still_image(sources, label, f"camera {label}"))
+
+
+def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera, ...]:
     """One camera for all shots with the same name (where they have one), pose and lens."""
+    if not shots:
+        raise StgaError(f"{calibration}: none of its frames are in the chosen range")
     groups: dict[object, list[Shot]] = {}
     for shot in shots:
         groups.setdefault(_identity(shot), []).append(shot)
     names = [group[0].camera_name or group[0].label for group in groups.values()]
-    return tuple(
-        _camera(name if names.count(name) == 1 else f"{name} at timestep {group[0].timestep}", group)
-        for name, group in zip(names, groups.values(), strict=True)
-    )
+    cameras: list[FootageCamera] = []
+    for name, group in zip(names, groups.values(), strict=True):
+        unique = name if names.count(name) == 1 else f"{name} at timestep {group[0].timestep}"
+        if unique in (camera.name for camera in cameras):
+            raise StgaError(f"{group[0].where}: two cameras are named {unique}; expected different names")
+        cameras.append(_camera(unique, group[0], ImageFrames(_views(unique, group))))
+    return tuple(cameras)
 
 
 def _identity(shot: Shot) -> object:
-    camera = shot.camera
+    camera: Camera = shot.camera
     intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
     # Adding zero turns -0 into 0, whose bytes differ.
     pose = (np.round(camera.world_to_camera, 6) + 0.0).tobytes()
     return shot.camera_name, intrinsics, pose, shot.lens
 
 
-def _camera(name: str, shots: list[Shot]) -> FootageCamera:
+def _views(name: str, shots: list[Shot]) -> dict[int, View]:
     views: dict[int, View] = {}
     for shot in sorted(shots, key=lambda shot: shot.timestep or 0):
         timestep = shot.timestep or 0
+        if shot.image is None:
+            raise StgaError(f"{shot.where}: names no image")
         if timestep in views and views[timestep].image != shot.image:
             raise StgaError(f"{shot.where}: camera {name} has two images at timestep {timestep}")
         for path in filter(None, (shot.image, shot.mask)):
             if not isfile(path):
                 raise StgaError(f"{path}: does not exist, but {shot.where} names it")
-        assert shot.image is not None
         views[timestep] = View(timestep, 0, shot.camera, shot.label, shot.image, shot.mask)
-    found = undistortion(shots[0].camera, shots[0].lens, shots[0].where)
-    camera = shots[0].camera if found is None else found.camera
-    return FootageCamera(name, camera, ImageFrames(views), found)
+    return views

@@ -1,31 +1,20 @@
-"""Footage opened from a calibration file."""
+"""Footage of transforms files."""
 
 import json
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
 
-WIDTH, HEIGHT = 40, 30
-
-
-def rig(count=3):
-    return [look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), WIDTH, HEIGHT, 50.0) for a in 0.4 * np.arange(count)]
+from .scenes import HEIGHT, rig, write_image
 
 
 def entry(camera, path, **values):
     intrinsics = {key: getattr(camera, key) for key in ("fl_x", "fl_y", "cx", "cy")}
     pose = {"transform_matrix": camera.camera_to_world_gl.tolist()}
     return {"file_path": path, "w": camera.width, "h": camera.height, **intrinsics, **pose, **values}
-
-
-def write_image(path, value=128):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (WIDTH, HEIGHT), (value, 10, 20)).save(path)
 
 
 def write_transforms(folder, frames, name="transforms.json", **top):
@@ -77,7 +66,10 @@ def test_splits_are_one_rig(tmp_path):
     [
         ({"k1": "much"}, r"transforms.json: frames\[1\].k1: expected a finite number, not 'much'"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"frames\[1\].camera_model: 'EQUIRECTANGULAR' is not one of"),
-        ({"file_path": "images/none.png"}, r"none.png: does not exist, but .*frames\[1\] names it"),
+        (
+            {"file_path": "images/none.png"},
+            r"frames\[1\]: .* has no image, folder or video of the name 'images/none.png'",
+        ),
         ({"mask_path": "masks/none.png"}, r"masks/none.png: does not exist, but .*frames\[1\] names it"),
         ({"k1": -40.0}, r"frames\[1\]: the distortion of its lens folds the image"),
     ],

@@ -1,0 +1,55 @@
+"""Enters and leaves Pose mode on the head's rig."""
+
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import select_bones
+from ..stga_addon.scene.objects import leave_edit_mode, show_kind
+from ..stga_addon.scene.rig.flame_rig import rig_of
+from . import ids
+from .common import head_of, needs_rig, reporting
+
+JAW = "jaw"
+
+
+class PoseHead(bpy.types.Operator):
+    """Show the bones and select the jaw in Pose mode; again: back to Object mode. R turns a bone, I keeps its pose"""
+
+    bl_idname = ids.POSE_HEAD
+    bl_label = "Pose the Jaw"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_rig(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head, objects = head_of(context), context.view_layer.objects
+        rig = rig_of(head)
+        was_posing = is_posing(context, rig)
+        leave_edit_mode()
+        show_kind(head.parent, tags.RIG, context.view_layer, not was_posing)
+        if was_posing:
+            return {"FINISHED"}
+        rig.hide_set(False)
+        if not rig.visible_get(view_layer=context.view_layer):
+            raise StgaError(f"{rig.name}: is hidden; show its collection in the Outliner")
+        for selected in objects.selected:
+            selected.select_set(False)
+        rig.select_set(True)
+        objects.active = rig
+        bpy.ops.object.mode_set(mode="POSE")
+        select_bones(rig, {JAW})
+        rig.data.bones.active = rig.data.bones[JAW]
+        if context.area is not None and context.area.type == "VIEW_3D":
+            bpy.ops.wm.tool_set_by_id(name="builtin.rotate")
+        return {"FINISHED"}
+
+
+def is_posing(context: Any, rig: Any) -> bool:
+    """Whether this rig is in Pose mode."""
+    return context.view_layer.objects.active is rig and rig.mode == "POSE"

@@ -1,0 +1,315 @@
+"""Renders a video of the shown splats: Blender records what each image shows, a worker renders and encodes it."""
+
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..stga_addon.capture.camera import Camera
+from ..stga_addon.capture.camera_path import TURNTABLE_S, to_and_fro
+from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs.video_job import Recorder, VideoJob, remove_video_job, worker_arguments
+from ..stga_addon.raster.posed_splats import PosedSplats
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
+from ..stga_addon.scene.render.engine import srgb_background
+from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from ..stga_addon.worker.launch import start_worker
+from ..stga_addon.worker.status import WorkerState, inspect_worker, request_cancel
+from . import ids, monitor
+from .common import file_path, is_head, reporting, scene_settings
+from .environment import has_training_python, training_python
+
+RECORDING_INTERVAL_S = 0.001
+"""Between two recorded images, so that Blender handles its events."""
+
+
+@dataclass
+class Video:
+    """A scene's video: `recorded` of its images are recorded; then a worker renders them in its status folder."""
+
+    output: Path
+    folder: Path
+    images: int
+    recorded: int = 0
+
+    @property
+    def is_recording(self) -> bool:
+        return self.recorded < self.images
+
+
+_videos: dict[int, Video] = {}
+"""Session id of a scene -> its last video."""
+
+
+def video_of(scene: Any) -> Video | None:
+    """The scene's video that is being made, or was made last; None where there is none, or it was dismissed."""
+    return _videos.get(scene.session_uid)
+
+
+class RenderVideo(bpy.types.Operator, ExportHelper):
+    """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working meanwhile"""
+
+    bl_idname = ids.RENDER_VIDEO
+    bl_label = "Render Video"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    filepath: bpy.props.StringProperty(
+        name="File or Folder",
+        description="An .mp4 file, or a folder for PNGs",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    )
+    path: bpy.props.EnumProperty(
+        name="Camera",
+        description="How the camera moves",
+        items=(
+            ("turntable", "Turntable", "The scene's camera moves around the head, which plays its motion to and fro"),
+            ("scene", "As Animated", "The scene's camera and animation, from the scene's first to its last frame"),
+        ),
+    )
+    format: bpy.props.EnumProperty(
+        name="Format",
+        description="What is written",
+        items=(
+            ("mp4", "MP4", "One video file, H.264"),
+            ("png", "PNG Sequence", "One PNG per image; with alpha where the film is transparent"),
+        ),
+    )
+    angle: bpy.props.FloatProperty(
+        name="Angle",
+        description="Of the turntable, to both sides; 0: the sides that the capture's cameras saw",
+        subtype="ANGLE",
+        min=0.0,
+        max=2 * pi,
+        default=0.0,
+    )
+    seconds: bpy.props.FloatProperty(
+        name="Seconds", description="Duration of the turntable", default=TURNTABLE_S, min=0.1, soft_max=60.0
+    )
+    filename_ext = ""
+    filter_glob: bpy.props.StringProperty(default="*.mp4", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if scene_settings(context).splats is None:
+            cls.poll_message_set("Show an avatar first")
+            return False
+        if is_busy(context.scene):
+            cls.poll_message_set("A video is being made; wait, or cancel it")
+            return False
+        if not has_training_python(context):
+            cls.poll_message_set("Needs a training environment, which is made in the add-on's preferences")
+            return False
+        return True
+
+    def check(self, context: Any) -> bool:
+        """Keep the path's extension in step with the format; whether it changed."""
+        path = self.filepath.removesuffix(".mp4")
+        if self.format == "mp4":
+            path = bpy.path.ensure_ext(path, ".mp4")
+        changed, self.filepath = path != self.filepath, path
+        return changed
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        output = file_path(self.filepath, "video").resolve()
+        if self.format == "mp4" and output.suffix.lower() != ".mp4":
+            output = output.with_name(f"{output.name}.mp4")
+        if self.format == "png" and output.suffix.lower() == ".mp4":
+            output = output.with_suffix("")
+        self._python = training_python(context)
+        self._recording = _Recording(context, output, self._frames(context), self._cameras(context))
+        if bpy.app.background:
+            return self._record_and_render(context)
+        self._timer = context.window_manager.event_timer_add(RECORDING_INTERVAL_S, window=context.window)
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def _record_and_render(self, context: Any) -> set[str]:
+        try:
+            while self._recording.record_next():
+                pass
+        except StgaError:
+            self._recording.discard()
+            raise
+        return self._render(context, wait=True)
+
+    def modal(self, context: Any, event: Any) -> set[str]:
+        if event.type == "ESC" or not self._recording.is_wanted():
+            self.cancel(context)
+            return {"CANCELLED"}
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        try:
+            more = self._recording.record_next()
+            monitor.redraw()
+            if more:
+                return {"RUNNING_MODAL"}
+            context.window_manager.event_timer_remove(self._timer)
+            return self._render(context)
+        except StgaError as error:
+            self.cancel(context)
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def cancel(self, context: Any) -> None:
+        """End the recording, also when Blender quits or loads another file meanwhile."""
+        context.window_manager.event_timer_remove(self._timer)
+        self._recording.discard()
+        monitor.redraw()
+
+    def _frames(self, context: Any) -> list[int]:
+        scene = context.scene
+        frames = list(range(scene.frame_start, scene.frame_end + 1))
+        if self.path == "scene":
+            return frames
+        return to_and_fro(frames, max(len(frames), round(self.seconds * _fps(scene)), 1))
+
+    def _cameras(self, context: Any) -> Sequence[Camera] | None:
+        """One camera per frame, None for the scene's own at each frame."""
+        if self.path == "scene":
+            return None
+        settings = scene_settings(context)
+        subject = settings.head if is_head(settings.head) else settings.splats
+        count = len(self._frames(context))
+        return turntable_cameras(subject, context.evaluated_depsgraph_get(), count, self.angle)
+
+    def _render(self, context: Any, wait: bool = False) -> set[str]:
+        """Start the worker; `wait`: until it ends. Raises StgaError where it failed then."""
+        video = self._recording.finish()
+        process = start_worker(video.folder, self._python, worker_arguments(video.folder))
+        monitor.monitor_worker(video.folder, process)
+        if wait:
+            _wait(video, process)
+            self.report({"INFO"}, f"Rendered {video.output}")
+        return {"FINISHED"}
+
+
+class CancelVideo(bpy.types.Operator):
+    """Stop making the video; nothing is written, or the PNGs that are finished stay"""
+
+    bl_idname = ids.CANCEL_VIDEO
+    bl_label = "Cancel Video"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if is_busy(context.scene):
+            return True
+        cls.poll_message_set("No video is being made")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        video = _videos[context.scene.session_uid]
+        if video.is_recording:
+            _videos.pop(context.scene.session_uid)  # the recording sees it at its next image
+        else:
+            request_cancel(video.folder)
+            monitor.monitor_worker(video.folder)
+        return {"FINISHED"}
+
+
+class DismissVideo(bpy.types.Operator):
+    """Remove the message about the last video; the video stays"""
+
+    bl_idname = ids.DISMISS_VIDEO
+    bl_label = "Dismiss"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if video_of(context.scene) is not None and not is_busy(context.scene):
+            return True
+        cls.poll_message_set("No video was made yet, or one is being made")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        remove_video_job(_videos.pop(context.scene.session_uid).folder)
+        return {"FINISHED"}
+
+
+def is_busy(scene: Any) -> bool:
+    """Whether a video of the scene is being recorded or rendered."""
+    video = video_of(scene)
+    return video is not None and (video.is_recording or monitor.snapshot(video.folder).state.is_alive)
+
+
+class _Recording:
+    """Records the images of a video, one scene frame at a time; the scene's frame is restored at the end."""
+
+    def __init__(self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None) -> None:
+        self._scene, self._frames, self._cameras = context.scene, frames, cameras
+        self._shown = context.scene.frame_current, context.scene.frame_subframe
+        self._cache, self._layers = SplatCache(), dict[int, list[PosedSplats]]()
+        folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
+        job = VideoJob(output, len(frames), _fps(context.scene), srgb_background(context.scene))
+        self._recorder = Recorder(folder, job)
+        self.video = Video(output, folder, len(frames))
+        last = _videos.get(context.scene.session_uid)
+        if last is not None:
+            remove_video_job(last.folder)
+        _videos[context.scene.session_uid] = self.video
+
+    def is_wanted(self) -> bool:
+        """Whether it was not cancelled."""
+        return self.video in _videos.values()
+
+    def record_next(self) -> bool:
+        """Record an image; whether there are more. Raises StgaError, as where the head is gone."""
+        index = self.video.recorded
+        frame = self._frames[index]
+        if frame not in self._layers:
+            self._scene.frame_set(frame)
+            if self._cameras is None:
+                self._layers.clear()  # each frame comes once
+            self._layers[frame] = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
+        own = self._cameras is None
+        camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[index]
+        self._recorder.add(self._layers[frame], camera)
+        self.video.recorded += 1
+        return self.video.is_recording
+
+    def finish(self) -> Video:
+        """End the recording; the job is ready for its worker."""
+        self._restore()
+        return self.video
+
+    def discard(self) -> None:
+        """End the recording and remove its files."""
+        self._restore()
+        remove_video_job(self.video.folder)
+        for scene, video in list(_videos.items()):
+            if video is self.video:
+                del _videos[scene]
+
+    def _restore(self) -> None:
+        self._recorder.close()
+        frame, subframe = self._shown
+        with suppress(ReferenceError):  # another file was opened
+            self._scene.frame_set(frame, subframe=subframe)
+
+
+def _fps(scene: Any) -> float:
+    return float(scene.render.fps / scene.render.fps_base)
+
+
+def _wait(video: Video, process: "subprocess.Popen[bytes]") -> None:
+    process.wait()
+    last = inspect_worker(video.folder, process)
+    if last.state != WorkerState.FINISHED:
+        raise StgaError(last.status.error or "The video was cancelled")
+
+
+def unregister() -> None:
+    """Forget the videos; their workers go on."""
+    _videos.clear()

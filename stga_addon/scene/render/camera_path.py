@@ -1,0 +1,47 @@
+"""Frames and cameras of a video of the scene: its animation, or a turntable."""
+
+from typing import Any
+
+import numpy as np
+
+from ...capture.camera import Camera, camera_from_gl
+from ...capture.camera_path import covered_angles, turntable
+from .. import tags
+from ..arrays import evaluated_vertices
+from .camera import render_camera
+
+UP = (0.0, 0.0, 1.0)
+"""Blender's scenes are z-up."""
+
+
+def scene_camera(depsgraph: Any) -> Camera:
+    """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is perspective."""
+    scene = depsgraph.scene
+    render = scene.render
+    scale = render.resolution_percentage / 100
+    width, height = max(1, int(render.resolution_x * scale)), max(1, int(render.resolution_y * scale))
+    camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
+    return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
+
+
+def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
+    """`count` cameras that start as the scene's and orbit the object `subject`, a head or splats.
+
+    angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there are none.
+    """
+    start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
+    vertices = evaluated_vertices(subject) if subject.type == "MESH" else np.zeros((1, 3))
+    center = matrix[:3, :3] @ (vertices.min(0) + vertices.max(0)) / 2 + matrix[:3, 3]
+    angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
+    cameras = _capture_cameras(subject)
+    if not angle and cameras:
+        angles = covered_angles(cameras, start, center, UP)
+    return turntable(start, center, count, angles, UP)
+
+
+def _capture_cameras(subject: Any) -> list[Camera]:
+    """The cameras of the capture that `subject` belongs to, for their positions."""
+    root = subject.parent
+    children = () if root is None else root.children_recursive
+    found = [child for child in children if child.get(tags.KIND) == tags.CAMERA]
+    return [camera_from_gl(np.array(camera.matrix_world, np.float64), 1, 1, 1, 1, 0, 0) for camera in found]

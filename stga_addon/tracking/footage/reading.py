@@ -1,0 +1,87 @@
+"""Bounded reads of calibration files, and checks of the cameras in them."""
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ...capture.camera import MAX_FOCAL_PIXELS, Camera, is_image_size
+from ...errors import StgaError, shorten
+from ...files import file_size
+
+MAX_FILE_BYTES = 1 << 30
+ROTATION_TOLERANCE = 1e-3  # some exports round rotations to a few decimals
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file. Raises StgaError where it is missing, no regular file, or above 1 GiB."""
+    size = file_size(path)
+    if size > MAX_FILE_BYTES:
+        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_FILE_BYTES} allowed")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def read_text(path: Path) -> str:
+    """The whole file, with or without a byte order mark. Raises StgaError as `read_bytes`, and where not UTF-8."""
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except ValueError as error:
+        raise StgaError(f"{path}: is not UTF-8 text ({error})") from error
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root element. Raises StgaError where it is malformed, or declares entities, which calibrations never do."""
+    data = read_bytes(path)
+    if b"<!DOCTYPE" in data:
+        raise StgaError(f"{path}: declares a document type; expected a calibration")
+    try:
+        return ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise StgaError(f"{path}: is not valid XML ({error})") from error
+
+
+def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[float]:
+    """Finite numbers. Raises StgaError, beginning with `where`, for other words or another count."""
+    words = list(words)
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = [math.nan]
+    if not all(math.isfinite(value) for value in values) or count not in (None, len(values)):
+        expected = "finite numbers" if count is None else f"{count} finite number{'s' if count > 1 else ''}"
+        raise StgaError(f"{where}: expected {expected}, not {shorten(' '.join(words))}")
+    return values
+
+
+def pinhole(
+    size: tuple[float, float],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    rotation: np.ndarray,
+    position: np.ndarray,
+    where: str,
+) -> Camera:
+    """Camera of a calibration.
+
+    size, focal, center: (x, y) in pixels, the center from the top-left corner. rotation (3, 3) from world to OpenCV's
+    camera axes; position (3,) of the camera in the calibration's world, whose unit is free.
+    Raises StgaError, beginning with `where`, for a size, focal length or rotation that no camera has.
+    """
+    if not is_image_size(*size):
+        raise StgaError(f"{where}: expected an image size in pixels, not {size[0]:g} x {size[1]:g}")
+    if not all(1 <= value <= MAX_FOCAL_PIXELS for value in focal):
+        raise StgaError(f"{where}: expected a focal length of 1 to 1e7 pixels, not {focal[0]:g}, {focal[1]:g}")
+    if not np.isfinite([*center, *rotation.ravel(), *position]).all():
+        raise StgaError(f"{where}: expected a pose and principal point of finite numbers")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+        raise StgaError(f"{where}: expected a rotation without scale or shear")
+    if np.linalg.det(rotation) < 0:
+        raise StgaError(f"{where}: its axes are mirrored; expected a right-handed rotation")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    return Camera(int(size[0]), int(size[1]), *focal, *center, pose)

@@ -1,0 +1,143 @@
+"""Finding the frames of cameras in a folder: an image, a folder of images or a video for each."""
+
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from ...errors import StgaError, shorten
+from . import video
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+CONTAINERS = ("images", "frames", "videos", "input")
+"""Folders that gather those of the cameras; their names are no part of a camera's."""
+MASK_FOLDERS = ("masks", "fg_masks")
+MAX_DEPTH = 4
+MAX_FILES = 1_000_000
+
+
+@dataclass
+class Sources:
+    """Files of a footage folder, by path below it without suffix and without a leading "images/" and the like.
+
+    images   "cam01/0001" -> files
+    folders  "cam01" -> its images, in natural order; "" for those that lie at the top
+    videos   "cam01" -> files
+    masks    as `images`; COLMAP's names ("0001.jpg.png") are "0001.jpg"
+    """
+
+    root: Path
+    images: dict[str, list[Path]] = field(default_factory=dict)
+    folders: dict[str, list[Path]] = field(default_factory=dict)
+    videos: dict[str, list[Path]] = field(default_factory=dict)
+    masks: dict[str, list[Path]] = field(default_factory=dict)
+
+    def mask_of(self, image: Path) -> Path | None:
+        """The mask with the same path below one of `MASK_FOLDERS`."""
+        key, name = _key(self.root, image), _without_container(image.relative_to(self.root).as_posix())
+        return next(iter(self.masks.get(key) or self.masks.get(name, [])), None)
+
+
+def find_sources(root: Path) -> Sources:
+    """List the footage folder, four levels deep, without hidden folders. Raises StgaError for over a million files."""
+    sources, count = Sources(root), 0
+    for folder, names, files in os.walk(root):
+        depth = len(Path(folder).relative_to(root).parts)
+        names[:] = sorted(name for name in names if not name.startswith(".") and depth < MAX_DEPTH)
+        count += len(files)
+        if count > MAX_FILES:
+            raise StgaError(f"{root}: holds more than {MAX_FILES} files; expected a folder of footage")
+        for name in sorted(files, key=natural_order):
+            _enter(sources, Path(folder, name))
+    return sources
+
+
+def _enter(sources: Sources, path: Path) -> None:
+    key, suffix = _key(sources.root, path), path.suffix.lower()
+    if path.name.startswith("."):
+        return
+    if suffix in video.SUFFIXES:
+        sources.videos.setdefault(key, []).append(path)
+    elif suffix in IMAGE_SUFFIXES:
+        first, _, rest = path.relative_to(sources.root).as_posix().partition("/")
+        if first in MASK_FOLDERS:
+            sources.masks.setdefault(_without_container(rest.rpartition(".")[0]), []).append(path)
+            return
+        sources.images.setdefault(key, []).append(path)
+        sources.folders.setdefault(key.rpartition("/")[0], []).append(path)
+
+
+def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
+    """For each label, the name of its camera's folder or video; None where it has neither.
+
+    The name is the label, with or without suffix and leading folders; or the folder of the image that the camera was
+    calibrated with, where no other camera's lies there.
+    """
+    labels = list(labels)
+    parents = [_parent(label) for label in labels]
+    found = []
+    for label, parent in zip(labels, parents, strict=True):
+        names = _tails(label)
+        if parent and parents.count(parent) == 1:
+            names += _tails(parent)
+        found.append(next((n for n in names if n in sources.videos or (n and n in sources.folders)), None))
+    return found
+
+
+def still_image(sources: Sources, label: str, where: str) -> Path:
+    """The image of that name. Raises StgaError, beginning with `where`, where there is none, or more than one."""
+    found = next((sources.images[name] for name in _tails(label) if name in sources.images), [])
+    if not found:
+        raise StgaError(f"{where}: {sources.root} has no image, folder or video of the name {shorten(label)}")
+    if len(found) > 1:
+        raise StgaError(f"{where}: {found[0]} and {found[1]} are both named {shorten(label)}; expected one")
+    return found[0]
+
+
+def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
+    """The video of a camera, or its images in order. Raises StgaError where there are both, or two videos."""
+    videos, images = sources.videos.get(name, []), sources.folders.get(name, [])
+    if len(videos) > 1 or (videos and images):
+        other = videos[1] if len(videos) > 1 else images[0].parent
+        raise StgaError(
+            f"{videos[0]} and {other} are both named {shorten(name)}; expected one video or folder a camera"
+        )
+    return videos[0] if videos else images
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Sort key by which 2 comes before 10."""
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
+
+
+def frame_number(path: Path) -> int | None:
+    """The last number in a file's name."""
+    found = re.findall(r"\d+", path.stem)
+    return int(found[-1]) if found else None
+
+
+def _key(root: Path, path: Path) -> str:
+    return _without_container(path.relative_to(root).with_suffix("").as_posix())
+
+
+def _without_container(path: str) -> str:
+    first, separator, rest = path.partition("/")
+    return rest if separator and first in CONTAINERS else path
+
+
+def _stem(label: str) -> str:
+    """The label without the suffix of an image or video, with forward slashes."""
+    path = PurePosixPath(label.replace("\\", "/"))
+    known = path.suffix.lower() in (*IMAGE_SUFFIXES, *video.SUFFIXES)
+    return (path.with_suffix("") if known else path).as_posix()
+
+
+def _parent(label: str) -> str:
+    return _stem(label).rpartition("/")[0]
+
+
+def _tails(label: str) -> list[str]:
+    """The label without suffix, then without its first folder, its second, …"""
+    parts = [part for part in _stem(label).split("/") if part not in ("", ".")]
+    return ["/".join(parts[start:]) for start in range(len(parts))]

@@ -1,0 +1,62 @@
+"""What an imported capture looks like: framed viewports, bones that are posed by one button."""
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
+from mathutils import Vector  # noqa: E402
+
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.objects import layers_of  # noqa: E402
+from stga_addon.scene.viewports import frame_head  # noqa: E402
+
+
+@pytest.fixture
+def head(extension, tmp_path):
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    return bpy.context.scene.stga.head
+
+
+def viewports() -> list:
+    return [
+        area.spaces.active for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"
+    ]  # fmt: skip
+
+
+def test_viewports_look_at_the_head(head):
+    """Catches a view from the side, past the head, or one that shows it as a dot."""
+    frame_head(head, bpy.context.scene.camera, bpy.data.screens)
+    center = head.matrix_world @ (sum((Vector(corner) for corner in head.bound_box), Vector()) / 8)
+    size = max(head.dimensions)
+    assert viewports()
+    for space in viewports():
+        region = space.region_3d
+        assert (region.view_location - center).length < 0.3 * size
+        assert 0.5 * size < region.view_distance < 5 * size
+        expected = np.array(bpy.context.scene.camera.matrix_world.to_3x3().normalized())
+        np.testing.assert_allclose(np.array(region.view_rotation.to_matrix()), expected, atol=1e-5)
+
+
+def test_pose_the_jaw_and_back(head):
+    """Catches bones that stay hidden, another bone that is selected, and no way back."""
+    layer = bpy.context.view_layer
+    (bones,) = layers_of(head.parent, tags.RIG, layer)
+    assert bones.hide_viewport
+    assert bpy.ops.stga.pose_head() == {"FINISHED"}
+    rig = layer.objects.active
+    assert (rig.get(tags.KIND), rig.mode, bones.hide_viewport) == (tags.RIG, "POSE", False)
+    owners = rig.pose.bones if bpy.app.version >= (5, 0, 0) else rig.data.bones
+    assert [bone.name for bone in owners if bone.select] == ["jaw"]
+    assert rig.data.bones.active.name == "jaw"
+    assert bpy.ops.stga.pose_head() == {"FINISHED"}
+    assert (rig.mode, bones.hide_viewport) == ("OBJECT", True)
+
+
+def test_heads_without_bones_say_so(extension, tmp_path):
+    """Catches a traceback, or a mode without bones, where a head has no rig."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.stga.pose_head()

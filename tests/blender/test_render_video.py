@@ -1,0 +1,75 @@
+"""Render Video in background mode: the worker's images are those of the render engine."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+bpy = pytest.importorskip("bpy")
+av = pytest.importorskip("av")
+
+from capture.factory import write_mesh_capture  # noqa: E402
+
+from .test_operators import write_ball_avatar  # noqa: E402
+
+
+@pytest.fixture
+def shown(extension, tmp_path):
+    """A scene of three frames that shows an avatar on the moving ball."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture", range(3), range(3))))
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    render = bpy.context.scene.render
+    render.resolution_percentage, render.fps, render.film_transparent = 200, 10, True
+    bpy.context.scene.frame_set(1)
+    yield tmp_path
+    if bpy.ops.stga.dismiss_video.poll():
+        bpy.ops.stga.dismiss_video()
+
+
+def engine_image(frame: int, path: Path) -> np.ndarray:
+    """The frame as the render engine writes it, (H, W, 4) uint8."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.render.filepath = "STGA_SPLATS", str(path)
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.frame_set(frame)
+    bpy.ops.render.render(write_still=True)
+    return np.asarray(Image.open(path)).astype(int)
+
+
+def test_image_sequence_of_the_scene(shown):
+    """Catches a sequence of another camera, size, frame or transparency than the render engine's."""
+    scene = bpy.context.scene
+    assert bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png") == {"FINISHED"}
+    assert scene.frame_current == 1
+    written = sorted((shown / "images").iterdir())
+    assert [path.name for path in written] == ["0001.png", "0002.png", "0003.png"]
+    for frame, path in enumerate(written):
+        image, expected = np.asarray(Image.open(path)).astype(int), engine_image(frame, shown / "engine.png")
+        opaque = (expected[..., 3] > 250) & (image[..., 3] > 250)
+        assert opaque.mean() > 0.1
+        assert np.abs(image - expected)[opaque].max() <= 2
+        assert np.abs(image[..., 3] - expected[..., 3]).max() <= 1
+
+
+def test_turntable_video(shown):
+    """Catches a turntable that stands still, lasts another time, or ends without the file it names."""
+    assert bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=1.5) == {"FINISHED"}
+    with av.open(str(shown / "turn.mp4")) as container:
+        assert container.streams.video[0].average_rate == 10
+        images = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    assert len(images) == 15
+    assert np.abs(images[0] - images[4]).max() > 40
+    (video,) = [video for video in shown.iterdir() if video.suffix == ".mp4"]
+    assert video.name == "turn.mp4"
+
+
+def test_a_head_that_is_gone(shown):
+    """Catches a traceback, and a job that is left behind as one in the making."""
+    splats = bpy.context.scene.stga.splats
+    bpy.data.objects.remove(bpy.context.scene.stga.head)
+    with pytest.raises(RuntimeError, match="has no head to follow"):
+        bpy.ops.stga.render_video(filepath=str(shown / "turn"), path="scene")
+    assert not bpy.ops.stga.cancel_video.poll()
+    assert splats is not None

@@ -1,0 +1,103 @@
+"""COLMAP models, compared with pycolmap."""
+
+import re
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.tracking.footage.colmap import LENSES, read_colmap
+from stga_addon.tracking.footage.open import open_footage
+
+from .scenes import HEIGHT, WIDTH, rig, write_colmap_text, write_image
+
+RANDOM = np.random.default_rng(3)
+PARAMETERS = {"FOV": (0.7,), "DIVISION": (-0.1,), "SIMPLE_DIVISION": (-0.1,)}
+
+
+def reconstruction():
+    """One image for each camera model of `LENSES`, with random pose and points."""
+    pycolmap = pytest.importorskip("pycolmap")
+    found = pycolmap.Reconstruction()
+    for number, (name, (count, _)) in enumerate(LENSES.items(), start=1):
+        camera = pycolmap.Camera.create_from_model_name(number, name, 500.0, 640, 480)
+        values = np.array(camera.params)
+        values[len(values) - count :] = PARAMETERS.get(name, 0.05 * RANDOM.standard_normal(count))
+        camera.params = values
+        found.add_camera_with_trivial_rig(camera)
+        pose = np.r_[RANDOM.standard_normal(4), RANDOM.standard_normal(3)]
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
+        points = pycolmap.Point2DList([pycolmap.Point2D(RANDOM.uniform(0, 400, 2)) for _ in range(number % 3)])
+        image = pycolmap.Image(name=f"cam {name}.jpg", image_id=number, camera_id=number, points2D=points)
+        found.add_image_with_trivial_frame(image, rigid)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_projections_are_colmaps(tmp_path, kind):
+    """Catches any model, text or binary, whose coefficients, pose or principal point are read as another's."""
+    model = reconstruction()
+    getattr(model, f"write_{kind}")(str(tmp_path))
+    shots = read_colmap(tmp_path)
+    assert [shot.label for shot in shots] == sorted(f"cam {name}.jpg" for name in LENSES)
+    local = np.c_[RANDOM.uniform(-0.5, 0.5, (20, 2)), np.ones(20)] * RANDOM.uniform(1, 3, (20, 1))
+    for shot, image in zip(shots, sorted(model.images.values(), key=lambda image: image.name), strict=True):
+        pose = image.cam_from_world().matrix()
+        world = (local - pose[:, 3]) @ pose[:, :3]
+        expected = image.camera.img_from_cam(local)
+        camera = shot.camera
+        seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        distorted = shot.lens.distort(seen[:, :2] / seen[:, 2:])
+        found = distorted * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
+        np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=shot.label)
+
+
+def test_model_beside_the_images(tmp_path):
+    """Catches COLMAP's usual folders not being found, and images without points that shift the lines after them."""
+    names = ["left.png", "middle.png", "right.png"]
+    write_colmap_text(tmp_path / "sparse/0", rig(), names)
+    for number, name in enumerate(names):
+        write_image(tmp_path / "images" / name, 50 * number)
+    footage = open_footage(tmp_path)
+    assert [camera.name for camera in footage.cameras] == names
+    assert [camera.image(0)[0, 0, 0] for camera in footage.cameras] == [0, 50, 100]
+    for camera, expected in zip(footage.cameras, rig(), strict=True):
+        np.testing.assert_allclose(camera.camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("cameras", "PINHOLE", "EQUIRECTANGULAR", r"cameras.txt: camera 1: model 'EQUIRECTANGULAR' is not one of"),
+        ("cameras", "PINHOLE", "OPENCV", r"cameras.txt: camera 1: expected 8 parameters of OPENCV, not 4"),
+        ("cameras", "50.0", "nan", r"cameras.txt: line 2: expected finite numbers"),
+        ("cameras", "50.0", "0", r"image 'left.png': expected a focal length of 1 to 1e7 pixels, not 0, 0"),
+        ("cameras", f" {WIDTH} {HEIGHT} ", " 0 30 ", r"image 'left.png': expected an image size in pixels, not 0 x 30"),
+        ("images", " 2 right.png", " 7 right.png", r"image 'right.png': names camera 7, which .*cameras.txt does not"),
+        ("images", " 2 right.png", " 2 left.png", r"image 'left.png': two cameras are named left.png"),
+        ("images", " 1 left.png", " 1 gone.png", r"has no image, folder or video of the name 'gone.png'"),
+        ("images", " 1 left.png", "", r"images.txt: line 2: expected number, quaternion, translation, camera and name"),
+    ],
+)
+def test_damaged_models_are_named(tmp_path, file, old, new, message):
+    """Catches a traceback, or a message without file and field."""
+    write_colmap_text(tmp_path / "sparse/0", rig(2), ["left.png", "right.png"])
+    for name in ("left.png", "right.png"):
+        write_image(tmp_path / name)
+    path = tmp_path / f"sparse/0/{file}.txt"
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(StgaError, match=message):
+        open_footage(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
+def test_binary_files_cut_short(tmp_path, file):
+    """Catches an error of the decoder, or a model that is read in part without a word."""
+    reconstruction().write_binary(str(tmp_path))
+    data = (tmp_path / file).read_bytes()
+    for length in [*range(0, 60, 7), len(data) - 9]:
+        (tmp_path / file).write_bytes(data[:length])
+        with pytest.raises(StgaError, match=re.escape(f"{tmp_path / file}: ")):
+            read_colmap(tmp_path)

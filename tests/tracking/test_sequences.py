@@ -1,0 +1,207 @@
+"""Frames of folders and videos, in step."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.sequences import FrameRange
+
+from .scenes import HEIGHT, WIDTH, rig, write_colmap_text, write_image, write_video
+
+
+def write_folders(root, counts=(6, 6), first=1, parent="images"):
+    """Cameras a and b with images numbered from `first`; camera c's red is 10 (c + 1) + number."""
+    names = "abcdef"[: len(counts)]
+    write_colmap_text(root / "sparse/0", rig(len(counts)), [f"{name}/frame_1.png" for name in names])
+    for camera, (name, count) in enumerate(zip(names, counts, strict=True)):
+        for number in range(first, first + count):
+            write_image(root / parent / name / f"frame_{number}.png", 100 * (camera + 1) + number)
+
+
+def red(footage):
+    return {camera.name: [int(camera.image(t)[0, 0, 0]) for t in camera.timesteps] for camera in footage.cameras}
+
+
+def test_folders_in_natural_order(tmp_path):
+    """Catches frame 10 before frame 2, and a rig calibrated with one image taken for one moment."""
+    write_folders(tmp_path, (12, 12))
+    footage = open_footage(tmp_path)
+    assert footage.timesteps == tuple(range(12))
+    assert footage.fps is None
+    assert red(footage) == {"a": [*range(101, 113)], "b": [*range(201, 213)]}
+    assert footage.cameras[0].file(9) == tmp_path / "images/a/frame_10.png"
+
+
+def test_range_step_and_offset(tmp_path):
+    """Catches an offset of the wrong sign, a range in other units than timesteps, and a lost timestep number."""
+    write_folders(tmp_path, (8, 12))
+    footage = open_footage(tmp_path, frames=FrameRange(1, 8, 3, {"b": 2}))
+    assert footage.timesteps == (1, 4, 7)
+    assert red(footage) == {"a": [102, 105, 108], "b": [204, 207, 210]}
+    footage = open_footage(tmp_path, frames=FrameRange(offsets={"b": -1}))
+    assert footage.timesteps == tuple(range(1, 8))
+    assert red(footage) == {"a": [*range(102, 109)], "b": [*range(201, 208)]}
+
+
+@pytest.mark.parametrize(
+    ("counts", "frames", "message"),
+    [
+        ((6, 5), FrameRange(), r"Camera b has 5 frames and camera a 6; expected recordings of the same length"),
+        ((6, 5), FrameRange(0, 6), r"Camera b has 5 frames; expected all up to 6"),
+        ((6, 6), FrameRange(0, 6, 1, {"b": 1}), r"Camera b has 6 frames; expected all up to 6 and its offset"),
+        ((6, 6), FrameRange(offsets={"z": 1}), r"Offset for camera z: expected one of a, b"),
+        ((6, 6), FrameRange(9), r"Frames from 9 on: the cameras have only 6 in common"),
+    ],
+)
+def test_recordings_out_of_step(tmp_path, counts, frames, message):
+    """Catches frames of different moments paired without a word."""
+    write_folders(tmp_path, counts)
+    with pytest.raises(StgaError, match=message):
+        open_footage(tmp_path, frames=frames)
+
+
+def test_missing_frame_in_one_folder(tmp_path):
+    """Catches all later frames of a camera being one too early because one file is missing."""
+    write_folders(tmp_path, (7, 6))
+    (tmp_path / "images/a/frame_4.png").unlink()
+    with pytest.raises(StgaError, match=r"b/frame_4.png: is 3 frames after the first of camera b, where camera a has"):
+        open_footage(tmp_path)
+
+
+def test_camera_without_a_recording(tmp_path):
+    """Catches a camera that disappears from the footage."""
+    write_folders(tmp_path)
+    for path in (tmp_path / "images/b").iterdir():
+        path.unlink()
+    with pytest.raises(StgaError, match=r"image 'b/frame_1.png': .* has no folder or video of this camera"):
+        open_footage(tmp_path)
+
+
+def test_other_size_than_calibrated(tmp_path):
+    """Catches images of another resolution than the calibration's."""
+    write_folders(tmp_path)
+    for path in (tmp_path / "images/b").iterdir():
+        write_image(path, size=(20, 15))
+    with pytest.raises(StgaError, match=r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"):
+        open_footage(tmp_path)
+
+
+def test_masks_beside_the_images(tmp_path):
+    """Catches masks of another camera or frame, and COLMAP's names of masks."""
+    write_folders(tmp_path)
+    write_image(tmp_path / "masks/a/frame_2.png", 255)
+    write_image(tmp_path / "masks/b/frame_3.png.png", 77)
+    first, second = open_footage(tmp_path).cameras
+    assert first.mask(0) is None
+    assert first.mask(1)[0, 0] == 255
+    assert second.mask(2)[0, 0] == 77
+
+
+def test_several_images_of_one_folder_are_several_cameras(tmp_path):
+    """Catches the images of a camera that moves around a still head taken for a sequence."""
+    names = ["walk/1.png", "walk/2.png", "walk/3.png"]
+    write_colmap_text(tmp_path / "sparse", rig(), names)
+    for number, name in enumerate(names):
+        write_image(tmp_path / name, number)
+    footage = open_footage(tmp_path)
+    assert red(footage) == {name: [number] for number, name in enumerate(names)}
+
+
+def values_of(frames):
+    """Mean gray of frames."""
+    return [float(frame.mean()) for frame in frames]
+
+
+def write_videos(root, counts=(12, 12), rates=(25, 25), **options):
+    pytest.importorskip("av")
+    names = "ab"[: len(counts)]
+    write_colmap_text(root / "calibration", rig(len(counts)), [f"{name}.jpg" for name in names])
+    for camera, (name, count, rate) in enumerate(zip(names, counts, rates, strict=False)):
+        write_video(root / f"videos/{name}.mp4", [60 + 10 * n + 5 * camera for n in range(count)], rate=rate, **options)
+
+
+@pytest.mark.parametrize("order", [range(12), [11, 3, 4, 5, 0, 10, 2], [6, 6, 5]])
+def test_frames_of_a_video_in_any_order(tmp_path, order):
+    """Catches key frames shown for the frames after them, and frames in the order of decoding."""
+    write_videos(tmp_path)
+    footage = open_footage(tmp_path, cameras=tmp_path / "calibration")
+    assert footage.fps == 25
+    assert footage.timesteps == tuple(range(12))
+    second = footage.cameras[1]
+    found = values_of(second.image(t) for t in order)
+    np.testing.assert_allclose(found, [65 + 10 * t for t in order], atol=3)
+    assert second.source(3) == f"{tmp_path / 'videos/b.mp4'}: frame 3"
+    assert second.file(3) is None
+
+
+def test_range_of_videos(tmp_path):
+    """Catches offsets and steps that videos do not follow as folders do."""
+    write_videos(tmp_path, (12, 14))
+    footage = open_footage(tmp_path, tmp_path / "calibration", FrameRange(2, 12, 4, {"b": 2}))
+    assert footage.timesteps == (2, 6, 10)
+    np.testing.assert_allclose(values_of(footage.cameras[1].image(t) for t in (2, 6, 10)), [105, 145, 185], atol=3)
+
+
+def test_videos_of_different_rates(tmp_path):
+    """Catches 25 and 30 frames a second paired by number."""
+    write_videos(tmp_path, rates=(25, 30))
+    with pytest.raises(StgaError, match=r"camera b has 30 frames a second, that of camera a 25; expected one rate"):
+        open_footage(tmp_path, tmp_path / "calibration")
+
+
+def test_damaged_video(tmp_path):
+    """Catches an exception of FFmpeg's, when opened or in the middle."""
+    write_videos(tmp_path)
+    path = tmp_path / "videos/b.mp4"
+    data = path.read_bytes()
+    path.write_bytes(data[:200])
+    with pytest.raises(StgaError, match=r"b.mp4: is not a readable video"):
+        open_footage(tmp_path, tmp_path / "calibration")
+
+
+def test_without_pyav_the_message_names_it(tmp_path, monkeypatch):
+    """Catches a traceback where the package is missing."""
+    write_videos(tmp_path)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(StgaError, match=r"a.mp4: reading videos needs the package av \(PyAV\)"):
+        open_footage(tmp_path, tmp_path / "calibration")
+
+
+def test_one_video_without_calibration(tmp_path):
+    """Catches a guessed focal length that is passed off as known."""
+    pytest.importorskip("av")
+    write_video(tmp_path / "phone.mp4", [60, 90, 120], size=(64, 48), rate=30)
+    for path in (tmp_path, tmp_path / "phone.mp4"):
+        footage = open_footage(path)
+        assert (footage.calibrated, footage.fps, footage.timesteps) == (False, 30, (0, 1, 2))
+        assert [camera.name for camera in footage.cameras] == ["phone"]
+    known = open_footage(tmp_path, focal=55.0)
+    assert known.calibrated
+    assert (known.cameras[0].camera.fl_x, known.cameras[0].camera.cx) == (55.0, 32.0)
+
+
+def test_two_cameras_without_calibration(tmp_path):
+    """Catches a rig without poses taken for one camera."""
+    write_image(tmp_path / "a/1.png")
+    write_image(tmp_path / "b/1.png")
+    with pytest.raises(StgaError, match=r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model"):
+        open_footage(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
+        open_footage(tmp_path / "empty")
+
+
+def test_distorted_frames_are_undistorted(tmp_path):
+    """Catches frames handed out as recorded beside a pinhole camera that does not show them."""
+    pytest.importorskip("cv2")
+    write_colmap_text(tmp_path / "sparse", rig(1), ["a.png"], "SIMPLE_RADIAL", (50.0, WIDTH / 2, HEIGHT / 2, -0.3))
+    write_image(tmp_path / "a/1.png", 90)
+    write_image(tmp_path / "masks/a/1.png", 255)
+    camera = open_footage(tmp_path).cameras[0]
+    assert camera.camera.fl_x < 50
+    assert camera.image(0).shape == (HEIGHT, WIDTH, 3)
+    assert camera.mask(0).shape == (HEIGHT, WIDTH)
+    assert camera.file(0) is None

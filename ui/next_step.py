@@ -1,0 +1,86 @@
+"""The hint on top of the sidebar tab: what to do next, with its button; once an avatar is shown, what to try."""
+
+from typing import Any
+
+import bpy
+
+from ..operators import ids, monitor
+from ..operators.common import is_head, scene_settings
+from ..operators.environment import has_training_python
+from ..operators.pose import is_posing
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene.compat import modifier_input_owner
+from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
+from ..stga_addon.scene.rig.flame_rig import rig_of
+from .sidebar import SidebarPanel
+from .text import draw_text
+from .train_panel import draw_environment_setup, draw_train_button
+from .video import draw_video
+
+
+class NextStepPanel(SidebarPanel, bpy.types.Panel):
+    bl_idname = "STGA_PT_next_step"
+    bl_label = "Next Step"
+
+    def draw(self, context: Any) -> None:
+        layout, settings = self.layout, scene_settings(context)
+        training = monitor.training_of(context.scene).snapshot.state.is_alive
+        if not is_head(settings.head) and settings.splats is None:
+            draw_text(layout, context, "Import a capture: the tracked head, its cameras and their images")
+            layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
+        elif settings.splats is not None:
+            _draw_what_to_try(layout, context, settings)
+        elif training:
+            draw_text(layout, context, "Training: splats appear on the head soon. Go on working, save, or quit Blender")
+        elif settings.avatar:
+            draw_text(layout, context, "Show the trained avatar on the head")
+            layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = settings.avatar
+        elif has_training_python(context):
+            draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
+            draw_train_button(layout, settings)
+        else:
+            draw_text(
+                layout,
+                context,
+                "Training needs a Python environment; to show a trained avatar, go to 4 Show",
+            )
+            draw_environment_setup(layout)
+
+
+def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
+    """Buttons that bring a shown avatar to life."""
+    layout.label(text="Orbit the avatar, or try", icon="INFO")
+    playing = context.screen.is_animation_playing
+    play = "Pause" if playing else "Play  (Space)"
+    column = layout.column(align=True)
+    column.operator("screen.animation_play", text=play, icon="PAUSE" if playing else "PLAY")
+    rig = _rig(settings.head)
+    if rig is not None:
+        posing = is_posing(context, rig)
+        text = "Done Posing" if posing else "Pose the Jaw"
+        column.operator(ids.POSE_HEAD, text=text, icon="ARMATURE_DATA", depress=posing)
+        if posing:
+            draw_text(column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO")
+    _draw_selection_toggle(column, settings.splats)
+    draw_video(column, context)
+
+
+def _draw_selection_toggle(layout: Any, splats: Any) -> None:
+    """Draw the switch that grays out what the current frame's selection freezes, where the splats have it."""
+    try:
+        modifier = splat_modifier(splats)
+    except StgaError:
+        return
+    identifier = input_identifier(modifier, splat_nodes.SHOW_SELECTION)
+    if identifier is not None:
+        owner, prop = modifier_input_owner(modifier, identifier)
+        layout.prop(owner, prop, text=splat_nodes.SHOW_SELECTION, icon="RESTRICT_SELECT_OFF", toggle=True)
+
+
+def _rig(head: Any) -> Any:
+    """The head's FLAME rig, or None."""
+    try:
+        return rig_of(head) if is_head(head) else None
+    except StgaError:
+        return None
