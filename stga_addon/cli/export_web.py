@@ -31,7 +31,7 @@ def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> N
     playback = Playback(
         title=_title(options),
         fps=options.fps,
-        views=_views(capture),
+        views=capture_views(capture),
         up=_up(capture),
         selection=_selection(capture, timesteps, options),
         motion_only=options.motion_only,
@@ -47,7 +47,7 @@ def _title(options: Namespace) -> str:
     return str(path.parent.name if path.name == "avatar.npz" else path.stem)
 
 
-def _views(capture: Capture) -> dict[str, Camera]:
+def capture_views(capture: Capture) -> dict[str, Camera]:
     """The first pose of each camera, a held-out one first."""
     cameras: dict[int, Camera] = {}
     for split in SPLITS:

@@ -10,6 +10,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from avatar.web.web_data import read_web_data  # noqa: E402
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
@@ -233,6 +234,26 @@ def test_exports_for_other_tools(extension, mesh_capture, tmp_path):
     for frame in range(4):
         expected = expected_world(avatar, capture.mesh(frame)).xyz
         np.testing.assert_allclose(positions.Get(frame), expected, atol=1e-5)
+
+
+def test_export_of_a_web_page(extension, mesh_capture, tmp_path):
+    """Catches a page of other frames than the scene's, at another rate, or seen from elsewhere than its camera."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene = bpy.context.scene
+    scene.render.fps, scene.frame_start = 30, 1
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web") == {"FINISHED"}
+    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    assert header["fps"] == 30
+    meshes = [open_capture(mesh_capture).mesh(timestep) for timestep in (1, 2, 3)]
+    centers = [mesh.mean(0) for mesh in meshes]
+    np.testing.assert_allclose(arrays["translation"], centers, atol=1e-5)
+    camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
+    head_to_camera = np.array(scene.camera.matrix_world.inverted() @ scene.stga.head.matrix_world)
+    np.testing.assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
+    up = np.array(scene.stga.head.matrix_world.to_3x3()) @ header["up"]
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-5)
 
 
 def range_export(extension, folder: Path, frames: range, stop_after: int | None = None) -> list[Path]:

@@ -12,10 +12,19 @@ from typing import Any
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-FLAGS = ("--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars",
-         "--force-prefers-reduced-motion", "--disable-dev-shm-usage", "--disable-background-networking", "--no-first-run", "--js-flags=--expose-gc",
-         "--remote-debugging-pipe")  # fmt: skip
-TIMEOUT_S = 60.0
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--hide-scrollbars",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--no-first-run",
+    "--force-prefers-reduced-motion",
+    "--remote-debugging-pipe",
+)
+TIMEOUT_S = 120.0
 
 
 def find_browser() -> str:

@@ -55,7 +55,7 @@ def test_equal_avatars_give_equal_bytes(head):
 
 
 def test_baked_meshes_come_back(head):
-    """Catches a lost mean, rotation or component of a baked sequence, and a rig that travels in spite of "motion only"."""
+    """Catches a lost mean, rotation or component of a baked sequence, and a baked rig that has sliders."""
     rig = baked_rig(list(head.meshes))
     angles = np.linalg.norm(rig.pose[:, 0], axis=1)
     assert angles.max() < 1

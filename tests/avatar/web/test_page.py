@@ -24,7 +24,8 @@ SNAPSHOT = """(async () => {
   avatar.camera = 'front';
   avatar.background = '#ffffff';
   const blob = await avatar.snapshot();
-  return new Promise((done) => Object.assign(new FileReader(), { onload: (e) => done(e.target.result) }).readAsDataURL(blob));
+  const reader = new FileReader();
+  return new Promise((done) => Object.assign(reader, { onload: () => done(reader.result) }).readAsDataURL(blob));
 })()"""
 READY = """new Promise((done) => {
   const avatar = document.querySelector('stga-avatar');
@@ -78,7 +79,6 @@ def test_controls(browser, head, tmp_path):
     show(browser, tmp_path, head.data())
     found = browser.evaluate("""(() => {
       const avatar = document.querySelector('stga-avatar');
-      const press = (key) => dispatchEvent(Object.assign(new KeyboardEvent('keydown', { key, cancelable: true })));
       const rows = [...document.querySelectorAll('.slider')];
       const name = rows[0].firstChild.textContent;
       const input = rows[0].querySelector('input');
