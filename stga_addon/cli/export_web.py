@@ -63,7 +63,7 @@ def _up(capture: Capture) -> tuple[float, float, float]:
     cameras = [view.camera for views in capture.views.values() for view in views]
     if not cameras:
         return (0.0, 1.0, 0.0)
-    mean = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    mean = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
     axis = np.zeros(3)
     axis[np.abs(mean).argmax()] = np.sign(mean[np.abs(mean).argmax()])
     return (float(axis[0]), float(axis[1]), float(axis[2]))

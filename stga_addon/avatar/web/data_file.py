@@ -46,7 +46,7 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     if exact:
-        arrays = {name: np.float32(a.values) if isinstance(a, FixedPoint) else a for name, a in arrays.items()}
+        arrays = {name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a for name, a in arrays.items()}
     return pack(_header(avatar, rig, playback), arrays)
 
 
