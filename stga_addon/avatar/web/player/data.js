@@ -12,9 +12,11 @@ export async function readData(bytes) {
   if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) throw new DataError('This is not an avatar data file.');
   const raw = await inflate(bytes);
   const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
-  if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741) throw new DataError('This is not an avatar data file.');
+  if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741)
+    throw new DataError('This is not an avatar data file.');
   const version = view.getUint32(4, true);
-  if (version !== VERSION) throw new DataError(`The avatar has format version ${version}; this player reads ${VERSION}.`);
+  if (version !== VERSION)
+    throw new DataError(`The avatar has format version ${version}; this player reads ${VERSION}.`);
   const length = view.getUint32(8, true);
   if (length > MAX_HEADER_BYTES || 12 + length > raw.length) throw new DataError('The avatar data is cut off.');
   const header = parseHeader(raw.subarray(12, 12 + length));
@@ -128,7 +130,9 @@ export function checkData(header, arrays) {
   checkRange(arrays.rotation_largest.values, 4, 'rotation_largest');
   checkRange(arrays.splats_per_face.values, splats + 1, 'splats_per_face');
   require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) === splats, 'splats_per_face');
-  require(header.parents.every((parent, joint) => parent === -1 || (Number.isInteger(parent) && parent >= 0 && parent < joint)), 'parents');
+  require(header.parents.every(
+    (parent, joint) => parent === -1 || (Number.isInteger(parent) && parent >= 0 && parent < joint),
+  ), 'parents');
   checkHeader(header, joints, shapes);
 }
 
@@ -141,7 +145,10 @@ function checkHeader(header, joints, shapes) {
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
   require(list(header.joints, 'joints').length === joints, 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
-    require(typeof slider?.name === 'string' && slider.reach > 0 && slider.component >= 0 && slider.component < shapes, 'sliders');
+    require(typeof slider?.name === 'string' &&
+      slider.reach > 0 &&
+      slider.component >= 0 &&
+      slider.component < shapes, 'sliders');
   }
   for (const view of list(header.views, 'views')) {
     require(typeof view?.name === 'string' && numbers(view.size, 2) && Math.min(...view.size) >= 1, 'views');
@@ -152,7 +159,9 @@ function checkHeader(header, joints, shapes) {
 
 function checkArray(arrays, name, shape) {
   const array = arrays[name];
-  require(array && array.shape.length === shape.length && shape.every((size, axis) => size === array.shape[axis]), name);
+  require(array &&
+    array.shape.length === shape.length &&
+    shape.every((size, axis) => size === array.shape[axis]), name);
   if (array.values instanceof Float32Array) require(array.values.every(Number.isFinite), name);
 }
 

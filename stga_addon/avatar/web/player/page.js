@@ -95,9 +95,16 @@ let background = null; // chosen by the viewer; null: the theme's
 
 function applyBackground() {
   const { theme } = document.documentElement.dataset;
-  const trained = `#${avatar.info.background.map((part) => Math.round(255 * part).toString(16).padStart(2, '0')).join('')}`;
+  const trained = `#${avatar.info.background
+    .map((part) =>
+      Math.round(255 * part)
+        .toString(16)
+        .padStart(2, '0'),
+    )
+    .join('')}`;
   avatar.background = background ?? THEME_BACKGROUND[theme] ?? trained;
-  for (const swatch of document.querySelectorAll('button.swatch')) icon(swatch, (swatch.dataset.color || null) === background);
+  for (const swatch of document.querySelectorAll('button.swatch'))
+    icon(swatch, (swatch.dataset.color || null) === background);
 }
 
 function addBackgrounds() {
@@ -110,7 +117,11 @@ function addBackgrounds() {
     swatch.addEventListener('click', () => chooseBackground(color || null));
     row.append(swatch);
   }
-  const custom = Object.assign(document.createElement('input'), { type: 'color', className: 'swatch', title: 'Any color' });
+  const custom = Object.assign(document.createElement('input'), {
+    type: 'color',
+    className: 'swatch',
+    title: 'Any color',
+  });
   custom.addEventListener('input', () => chooseBackground(custom.value));
   row.append(custom);
   applyBackground();
@@ -267,7 +278,8 @@ function toggleFullscreen() {
 function showFacts() {
   const splats = avatar.splatCount.toLocaleString('en');
   const rate = avatar.frameCount > 1 ? ` · ${Number(avatar.info.fps.toFixed(2))} fps` : '';
-  byId('facts').innerHTML = `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms a frame</span>`;
+  byId('facts').innerHTML =
+    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms a frame</span>`;
 }
 
 function start() {

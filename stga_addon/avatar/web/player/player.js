@@ -14,7 +14,8 @@ export class Player {
   constructor(canvas, data) {
     const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
     this.gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
-    if (!this.gl) throw new RendererError('This page needs WebGL 2, which this browser or graphics driver does not offer.');
+    if (!this.gl)
+      throw new RendererError('This page needs WebGL 2, which this browser or graphics driver does not offer.');
     const { header, arrays } = data;
     this.canvas = canvas;
     this.data = data;

@@ -35,7 +35,7 @@ export class Rig {
 
   /** The entries of the rotations of joints 1… minus identity. */
   poseFeatures() {
-    return this.local.slice(9).map((entry, k) => entry - (k % 9 % 4 === 0 ? 1 : 0));
+    return this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
   }
 
   /** Rotation and offset of each joint in the world, from the root outwards. */

@@ -37,7 +37,11 @@ export class StgaAvatar extends HTMLElement {
     this.#message = root.querySelector('p');
     this.speed = 1;
     this.loop = false;
-    addControls(this.#canvas, () => this.#player, () => this.#changed('camerachange'));
+    addControls(
+      this.#canvas,
+      () => this.#player,
+      () => this.#changed('camerachange'),
+    );
     this.#canvas.addEventListener('webglcontextlost', (event) => event.preventDefault());
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
@@ -155,12 +159,18 @@ export class StgaAvatar extends HTMLElement {
   /** "#rrggbb" or "transparent". */
   get background() {
     const [red, green, blue, alpha] = this.#player?.background ?? [1, 1, 1, 1];
-    const hex = (part) => Math.round(255 * part).toString(16).padStart(2, '0');
+    const hex = (part) =>
+      Math.round(255 * part)
+        .toString(16)
+        .padStart(2, '0');
     return alpha ? `#${hex(red)}${hex(green)}${hex(blue)}` : 'transparent';
   }
 
   set background(value) {
-    const parts = /^#(..)(..)(..)$/.exec(value)?.slice(1).map((part) => parseInt(part, 16) / 255);
+    const parts = /^#(..)(..)(..)$/
+      .exec(value)
+      ?.slice(1)
+      .map((part) => parseInt(part, 16) / 255);
     if (!parts && value !== 'transparent') throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
     if (this.#player) this.#player.background = parts ? [...parts, 1] : [0, 0, 0, 0];
     this.#request ||= requestAnimationFrame((now) => this.#tick(now));
