@@ -36,10 +36,14 @@ def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) ->
 
 
 def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
-    """FLAME parameters of what the head plays; None, after saying why, where they would not give the scene's meshes."""
+    """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they would not give the
+    scene's meshes."""
     reasons: list[str] = []
     try:
         rig_of(head)
+    except StgaError:
+        return None
+    try:
         motion = sample_motion(head, flame_of(capture_of(head), head.name), frames, reasons.append)
     except StgaError as error:
         reasons.append(str(error))

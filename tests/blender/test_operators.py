@@ -246,9 +246,9 @@ def test_export_of_a_web_page(extension, mesh_capture, tmp_path):
     assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web") == {"FINISHED"}
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["fps"] == 30
-    meshes = [open_capture(mesh_capture).mesh(timestep) for timestep in (1, 2, 3)]
-    centers = [mesh.mean(0) for mesh in meshes]
-    np.testing.assert_allclose(arrays["translation"], centers, atol=1e-5)
+    assert len(arrays["translation"]) == 3
+    centers = [open_capture(mesh_capture).mesh(timestep).mean(0) for timestep in (1, 3)]
+    np.testing.assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
     camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
     head_to_camera = np.array(scene.camera.matrix_world.inverted() @ scene.stga.head.matrix_world)
     np.testing.assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
