@@ -36,6 +36,7 @@ export class Renderer {
     this.frameTexture = texture(gl, gl.RGBA32F, this.frameValues);
     this.makeIndexArray();
     this.target = null;
+    this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
   makeIndexArray() {
@@ -52,12 +53,13 @@ export class Renderer {
 
   /**
    * Draw `order` (back to front) of the splats on the frames in `frameValues`.
-   * camera: { size, focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas.
+   * camera: { size, focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas;
+   * format: of the target in which they are blended.
    */
-  draw(order, camera, background, showSelection, framebuffer = null) {
+  draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
     const gl = this.gl;
     const [width, height] = camera.size;
-    this.resizeTarget(width, height);
+    this.resizeTarget(width, height, format);
     this.upload(order);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
     gl.viewport(0, 0, width, height);
@@ -104,10 +106,11 @@ export class Renderer {
     gl.disable(gl.BLEND);
   }
 
-  resizeTarget(width, height) {
-    if (this.target?.width === width && this.target?.height === height) return;
-    if (this.target) deleteTarget(this.gl, this.target);
-    this.target = makeTarget(this.gl, this.gl.RGBA16F, width, height);
+  resizeTarget(width, height, format) {
+    const { target } = this;
+    if (target?.width === width && target.height === height && target.format === format) return;
+    if (target) deleteTarget(this.gl, target);
+    this.target = makeTarget(this.gl, format, width, height);
   }
 
   /** The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied with alpha. */
@@ -115,7 +118,7 @@ export class Renderer {
     const gl = this.gl;
     const [width, height] = camera.size;
     const copy = makeTarget(gl, gl.RGBA8, width, height);
-    this.draw(order, camera, background, showSelection, copy.framebuffer);
+    this.draw(order, camera, background, showSelection, copy.framebuffer, this.finest);
     const flipped = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, flipped);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -239,7 +242,7 @@ function makeTarget(gl, format, width, height) {
   const framebuffer = gl.createFramebuffer();
   gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
-  return { texture: made, framebuffer, width, height };
+  return { texture: made, framebuffer, format, width, height };
 }
 
 function deleteTarget(gl, target) {
