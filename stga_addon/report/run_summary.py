@@ -1,5 +1,6 @@
 """Summary of a training run and its curve as a picture, from its metrics."""
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -61,7 +62,8 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         return []
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
-        best = max((line for line in metrics if "psnr" in line), key=lambda line: line["psnr"])
+        evaluations = [line for line in metrics if "psnr" in line]
+        best = min(evaluations, key=lambda line: line.get("detail_difference", math.inf))
         parts = [f"{best['psnr']:.2f} dB", f"SSIM {best['ssim']:.4f}"]
         named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]

@@ -1,5 +1,6 @@
 """Render Video in background mode: the worker's images are those of the render engine."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ av = pytest.importorskip("av")
 
 from capture.factory import write_mesh_capture  # noqa: E402
 
+from stga_addon.avatar.file import write_avatar  # noqa: E402
+from stga_addon.avatar.ply import write_ply  # noqa: E402
+from stga_addon.avatar.splats import Splats  # noqa: E402
+
 from .test_operators import write_ball_avatar  # noqa: E402
 
 
@@ -18,7 +23,9 @@ from .test_operators import write_ball_avatar  # noqa: E402
 def shown(extension, tmp_path):
     """A scene of three frames that shows an avatar on the moving ball."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture", range(3), range(3))))
-    write_ball_avatar(tmp_path / "avatar.npz")
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    colors = np.random.default_rng(1).normal(0, 1.5, avatar.splats.sh.shape).astype(np.float32)
+    write_avatar(tmp_path / "avatar.npz", replace(avatar, splats=replace(avatar.splats, sh=colors)))
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     render = bpy.context.scene.render
     render.resolution_percentage, render.fps, render.film_transparent = 200, 10, True
@@ -63,6 +70,29 @@ def test_turntable_video(shown):
     assert np.abs(images[0] - images[4]).max() > 40
     (video,) = [video for video in shown.iterdir() if video.suffix == ".mp4"]
     assert video.name == "turn.mp4"
+
+
+def test_turntable_of_a_ply(extension, tmp_path):
+    """Catches a turntable that needs a head, or turns about splats far away."""
+    rng = np.random.default_rng(0)
+    xyz = rng.normal((3, 1, 0), 0.1, (200, 3))
+    xyz[0] = 1e4
+    upright = np.tile(np.float32([1, 0, 0, 0]), (200, 1))
+    shape = {"log_scale": np.full((200, 3), -4.0), "opacity": np.full(200, 3.0), "sh": np.full((200, 1, 3), 1.5)}
+    floats = {name: values.astype(np.float32) for name, values in ({"xyz": xyz} | shape).items()}
+    splats = Splats(rotation=upright, face=np.zeros(200, np.int32), unbound=np.zeros(200, bool), **floats)
+    write_ply(tmp_path / "scan.ply", splats)
+    bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"))
+    scene, camera = bpy.context.scene, bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (3, -1, 1), (np.pi / 2, 0, 0)
+    scene.camera, scene.render.resolution_percentage, scene.frame_end = camera, 5, 3
+    assert bpy.ops.stga.render_video(filepath=str(tmp_path / "turn"), format="png", seconds=0.5) == {"FINISHED"}
+    images = [np.asarray(Image.open(path)).astype(int) for path in sorted((tmp_path / "turn").iterdir())]
+    assert len(images) == 12
+    shown = [(image[..., :3].max(2) > image[0, 0, :3].max() + 20).mean() for image in images]
+    assert min(shown) > 0.5 * max(shown) > 0
+    bpy.ops.stga.dismiss_video()
 
 
 def test_a_head_that_is_gone(shown):

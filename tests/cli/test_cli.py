@@ -130,9 +130,9 @@ def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert f"{split}: {views} views, PSNR " in capsys.readouterr().out
         quality = json.loads((trained / f"quality_{split}.json").read_text())
         assert quality["views"] == views
-    best = read_checkpoint(trained).best_psnr
-    measured = json.loads((trained / "quality_val.json").read_text())["psnr"]
-    assert measured == pytest.approx(best, abs=0.05)
+    best = read_checkpoint(trained).best_difference
+    measured = json.loads((trained / "quality_val.json").read_text())["detail_difference"]
+    assert measured == pytest.approx(best, rel=0.02)
 
 
 def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:

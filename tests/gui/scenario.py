@@ -23,6 +23,7 @@ seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 monitor = sys.modules[f"{extension}.operators.monitor"]
+render_video = sys.modules[f"{extension}.operators.render_video"]
 environment_folder = sys.modules[f"{extension}.operators.environment"].environment_folder
 status_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].status_folder
 lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
@@ -134,8 +135,30 @@ def second() -> Iterator[Callable[[], bool]]:
     bpy.ops.stga.train(directory="//short", iterations=30)
     yield lambda: state() == "finished" and chosen().result_shown
     seen["finished"] = {"avatar": chosen().avatar, "splats": splats()}
+    yield from videos()
     bpy.ops.stga.dismiss_training()
     seen["dismissed"] = chosen().training_run == ""
+
+
+def videos() -> Iterator[Callable[[], bool]]:
+    """One video that is cancelled while it is recorded, one while it is rendered, and one that is finished."""
+    folder, scene = Path(BLEND).parent, bpy.context.scene
+    scene.frame_set(1)
+    for name in ("recording", "rendering", "finished"):
+        with in_window():
+            bpy.ops.stga.render_video(filepath=str(folder / name), seconds=0.5)
+        video = render_video.video_of(scene)
+        if name != "recording":
+            yield lambda video=video: not video.is_recording and monitor.snapshot(video.folder).state.is_alive
+        if name != "finished":
+            bpy.ops.stga.cancel_video()
+        yield lambda: not render_video.is_busy(scene)
+        if name != "recording":
+            seen[f"video {name}"] = str(monitor.snapshot(video.folder).state)
+            bpy.ops.stga.dismiss_video()
+        yield lambda video=video: not video.folder.exists()
+        seen[f"{name} written"] = (folder / f"{name}.mp4").exists()
+    seen["frame after videos"] = scene.frame_current
 
 
 def in_window() -> Any:

@@ -53,7 +53,7 @@ def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
 
 
 def test_training_in_a_window(home: Path) -> None:
-    """Catches what only a window has: the timer, its end, undo, reopening, and workers that outlive Blender."""
+    """Catches what only a window has: timers, their end, undo, reopening, and workers that outlive Blender."""
     capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
     seen = play(home, "first", capture)
     assert seen["environment"].startswith(f"Python {sys.version.split()[0]}, torch ")
@@ -75,3 +75,6 @@ def test_training_in_a_window(home: Path) -> None:
     assert then["finished"]["avatar"] == str(home / "short/avatar.npz")
     assert then["finished"]["splats"] > 0
     assert then["dismissed"]
+    assert (then["recording written"], then["rendering written"], then["finished written"]) == (False, False, True)
+    assert (then["video rendering"], then["video finished"]) == ("cancelled", "finished")
+    assert then["frame after videos"] == 1

@@ -89,7 +89,7 @@ def test_limits_where_every_norm_is_zero() -> None:
         assert norm == 0
         assert not gradient.any()
         flat = np.full((count, 3), -200, np.float32)  # scales of e^−200 are zero in float32
-        assert scale_limit(rows, flat, face, unbound, np.float32([limit]), 0.1, gradient) == 0
+        assert scale_limit(rows, flat, face, unbound, np.float32([[limit], [limit]]), 0.1, gradient) == 0
         assert not gradient.any()
 
 
@@ -98,7 +98,7 @@ def test_limit_of_one_enormous_splat() -> None:
     log_scale = np.log(np.float32([[1, 1, 1], [2, 2, 2], [1e15, 1, 1]]))
     rows, face, unbound = np.arange(3, dtype=np.int32), np.zeros(3, np.int32), np.zeros(3, bool)
     gradient = np.zeros((3, 3), np.float32)
-    norm = scale_limit(rows, log_scale, face, unbound, np.float32([0.5]), 1.0, gradient)
+    norm = scale_limit(rows, log_scale, face, unbound, np.float32([[0.5], [0.5]]), 1.0, gradient)
     scale = np.exp(log_scale.astype(np.float64))
     expected = np.linalg.norm(scale - 0.5)
     assert norm == pytest.approx(expected, rel=1e-6)

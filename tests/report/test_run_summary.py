@@ -15,7 +15,15 @@ from stga_addon.training.settings import make_settings
 
 def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     return [
-        {"seconds": 10.0 * n, "psnr": psnr, "ssim": 0.9, "iteration": n, "evaluation_s": 0.2, **more}
+        {
+            "seconds": 10.0 * n,
+            "psnr": psnr,
+            "ssim": 0.9,
+            "detail_difference": 1 / psnr,
+            "iteration": n,
+            "evaluation_s": 0.2,
+            **more,
+        }
         for n, psnr in enumerate(values, 1)
     ]
 

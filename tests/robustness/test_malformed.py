@@ -601,7 +601,7 @@ META_VALUES: dict[str, Any] = {
     "visit": ["5", None],
     "last_timestep": ["5", 1.5, [1]],
     "elapsed_s": ["5", None, float("nan"), [], True],
-    "best_psnr": ["5", None, float("nan")],
+    "best_difference": ["5", None, float("nan")],
     "losses": ["5", None, [None], ["a"], [float("nan")], {"a": 1}, 7],
     "evaluations": [None, "x"],
     "initial_count": [None, "x"],

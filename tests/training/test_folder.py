@@ -117,11 +117,11 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 
 
 def test_checkpoint_before_any_evaluation(tmp_path: Path) -> None:
-    """Catches −inf and None, which plain JSON does not know, lost on their way."""
-    checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, -np.inf, 0, [])
+    """Catches ∞ and None, which plain JSON does not know, lost on their way."""
+    checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, np.inf, 0, [])
     checkpoint_files.write_checkpoint(tmp_path, checkpoint)
     again = checkpoint_files.read_checkpoint(tmp_path)
-    assert (again.best_psnr, again.last_timestep) == (-np.inf, None)
+    assert (again.best_difference, again.last_timestep) == (np.inf, None)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.2, 0.9, 0.999])
@@ -158,7 +158,7 @@ DAMAGES: dict[str, tuple[str, np.ndarray | None]] = {
     "unknown count": ("meta", meta(color=3)),
     "negative iteration": ("meta", meta(iteration=-1)),
     "endless time": ("meta", meta(elapsed_s=math.inf)),
-    "quality that is no number": ("meta", meta(best_psnr=math.nan)),
+    "quality that is no number": ("meta", meta(best_difference=math.nan)),
     "negative timestep": ("meta", meta(last_timestep=-1)),
     "losses that are no list": ("meta", meta(losses=5)),
     "identity that is no text": ("meta", meta(identity=None)),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit
+from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit, unbound_opacity
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.density import reset_strays
 from stga_addon.training.optimize.state import new_state
@@ -16,7 +16,7 @@ FACES, WEIGHT = 5, 0.7
 
 @pytest.fixture(params=range(3))
 def scene(request: pytest.FixtureRequest):
-    """Splats about half of which are over their limits, rows that leave some out, and limits per triangle."""
+    """Splats about half of which are over their limits, rows that leave some out, and limits (F,) per triangle."""
     splats = random_splats(50, FACES, request.param)
     rng = np.random.default_rng(request.param)
     rows = np.flatnonzero(rng.random(50) < 0.7).astype(np.int32)
@@ -24,27 +24,29 @@ def scene(request: pytest.FixtureRequest):
     return splats, rows, limit
 
 
-def expected(values: np.ndarray, size, splats, rows, limit) -> tuple[float, np.ndarray]:
+def expected(values: np.ndarray, size, splats, rows, limits) -> tuple[float, np.ndarray]:
+    """limits (2, F) of bound and of unbound splats."""
     x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    bound = rows[~splats.unbound[rows]]
-    of = torch.tensor(limit[splats.face[bound]], dtype=torch.float64)
-    excess = torch.relu(size(x)[bound] - of.reshape(-1, *[1] * (size(x).dim() - 1)))
+    of = torch.tensor(limits[splats.unbound[rows].astype(int), splats.face[rows]], dtype=torch.float64)
+    excess = torch.relu(size(x)[rows] - of.reshape(-1, *[1] * (size(x).dim() - 1)))
     norm = excess.norm()
     (WEIGHT * norm).backward()
     return norm.item(), x.grad.numpy()
 
 
 def test_scale_limit(scene) -> None:
-    """Catches a gradient that forgets the exponential or the norm, reaches unlisted or unbound rows, or overwrites."""
+    """Catches a gradient that forgets the exponential or the norm, reaches unlisted rows, overwrites, or holds unbound
+    splats to the limit of bound ones."""
     splats, rows, limit = scene
-    limit = limit * np.float32(np.exp(-5))
-    norm, gradient = expected(splats.log_scale, torch.exp, splats, rows, limit)
+    limits = np.stack([limit, 0.6 * limit[::-1]]).astype(np.float32) * np.float32(np.exp(-5))
+    norm, gradient = expected(splats.log_scale, torch.exp, splats, rows, limits)
     assert norm > 0
     out = np.full((50, 3), 0.25, np.float32)
-    found = scale_limit(rows, splats.log_scale, splats.face, splats.unbound, limit, WEIGHT, out)
+    found = scale_limit(rows, splats.log_scale, splats.face, splats.unbound, limits, WEIGHT, out)
     assert found == pytest.approx(norm, rel=1e-5)
     np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-7)
-    untouched = splats.unbound | ~np.isin(np.arange(50), rows)
+    assert (gradient[rows[splats.unbound[rows]]] > 0).any()
+    untouched = ~np.isin(np.arange(50), rows)
     np.testing.assert_array_equal(out[untouched], 0.25)
 
 
@@ -52,7 +54,8 @@ def test_distance_limit(scene) -> None:
     """Catches a gradient along the wrong axis or of the squared norm, and unbound splats pulled towards the mesh."""
     splats, rows, limit = scene
     limit = limit * np.float32(0.015)
-    norm, gradient = expected(splats.xyz, lambda x: x.norm(dim=1), splats, rows, limit)
+    limits = np.stack([limit, np.full_like(limit, np.inf)])
+    norm, gradient = expected(splats.xyz, lambda x: x.norm(dim=1), splats, rows, limits)
     assert norm > 0
     out = np.full((50, 3), 0.25, np.float32)
     found = distance_limit(rows, splats.xyz, splats.face, splats.unbound, limit, WEIGHT, out)
@@ -60,6 +63,18 @@ def test_distance_limit(scene) -> None:
     np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-6)
     untouched = splats.unbound | ~np.isin(np.arange(50), rows)
     np.testing.assert_array_equal(out[untouched], 0.25)
+
+
+def test_opacity_of_unbound_splats(scene) -> None:
+    """Catches a pull on bound or unlisted splats, in the wrong direction, or of the logit instead of the opacity."""
+    splats, rows, _ = scene
+    listed = rows[splats.unbound[rows]]
+    assert 0 < len(listed) < len(rows)
+    x = torch.tensor(splats.opacity, dtype=torch.float64, requires_grad=True)
+    (WEIGHT * torch.sigmoid(x[listed]).sum()).backward()
+    out = np.full(50, 0.25, np.float32)
+    unbound_opacity(rows, splats.opacity, splats.unbound, WEIGHT, out)
+    np.testing.assert_allclose(out - 0.25, x.grad.numpy(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("kernel", [scale_limit, distance_limit])
@@ -70,6 +85,7 @@ def test_within_the_limits_nothing_happens(kernel) -> None:
     out = np.full((8, 3), 0.25, np.float32)
     values = splats.log_scale if kernel is scale_limit else splats.xyz
     rows, limit = np.arange(8, dtype=np.int32), np.full(FACES, 10, np.float32)
+    limit = np.stack([limit, limit]) if kernel is scale_limit else limit
     assert kernel(rows, values, splats.face, splats.unbound, limit, WEIGHT, out) == 0
     np.testing.assert_array_equal(out, 0.25)
 

@@ -98,7 +98,7 @@ def test_regions_are_measured_by_themselves(tmp_path: Path) -> None:
         share = where.mean()
         lost = (1 - reference_ssim(good, target / 255, where)) + (1 - outside) * (1 - share) / share
         assert region.ssim == pytest.approx(1 - lost, abs=1e-4)
-    assert set(quality.as_json()) == {"psnr", "ssim", "psnr_mask", "ssim_mask"}
+    assert set(quality.as_json()) == {"psnr", "ssim", "detail_difference", "psnr_mask", "ssim_mask"}
 
 
 def test_peak_memory_never_falls() -> None:
@@ -120,5 +120,5 @@ def test_lpips_is_left_out_where_its_weights_are_missing(tmp_path: Path, monkeyp
     evaluation_views = sights_of(write_views(tmp_path, 1))
     quality = evaluate(lambda view: np.zeros((3, HEIGHT, WIDTH), np.float32), evaluation_views, perceptual=True)
     assert quality.lpips is None
-    assert set(quality.as_json()) == {"psnr", "ssim"}
+    assert set(quality.as_json()) == {"psnr", "ssim", "detail_difference"}
     assert Quality(30.0, 0.9, 0.1).as_json() == {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1}

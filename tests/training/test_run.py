@@ -191,7 +191,7 @@ def test_resuming_a_finished_run_changes_nothing(toy: Capture, unbroken: Path, t
 
 def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a run that gets worse with time taking its best avatar with it, also over an interruption."""
-    scores = iter([10.0, 30.0, 20.0, 29.9, *[25.0] * 20])
+    scores = iter([0.3, 0.1, 0.2, 0.11, *[0.15] * 20])
     written: list[Avatar] = []
 
     def write(path: Path, avatar: Avatar) -> None:
@@ -199,12 +199,14 @@ def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pyte
         run_module_write(path, avatar)
 
     run_module_write = run_module.write_avatar
-    monkeypatch.setattr(run_module, "evaluate", lambda draw, views, perceptual: Quality(next(scores), 0.5))
+    monkeypatch.setattr(
+        run_module, "evaluate", lambda draw, views, perceptual: Quality(30.0, 0.5, detail_difference=next(scores))
+    )
     monkeypatch.setattr(run_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)
     assert len(written) == 2
-    assert read_checkpoint(tmp_path).best_psnr == 30.0
+    assert read_checkpoint(tmp_path).best_difference == 0.1
     best = read_avatar(tmp_path / "avatar.npz").splats
     np.testing.assert_array_equal(best.xyz, written[1].splats.xyz)
     assert not np.array_equal(written[0].splats.xyz, written[1].splats.xyz)

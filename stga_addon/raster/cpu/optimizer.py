@@ -75,28 +75,39 @@ def _adam_block(
 
 
 @jit
-def scale_limit(rows, log_scale, face, unbound, limit, weight, gradient):
+def scale_limit(rows, log_scale, face, unbound, limits, weight, gradient):
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
 
-    limit (F,) per triangle, in the unit of the splats' local scale. Unbound splats have no limit. Returns the norm.
+    limits (2, F) per triangle, of bound and of unbound splats, in the unit of the splats' local scale. Returns the
+    norm.
     """
     total = 0.0
     for n in range(len(rows)):
         i = rows[n]
-        if not unbound[i]:
-            for c in range(3):
-                over = max(ZERO, math.exp(log_scale[i, c]) - limit[face[i]])
-                total += over * over
+        limit = limits[1 if unbound[i] else 0, face[i]]
+        for c in range(3):
+            over = max(ZERO, math.exp(log_scale[i, c]) - limit)
+            total += over * over
     norm = math.sqrt(total)
     if norm > 0.0:
         factor = np.float32(weight / norm)
         for n in range(len(rows)):
             i = rows[n]
-            if not unbound[i]:
-                for c in range(3):
-                    scale = math.exp(log_scale[i, c])
-                    gradient[i, c] += factor * max(ZERO, scale - limit[face[i]]) * scale
+            limit = limits[1 if unbound[i] else 0, face[i]]
+            for c in range(3):
+                scale = math.exp(log_scale[i, c])
+                gradient[i, c] += factor * max(ZERO, scale - limit) * scale
     return norm
+
+
+@jit
+def unbound_opacity(rows, opacity, unbound, weight, gradient):
+    """weight · Σ sigmoid(opacity) over the unbound ones of the listed rows; its gradient is added to gradient (N,)."""
+    for n in range(len(rows)):
+        i = rows[n]
+        if unbound[i]:
+            value = ONE / (ONE + math.exp(-opacity[i]))
+            gradient[i] += np.float32(weight) * value * (ONE - value)
 
 
 @jit

@@ -88,15 +88,15 @@ def scale_excess(
     unbound: wp.array[wp.uint8],
     log_scale: wp.array[wp.vec3],
     face: wp.array[wp.int32],
-    limit: wp.array[wp.float32],
+    limits: wp.array2d[wp.float32],
     squares: wp.array[wp.float32],
 ):
-    """‖ReLU(scale − limit)‖² of each row, 0 for rows that are not wanted or unbound."""
+    """‖ReLU(scale − limit)‖² of each row, 0 for rows that are not wanted; limits (2, F) of bound and unbound splats."""
     i = wp.tid()
     total = float(0.0)
-    if wanted[i] != UNMARKED and unbound[i] == UNMARKED:
+    if wanted[i] != UNMARKED:
         for c in range(3):
-            over = _over(wp.exp(log_scale[i][c]), limit[face[i]])
+            over = _over(wp.exp(log_scale[i][c]), limits[int(unbound[i]), face[i]])
             total += over * over
     squares[i] = total
 
@@ -107,21 +107,37 @@ def scale_limit(
     unbound: wp.array[wp.uint8],
     log_scale: wp.array[wp.vec3],
     face: wp.array[wp.int32],
-    limit: wp.array[wp.float32],
+    limits: wp.array2d[wp.float32],
     weight: wp.float32,
     square: wp.array[wp.float32],
     gradient: wp.array[wp.vec3],
 ):
     """Add the gradient of weight · ‖ReLU(scale − limit)‖₂, whose square is given."""
     i = wp.tid()
-    if wanted[i] == UNMARKED or unbound[i] != UNMARKED or not (square[0] > 0.0):
+    if wanted[i] == UNMARKED or not (square[0] > 0.0):
         return
     factor = weight / wp.sqrt(square[0])
     screen_gradient = wp.vec3()
     for c in range(3):
         scale = wp.exp(log_scale[i][c])
-        screen_gradient[c] = factor * _over(scale, limit[face[i]]) * scale
+        screen_gradient[c] = factor * _over(scale, limits[int(unbound[i]), face[i]]) * scale
     gradient[i] = gradient[i] + screen_gradient
+
+
+@wp.kernel
+def unbound_opacity(
+    wanted: wp.array[wp.uint8],
+    unbound: wp.array[wp.uint8],
+    opacity: wp.array[wp.float32],
+    weight: wp.float32,
+    gradient: wp.array[wp.float32],
+):
+    """Add the gradient of weight · Σ sigmoid(opacity) over the unbound splats."""
+    i = wp.tid()
+    if wanted[i] == UNMARKED or unbound[i] == UNMARKED:
+        return
+    value = 1.0 / (1.0 + wp.exp(-opacity[i]))
+    gradient[i] = gradient[i] + weight * value * (1.0 - value)
 
 
 @wp.kernel

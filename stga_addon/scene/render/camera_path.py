@@ -7,7 +7,7 @@ import numpy as np
 from ...capture.camera import Camera, camera_from_gl
 from ...capture.camera_path import covered_angles, turntable
 from .. import tags
-from ..arrays import evaluated_vertices
+from ..arrays import evaluated_vertices, mesh_vertices
 from .camera import render_camera
 
 UP = (0.0, 0.0, 1.0)
@@ -30,8 +30,12 @@ def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) ->
     angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there are none.
     """
     start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
-    vertices = evaluated_vertices(subject) if subject.type == "MESH" else np.zeros((1, 3))
-    center = matrix[:3, :3] @ (vertices.min(0) + vertices.max(0)) / 2 + matrix[:3, 3]
+    if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
+        middle = np.median(mesh_vertices(subject.data), axis=0)
+    else:
+        vertices = evaluated_vertices(subject)
+        middle = (vertices.min(0) + vertices.max(0)) / 2
+    center = matrix[:3, :3] @ middle + matrix[:3, 3]
     angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
     cameras = _capture_cameras(subject)
     if not angle and cameras:

@@ -71,6 +71,8 @@ class VideoFrames:
         except (av.FFmpegError, StopIteration, ValueError) as error:
             self.close()
             raise StgaError(f"{self.source(timestep)}: cannot be decoded ({error or type(error).__name__})") from error
+        if timestep == self.timesteps[-1]:
+            self.close()  # a decoder holds dozens of frames, and a rig has dozens of cameras
         return pixels
 
     def mask(self, timestep: int) -> None:

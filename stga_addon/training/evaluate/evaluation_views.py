@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from PIL import Image, ImageDraw
+from scipy.ndimage import binary_erosion
 
 from ...capture.images import read_image, read_mask
 from ...capture.model import Capture, View
@@ -14,6 +15,8 @@ MAX_EVALUATION_VIEWS = 16
 """Held-out views that an evaluation during training renders."""
 MIN_REGION_PIXELS = 50
 """A smaller region of a view is left out."""
+MATTE_BORDER_SHARE = 0.0075
+"""Width of the border of a head mask in which the matte is uncertain, as a share of the image's height."""
 MIN_DEPTH_M = 0.01
 """Triangles nearer to the camera's plane, or behind it, are not drawn."""
 
@@ -25,11 +28,13 @@ class EvaluationView:
     target   (H, W, 3) uint8, read-only
     regions  name -> (H, W) bool. "mask": the head mask, if the view has one; "moving": visible pixels of the triangles
              that the default selection picks at the timestep, if there are any
+    interior (H, W) bool: the head mask without the matte's border; None without a mask
     """
 
     view: View
     target: np.ndarray
     regions: Mapping[str, np.ndarray] = field(default_factory=dict)
+    interior: np.ndarray | None = None
 
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
@@ -50,11 +55,13 @@ def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:
     target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
     selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
     regions = {"moving": visible_pixels(capture, view, selection[view.timestep])}
+    interior = None
     if mask is not None:
         regions = {"mask": mask > 127, **regions}
-    return EvaluationView(
-        view, target, {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
-    )
+        inside = binary_erosion(mask > 127, iterations=max(1, round(MATTE_BORDER_SHARE * len(mask))))
+        interior = inside if inside.sum() >= MIN_REGION_PIXELS else None
+    regions = {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
+    return EvaluationView(view, target, regions, interior)
 
 
 def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from ...capture.model import Capture, View
 from ...raster.render import render_avatar
 from ..optimize.losses import similarity
 from . import lpips
+from .detail_difference import detail_difference
 from .evaluation_views import EvaluationView, read_evaluation_view
 
 
@@ -22,17 +23,19 @@ class Quality:
     """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None if it was not measured.
 
     regions  the same per region ("mask", "moving"), over the views that have the region
+    detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
+                       None for a region
     """
 
     psnr: float
     ssim: float
     lpips: float | None = None
     regions: Mapping[str, "Quality"] = field(default_factory=dict)
+    detail_difference: float | None = None
 
     def as_json(self) -> dict[str, float]:
         """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
-        own = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
-        flat = {name: value for name, value in own.items() if value is not None}
+        flat = {name: value for name, value in vars(self).items() if name != "regions" and value is not None}
         for region, quality in self.regions.items():
             flat.update({f"{name}_{region}": value for name, value in quality.as_json().items()})
         return flat
@@ -43,14 +46,16 @@ def evaluate(
 ) -> Quality:
     """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1; perceptual: whether to measure LPIPS."""
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
+    differences = []
     for evaluation_view in evaluation_views:
         image = np.clip(render(evaluation_view.view), 0, 1)
+        differences.append(detail_difference(image, evaluation_view.target, evaluation_view.interior))
         scores[""].append(_scores(image, evaluation_view.target, perceptual))
         for region, where in evaluation_view.regions.items():
             scores.setdefault(region, []).append(_scores(image, evaluation_view.target, perceptual, where))
     means = {region: _mean(of_views) for region, of_views in scores.items()}
     whole = means.pop("")
-    return Quality(whole.psnr, whole.ssim, whole.lpips, means)
+    return Quality(whole.psnr, whole.ssim, whole.lpips, means, float(np.mean(differences)) if differences else None)
 
 
 def evaluate_avatar(avatar: Avatar, capture: Capture, split: str, perceptual: bool = False) -> Quality:

@@ -6,13 +6,13 @@ from ...avatar.embedding import frame_backward
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import distance_limit, scale_limit
+from ...raster.cpu.optimizer import distance_limit, scale_limit, unbound_opacity
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..settings import TrainingSettings
 from . import adam
 from .backend import Batch
 from .frames import FrameStore
-from .losses import image_gradient, tile_rectangles, whole_image
+from .losses import image_gradient, scale_limits, tile_rectangles, whole_image
 from .state import TrainState
 from .tracking import frame_gradient
 
@@ -26,6 +26,7 @@ class CpuBackend:
     def __init__(self, settings: TrainingSettings, units: np.ndarray, frames: FrameStore, state: TrainState) -> None:
         self.state = state
         self._settings, self._units, self._frames = settings, units, frames
+        self._scale_limits = scale_limits(frames.capture, settings)
         self._buffers = BufferPool()
 
     def __len__(self) -> int:
@@ -98,13 +99,15 @@ class CpuBackend:
         store.clear()
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:
-        """Add the gradients of the limits that keep splats near what they cover."""
+        """Add the gradients that keep splats near what they cover, and unbound ones out of the air."""
         settings, state = self._settings, self.state
         face, unbound = state.face.numpy(), state.unbound.numpy()
         if settings.scale_weight:
-            limit = np.float32(settings.scale_limit) * self._units
-            gradient = state.gradients.log_scale.numpy()
-            scale_limit(rows, state.parameters.log_scale.numpy(), face, unbound, limit, settings.scale_weight, gradient)
+            gradient, log_scale = state.gradients.log_scale.numpy(), state.parameters.log_scale.numpy()
+            scale_limit(rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient)
+        if settings.unbound_opacity_weight:
+            weight, gradient = settings.unbound_opacity_weight / len(state), state.gradients.opacity.numpy()
+            unbound_opacity(rows, state.parameters.opacity.numpy(), unbound, weight, gradient)
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._units
             gradient = state.gradients.xyz.numpy()

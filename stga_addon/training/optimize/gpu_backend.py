@@ -24,6 +24,7 @@ from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, EPSILON
 from .backend import Batch
 from .frames import FrameStore
+from .losses import scale_limits
 from .state import TrainState
 
 
@@ -83,9 +84,9 @@ class GpuBackend:
             self._embedding = Embedding(
                 self._device, capture.neutral, capture.faces, frames.convention, frames.strain
             )  # fmt: skip
-            self._scale_limit, self._distance_limit = (
-                wp.array(np.float32(limit) * units, dtype=wp.float32, device=self._device)
-                for limit in (settings.scale_limit, settings.distance_limit)
+            limits = scale_limits(capture, settings), np.float32(settings.distance_limit) * units
+            self._scale_limits, self._distance_limit = (
+                wp.array(limit, dtype=wp.float32, device=self._device) for limit in limits
             )
             self._losses = wp.zeros(2, wp.float32, device="cpu", pinned=self._device.is_cuda)
         self._queued: _DeviceBatch | None = None
@@ -259,10 +260,15 @@ class GpuBackend:
         squares, square = self._rasterizer.buffers.get("squares", n), self._rasterizer.buffers.get("square", 1)
         xyz, log_scale = _rows(state.parameters).xyz, _rows(state.parameters).log_scale
         if settings.scale_weight:
-            given = wanted, state.unbound, log_scale, state.face, self._scale_limit
+            given = wanted, state.unbound, log_scale, state.face, self._scale_limits
             launch(optimizer.scale_excess, n, *given, squares)
             wp.utils.array_sum(squares, out=square)
             launch(optimizer.scale_limit, n, *given, settings.scale_weight, square, _rows(state.gradients).log_scale)
+        if settings.unbound_opacity_weight:
+            weight, gradient = settings.unbound_opacity_weight / n, _rows(state.gradients).opacity
+            launch(
+                optimizer.unbound_opacity, n, wanted, state.unbound, _rows(state.parameters).opacity, weight, gradient
+            )
         if settings.distance_weight:
             given = wanted, state.unbound, xyz, state.face, self._distance_limit
             launch(optimizer.distance_excess, n, *given, squares)

@@ -41,13 +41,18 @@ def hull_points(capture: Capture, views: Sequence[View], convention: str, sh_deg
     it.
     """
     mesh = capture.mesh(views[0].timestep)
-    voxel = max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
+    voxel = voxel_size(mesh)
     points = _hull_surface(mesh, capture.faces, views, voxel)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(world, frames, face[outside])
+
+
+def voxel_size(mesh: np.ndarray) -> float:
+    """Distance in meters between hull points around a mesh (V, 3)."""
+    return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
 
 
 def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

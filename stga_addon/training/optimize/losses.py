@@ -5,10 +5,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from ...avatar.embedding import face_areas
+from ...avatar.embedding import MIN_DIVISOR, face_areas, face_frames
 from ...capture.model import Capture
 from ...raster.cpu.image_loss import image_loss
 from ...raster.cpu.layout import TILE
+from ..settings import TrainingSettings
+from .hull_points import voxel_size
 
 
 def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:
@@ -43,6 +45,14 @@ def similarity(image: np.ndarray, target: np.ndarray) -> float:
     """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
     unused = np.empty_like(image)
     return image_gradient(image, target, whole_image(*image.shape[1:]), 1.0, unused)[1]
+
+
+def scale_limits(capture: Capture, settings: TrainingSettings) -> np.ndarray:
+    """Largest scale (2, F) float32 of bound and of unbound splats by triangle, in the convention's local units."""
+    bound = settings.scale_limit * limit_units(capture, settings.convention)
+    frames = face_frames(capture.neutral, capture.faces, capture.neutral, settings.convention)
+    unbound = settings.unbound_scale_limit * voxel_size(capture.neutral) / np.maximum(frames.scale, MIN_DIVISOR)
+    return np.asarray(np.stack([bound, unbound]), np.float32)
 
 
 def limit_units(capture: Capture, convention: str) -> np.ndarray:

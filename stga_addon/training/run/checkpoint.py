@@ -19,7 +19,7 @@ from ..optimize.state import TrainState, state_of, tensors_of
 from ..optimize.tracking import RefinementState
 from .folder import CHECKPOINT, SELECTION
 
-VERSION = 2
+VERSION = 3
 REFINEMENT, IDENTITY = "tracking/", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
@@ -31,7 +31,7 @@ class Checkpoint:
     """State of training between two iterations.
 
     elapsed_s  seconds of training so far, evaluation not counted
-    best_psnr  of avatar.npz, dB; −inf before the first evaluation
+    best_difference  of avatar.npz (`Quality.detail_difference`); ∞ before the first evaluation
     losses     of the last global iterations
     identity   digest of the run's identity
     tracking   of refined FLAME parameters; None where they are not refined
@@ -43,7 +43,7 @@ class Checkpoint:
     last_timestep: int | None
     initial_count: int
     elapsed_s: float
-    best_psnr: float
+    best_difference: float
     evaluations: int
     losses: list[float]
     tracking: RefinementState | None = None
@@ -120,8 +120,8 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
         raise ValueError(f"last_timestep is {shorten(last)}, expected a timestep")
     if not _is_number(meta.get("elapsed_s")) or not 0 <= meta["elapsed_s"] < math.inf:
         raise ValueError(f"elapsed_s is {shorten(meta.get('elapsed_s'))}, expected seconds from 0 up")
-    if not _is_number(meta.get("best_psnr")) or math.isnan(meta["best_psnr"]):
-        raise ValueError(f"best_psnr is {shorten(meta.get('best_psnr'))}, expected a number of dB")
+    if not _is_number(meta.get("best_difference")) or math.isnan(meta["best_difference"]):
+        raise ValueError(f"best_difference is {shorten(meta.get('best_difference'))}, expected a number")
     if not isinstance(losses, list) or not all(_is_number(loss) and not math.isnan(loss) for loss in losses):
         raise ValueError("losses is no list of numbers")
     if not isinstance(meta.get("identity"), str):

@@ -117,7 +117,7 @@ class _Loop:
         assert run.identity is not None
         self.capture, self.out, self.run, self.report = capture, out, run, report
         self.settings, self.digest = run.settings, run.identity.digest
-        self.elapsed, self.best, self.evaluations = 0.0, -np.inf, 0
+        self.elapsed, self.best_difference, self.evaluations = 0.0, np.inf, 0
         self.losses: deque[float] = deque(maxlen=100)
         self.lines: list[dict[str, Any]] = []
         self.psnr: float | None = None
@@ -154,7 +154,7 @@ class _Loop:
             checkpoint.tracking,
         )  # fmt: skip
         self.losses.extend(checkpoint.losses)
-        self.elapsed, self.best = checkpoint.elapsed_s, checkpoint.best_psnr
+        self.elapsed, self.best_difference = checkpoint.elapsed_s, checkpoint.best_difference
         self.evaluations = checkpoint.evaluations
         cut_metrics(self.out, checkpoint.iteration)
         self.lines = read_metrics(self.out)
@@ -263,7 +263,7 @@ class _Loop:
             quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
             self.psnr = quality.psnr
             line.update(quality.as_json())
-        self._keep_best()
+        self._keep_best(line.get("detail_difference"))
         now = perf_counter()
         line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
         line["peak_memory_mb"] = peak_memory_mb()
@@ -271,11 +271,15 @@ class _Loop:
         self._forecast(line)
         append_metrics(self.out, line)
 
-    def _keep_best(self) -> None:
-        """Write the avatar if it is the best so far; without evaluation views the latest one counts as the best."""
-        if self.psnr is not None and not self.psnr >= self.best:
-            return
-        self.best = -np.inf if self.psnr is None else self.psnr
+    def _keep_best(self, detail_difference: float | None) -> None:
+        """Write the avatar if it is the sharpest so far; without evaluation views the latest one is kept.
+
+        Not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
+        """
+        if detail_difference is not None:
+            if not detail_difference <= self.best_difference:
+                return
+            self.best_difference = detail_difference
         write_avatar(self.out / "avatar.npz", self._avatar())
         if self.trainer.tracking is not None:
             write_tracking(self.out, self.trainer.tracking)
@@ -313,7 +317,7 @@ class _Loop:
         trainer = self.trainer
         checkpoint = Checkpoint(
             trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
-            self.elapsed, self.best, self.evaluations, list(self.losses),
+            self.elapsed, self.best_difference, self.evaluations, list(self.losses),
             None if trainer.tracking is None else trainer.tracking.state, self.digest,
         )  # fmt: skip
         write_checkpoint(self.out, checkpoint)
