@@ -9,6 +9,7 @@ from ..operators.common import is_head, scene_settings
 from ..operators.environment import has_training_python
 from ..operators.pose import is_posing
 from ..stga_addon.errors import StgaError
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
@@ -62,7 +63,9 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
         column.operator(ids.POSE_HEAD, text=text, icon="ARMATURE_DATA", depress=posing)
         if posing:
             draw_text(column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO")
-    _draw_selection_toggle(column, settings.splats)
+    groups = settings.head.vertex_groups if is_head(settings.head) else ()
+    if any(tags.group_timestep(group.name) is not None for group in groups):
+        _draw_selection_toggle(column, settings.splats)
     draw_video(column, context)
 
 

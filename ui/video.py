@@ -3,6 +3,7 @@
 from typing import Any
 
 from ..operators import ids, monitor
+from ..operators.environment import has_training_python
 from ..operators.render_video import video_of
 from ..stga_addon.worker.status import WorkerState
 from .failure import draw_failure
@@ -14,6 +15,8 @@ def draw_video(layout: Any, context: Any) -> None:
     video = video_of(context.scene)
     if video is None:
         layout.operator(ids.RENDER_VIDEO, text="Render Video…", icon="RENDER_ANIMATION")
+        if not has_training_python(context):
+            draw_text(layout, context, "Render Video needs a training environment", "INFO")
         return
     if video.is_recording:
         _draw_progress(layout, video.recorded / video.images, "Recording")

@@ -59,7 +59,7 @@ def test_model_beside_the_images(tmp_path):
     for number, name in enumerate(names):
         write_image(tmp_path / "images" / name, 50 * number)
     footage = open_footage(tmp_path)
-    assert [camera.name for camera in footage.cameras] == names
+    assert [camera.name for camera in footage.cameras] == ["left", "middle", "right"]
     assert [camera.image(0)[0, 0, 0] for camera in footage.cameras] == [0, 50, 100]
     for camera, expected in zip(footage.cameras, rig(), strict=True):
         np.testing.assert_allclose(camera.camera.world_to_camera, expected.world_to_camera, atol=1e-9)
@@ -74,7 +74,7 @@ def test_model_beside_the_images(tmp_path):
         ("cameras", "50.0", "0", r"image 'left.png': expected a focal length of 1 to 1e7 pixels, not 0, 0"),
         ("cameras", f" {WIDTH} {HEIGHT} ", " 0 30 ", r"image 'left.png': expected an image size in pixels, not 0 x 30"),
         ("images", " 2 right.png", " 7 right.png", r"image 'right.png': names camera 7, which .*cameras.txt does not"),
-        ("images", " 2 right.png", " 2 left.png", r"image 'left.png': two cameras are named left.png"),
+        ("images", " 2 right.png", " 2 left.png", r"image 'left.png': two cameras are named left"),
         ("images", " 1 left.png", " 1 gone.png", r"has no image, folder or video of the name 'gone.png'"),
         ("images", " 1 left.png", "", r"images.txt: line 2: expected number, quaternion, translation, camera and name"),
     ],

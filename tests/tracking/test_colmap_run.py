@@ -91,7 +91,7 @@ def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
     assert len(models) == 1
 
     footage = open_footage(tmp_path)
-    assert [camera.name for camera in footage.cameras] == [f"{n}.png" for n in range(len(truth))]
+    assert [camera.name for camera in footage.cameras] == [str(n) for n in range(len(truth))]
     positions = np.array([camera.camera.position for camera in footage.cameras])
     scale, rotation, translation = similarity(positions, np.array([camera.position for camera in truth]))
     for found, expected in zip(footage.cameras, truth, strict=True):

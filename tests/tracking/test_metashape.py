@@ -99,7 +99,7 @@ def test_labels_are_image_names_or_paths(tmp_path):
     for number, name in enumerate(("left", "middle", "right")):
         write_image(tmp_path / f"images/{name}.png", 50 * number)
     footage = open_footage(tmp_path)
-    assert [camera.name for camera in footage.cameras] == labels
+    assert [camera.name for camera in footage.cameras] == ["left", "middle", "right"]
     assert [camera.image(0)[15, 20, 0] for camera in footage.cameras] == [0, 50, 100]
     assert footage.warnings == (f"{tmp_path / 'cameras.xml'}: left out cameras without a pose: spare",)
 

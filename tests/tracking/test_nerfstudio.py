@@ -46,7 +46,7 @@ def test_one_image_per_pose_is_one_timestep(tmp_path):
         tmp_path, [entry(c, f"images/{n}.png", cy=12.0) for n, c in enumerate(rig())], camera_model="OPENCV"
     )
     footage = open_footage(tmp_path)
-    assert [camera.name for camera in footage.cameras] == ["images/0.png", "images/1.png", "images/2.png"]
+    assert [camera.name for camera in footage.cameras] == ["0", "1", "2"]
     assert footage.timesteps == (0,)
     assert footage.cameras[0].camera.cy == 12.0
 
@@ -88,8 +88,12 @@ def test_bad_entries_are_named(tmp_path, change, message):
 
 
 def test_two_images_of_one_moment(tmp_path):
-    """Catches a frame that silently replaces another."""
+    """Catches a sequence of a camera that stands still taken for a rig, and a frame that replaces another."""
     camera = rig(1)[0]
     write_transforms(tmp_path, [entry(camera, "images/0.png"), entry(camera, "images/1.png")])
-    with pytest.raises(StgaError, match=r"frames\[1\]: camera .* has two images at timestep 0"):
+    with pytest.raises(StgaError, match=r"frames\[1\]: has the pose of images/0.png; expected one moment"):
+        open_footage(tmp_path)
+    frames = [entry(camera, f"images/{n}.png", timestep_index=4, camera_index=7) for n in range(2)]
+    write_transforms(tmp_path, frames)
+    with pytest.raises(StgaError, match=r"frames\[1\]: camera 07 has two images at timestep 4"):
         open_footage(tmp_path)

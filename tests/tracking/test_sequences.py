@@ -108,7 +108,7 @@ def test_several_images_of_one_folder_are_several_cameras(tmp_path):
     for number, name in enumerate(names):
         write_image(tmp_path / name, number)
     footage = open_footage(tmp_path)
-    assert red(footage) == {name: [number] for number, name in enumerate(names)}
+    assert red(footage) == {f"walk/{number + 1}": [number] for number in range(3)}
 
 
 def values_of(frames):

@@ -128,14 +128,21 @@ def _single_camera(root: Path, sources: Sources, frames: FrameRange, focal: floa
 
 
 def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
-    """Shots with their image, which shows the only moment."""
-    found = []
+    """Shots with their image, after which they are named, and which shows the only moment.
+
+    Raises StgaError for two of the same pose: the images of a camera that stands still are a sequence.
+    """
+    found, poses = [], dict[bytes, Shot]()
     for shot in shots:
+        other = poses.setdefault(_pose(shot), shot)
+        if other is not shot:
+            raise StgaError(f"{shot.where}: has the pose of {other.label}; expected one moment, or a timestep_index")
         listed = shot.image if shot.image is not None and isfile(shot.image) else None
         image = listed or still_image(sources, shot.label, shot.where)
         inside = image.is_relative_to(sources.root)
         mask = shot.mask or (sources.mask_of(image) if inside else None)
-        found.append(replace(shot, image=image, mask=mask, timestep=0))
+        name = shot.camera_name or (sources.name_of(image) if inside else image.stem)
+        found.append(replace(shot, image=image, mask=mask, timestep=0, camera_name=name))
     return found
 
 
@@ -167,9 +174,12 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
 def _identity(shot: Shot) -> object:
     camera: Camera = shot.camera
     intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
+    return shot.camera_name, intrinsics, _pose(shot), shot.lens
+
+
+def _pose(shot: Shot) -> bytes:
     # Adding zero turns -0 into 0, whose bytes differ.
-    pose = (np.round(camera.world_to_camera, 6) + 0.0).tobytes()
-    return shot.camera_name, intrinsics, pose, shot.lens
+    return bytes((np.round(shot.camera.world_to_camera, 6) + 0.0).tobytes())
 
 
 def _views(name: str, shots: list[Shot]) -> dict[int, View]:

@@ -33,9 +33,13 @@ class Sources:
     videos: dict[str, list[Path]] = field(default_factory=dict)
     masks: dict[str, list[Path]] = field(default_factory=dict)
 
+    def name_of(self, image: Path) -> str:
+        """Path below the footage, without suffix and without a leading "images/" and the like."""
+        return _key(self.root, image)
+
     def mask_of(self, image: Path) -> Path | None:
         """The mask with the same path below one of `MASK_FOLDERS`."""
-        key, name = _key(self.root, image), _without_container(image.relative_to(self.root).as_posix())
+        key, name = self.name_of(image), _without_container(image.relative_to(self.root).as_posix())
         return next(iter(self.masks.get(key) or self.masks.get(name, [])), None)
 
 
