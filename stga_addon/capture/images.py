@@ -13,6 +13,7 @@ from ..errors import StgaError
 from .camera import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, is_image_size
 from .model import View
 
+WHITE = (255, 255, 255)
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 BAND_PIXELS = 1 << 20
@@ -37,13 +38,13 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def read_image(view: View) -> np.ndarray:
-    """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over white.
+def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarray:
+    """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over `background` (0 to 255).
 
     Gray, palette and 16-bit images are converted. Raises StgaError naming the file where it is missing,
     truncated or not as large as the camera says.
     """
-    return _over_white(_decode(view.image, view, "image"))
+    return _over(_decode(view.image, view, "image"), background)
 
 
 def read_mask(view: View) -> np.ndarray | None:
@@ -56,7 +57,9 @@ def read_mask(view: View) -> np.ndarray | None:
     return _transparency(_decode(view.image, view, "image"))
 
 
-def read_view(view: View, scale: float = 1.0) -> tuple[View, np.ndarray, np.ndarray | None]:
+def read_view(
+    view: View, scale: float = 1.0, background: tuple[int, int, int] = WHITE
+) -> tuple[View, np.ndarray, np.ndarray | None]:
     """Image and mask at `scale` in (0, 1]: the view with its camera scaled alike, image and mask as above.
 
     Every small pixel is the mean over the area it covers, to avoid aliasing.
@@ -68,7 +71,7 @@ def read_view(view: View, scale: float = 1.0) -> tuple[View, np.ndarray, np.ndar
     mask = _transparency(pixels) if view.mask is None else read_mask(view)
     small = view if scale == 1 else replace(view, camera=view.camera.scaled(scale))
     size = small.camera.height, small.camera.width
-    return small, area_mean(_over_white(pixels), *size), None if mask is None else area_mean(mask, *size)
+    return small, area_mean(_over(pixels, background), *size), None if mask is None else area_mean(mask, *size)
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -155,7 +158,7 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGBA" if transparent else "RGB"))
 
 
-def _over_white(pixels: np.ndarray) -> np.ndarray:
+def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 3:
@@ -163,7 +166,7 @@ def _over_white(pixels: np.ndarray) -> np.ndarray:
 
     def blend(band: np.ndarray) -> np.ndarray:
         alpha = band[..., -1:].astype(np.uint32)
-        return np.asarray((band[..., :-1] * alpha + 255 * (255 - alpha) + 127) // 255)
+        return np.asarray((band[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha) + 127) // 255)
 
     return _in_bands(pixels, 3, blend)
 

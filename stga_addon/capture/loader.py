@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .images import read_view
+from .images import WHITE, read_view
 from .model import View
 
 
@@ -46,13 +46,14 @@ class ViewLoader:
         self,
         views: Iterable[View],
         scale: Callable[[int], float] = lambda position: 1.0,
+        background: tuple[int, int, int] = WHITE,
         queue_bytes: int = 16 << 20,
         cache_bytes: int = 224 << 20,
         correct: Callable[[View, np.ndarray, np.ndarray | None], np.ndarray] | None = None,
         mesh: Callable[[int], np.ndarray] | None = None,
     ) -> None:
         self.waited_s = 0.0
-        self._scale, self._correct, self._mesh = scale, correct, mesh
+        self._scale, self._background, self._correct, self._mesh = scale, background, correct, mesh
         self._queue_bytes = queue_bytes
         self._cache = _Cache(cache_bytes)
         self._ready: deque[LoadedView] = deque()
@@ -131,7 +132,7 @@ class ViewLoader:
         key = (view.image, view.mask, view.timestep, view.camera_index, scale)
         kept = self._cache.get(key)
         if kept is None:
-            kept = LoadedView(*read_view(view, scale))
+            kept = LoadedView(*read_view(view, scale, self._background))
             if self._correct is not None:
                 kept = kept._replace(image=self._correct(kept.view, kept.image, kept.mask))
             for array in (kept.image, kept.mask):

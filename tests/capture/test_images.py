@@ -37,12 +37,13 @@ def test_plain_color(tmp_path: Path) -> None:
     assert image.dtype == np.uint8
 
 
-def test_transparency_is_laid_over_white(tmp_path: Path) -> None:
+@pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (10, 200, 90)])
+def test_transparency_is_laid_over_the_background(tmp_path: Path, background: tuple[int, int, int]) -> None:
     """Catches premultiplied mixing and integer overflow, against the same in floating point; alpha is the mask."""
     view = view_of(saved(tmp_path / "x.png", np.dstack([COLOUR, ALPHA])))
     share = ALPHA[..., None] / 255
-    expected = np.round(COLOUR * share + 255 * (1 - share))
-    np.testing.assert_allclose(read_image(view), expected, atol=0.51)
+    expected = np.round(COLOUR * share + np.array(background) * (1 - share))
+    np.testing.assert_allclose(read_image(view, background), expected, atol=0.51)
     np.testing.assert_array_equal(read_mask(view), ALPHA)
 
 
