@@ -97,7 +97,8 @@ def test_binary_files_cut_short(tmp_path, file):
     """Catches an error of the decoder, or a model that is read in part without a word."""
     reconstruction().write_binary(str(tmp_path))
     data = (tmp_path / file).read_bytes()
-    for length in [*range(0, 60, 7), len(data) - 9]:
-        (tmp_path / file).write_bytes(data[:length])
+    huge = data[:-8] + b"\xff" * 8  # the last number of points, where it is one
+    for cut in [*(data[:length] for length in range(0, 60, 7)), data[:-9], *([huge] if file == "images.bin" else [])]:
+        (tmp_path / file).write_bytes(cut)
         with pytest.raises(StgaError, match=re.escape(f"{tmp_path / file}: ")):
             read_colmap(tmp_path)

@@ -215,6 +215,11 @@ class _Cursor:
     def count(self) -> int:
         return int(self.unpack("Q")[0])
 
+    def skip(self, size: int) -> None:
+        if size > len(self.data) - self.offset:
+            raise StgaError(f"{self.path}: ends within an entry; expected a COLMAP model")
+        self.offset += size
+
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset)
         if end < 0:
@@ -244,5 +249,4 @@ def _binary_images(path: Path) -> Iterator[_Image]:
         _, *pose, camera = cursor.unpack("I7dI")
         name = cursor.name()
         yield _Image(tuple(pose[:4]), tuple(pose[4:]), int(camera), name)
-        points = cursor.count()
-        cursor.offset += 24 * points  # x, y and number of each
+        cursor.skip(24 * cursor.count())  # x, y and number of each point

@@ -1,0 +1,83 @@
+"""Accuracy of `stga track`: distances of the tracked head from a capture's own meshes.
+
+    python benchmarks/tracking_accuracy.py CAPTURE --model HEAD [--flame FILE] [--timesteps 8]
+
+CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were
+made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
+`shapedirs`, `faces`). Prints in millimeters, over the vertices within 9 cm of the face's landmarks: distances from the
+capture's surface and, where both have the same topology, from its vertices. Needs mediapipe, or landmark files with
+--landmarks.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from stga_addon.capture.open import open_capture
+from stga_addon.files import read_npz, write_npz
+from stga_addon.tracking.correspondence import nearest_points
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.sequences import FrameRange
+from stga_addon.tracking.head_model import read_head_model
+from stga_addon.tracking.landmarks import PLACES_FILE, read_places
+from stga_addon.tracking.track import LANDMARKS_FOLDER, track
+
+FACE_RADIUS_M = 0.09
+
+
+def head_file(path: Path, folder: Path) -> Path:
+    """The head model, or FLAME's open template written as a linear model."""
+    if path.suffix == ".npz":
+        arrays = read_npz(path)
+        if "v_template" in arrays and "posedirs" not in arrays:
+            linear = {"mean": arrays["v_template"], "faces": arrays["faces"], "identity": arrays["shapedirs"]}
+            write_npz(folder / "head.npz", linear)
+            return folder / "head.npz"
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--flame", type=Path)
+    parser.add_argument("--landmarks", type=Path)
+    parser.add_argument("--timesteps", type=int)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        measure(options, Path(name))
+
+
+def measure(options: argparse.Namespace, folder: Path) -> None:
+    """Track, and print a row in Markdown for each timestep."""
+    footage = open_footage(options.capture, frames=FrameRange(stop=options.timesteps))
+    true, file = open_capture(options.capture, options.flame), head_file(options.model, folder)
+    begin = perf_counter()
+    result = track(footage, file, folder / "out", options.landmarks)
+    seconds = perf_counter() - begin
+    found = open_capture(folder / "out", file)
+    places, used = read_places((options.landmarks or folder / "out" / LANDMARKS_FOLDER) / PLACES_FILE, len(found.faces))
+    template = read_head_model(file).model.v_template
+    center = places.on(template, found.faces)[used].mean(0)
+    face = np.flatnonzero(np.linalg.norm(template - center, axis=1) < FACE_RADIUS_M)
+    # The true world is the footage's: cameras are in both, so that they give the way back.
+    first = {view.camera_index: view.camera for view in (*found.views["train"], *found.views["val"])}
+    print("| timestep | surface: median | 90 % | vertices: mean |")
+    print("| --- | --- | --- | --- |")
+    for timestep in footage.timesteps:
+        camera, known = first[0], footage.cameras[0].camera
+        local = found.mesh(timestep) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        local = (local / result.scale - known.world_to_camera[:3, 3]) @ known.world_to_camera[:3, :3]
+        distance = 1000 * nearest_points(true.mesh(timestep), true.faces, local[face])[1]
+        same = len(found.faces) == len(true.faces) or len(true.mesh(timestep)) - len(local) == 120
+        shift = 1000 * np.linalg.norm(local[face] - true.mesh(timestep)[face], axis=1).mean() if same else np.nan
+        print(f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |")
+    print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
+    print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
+
+
+if __name__ == "__main__":
+    main()

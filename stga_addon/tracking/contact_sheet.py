@@ -1,0 +1,156 @@
+"""Contact sheet of a tracked take: errors of all views, and the mesh drawn over the worst."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ..capture.camera import Camera
+from ..files import replacing
+from .footage.model import Footage
+from .mesh_image import rasterize, vertex_normals
+
+COLUMNS, ROWS = 4, 5
+PICTURE = 200, 250
+"""Width and height in pixels of a view; beside it stands the same with the mesh."""
+GAP, CAPTION, MARGIN = 8, 18, 12
+NAME_WIDTH, CELL_HEIGHT, MAX_CHART_ROWS = 130, 12, 48
+HEAD_MARGIN = 0.08
+"""Of the head's box in the image, on every side."""
+MESH_OPACITY = 0.6
+BACKGROUND, TEXT, NO_FACE = (24, 26, 30), (225, 228, 232), (70, 74, 80)
+ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
+"""Of no error, half of the color scale and its end."""
+COLOR_SCALE_END = 3.0
+"""In medians of all errors."""
+
+Errors = Mapping[str, Mapping[int, float]]
+"""Camera -> timestep -> reprojection error in pixels; without an entry where no face was found."""
+
+
+def write_contact_sheet(
+    path: Path,
+    footage: Footage,
+    cameras: Mapping[str, Camera],
+    mesh: Callable[[int], np.ndarray],
+    faces: np.ndarray,
+    errors: Errors,
+) -> None:
+    """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views with the mesh.
+
+    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3).
+    Raises StgaError where the file cannot be written or a frame cannot be read.
+    """
+    ranked = sorted(((px, name, t) for name, own in errors.items() for t, px in own.items()), reverse=True)
+    shown = ranked[: COLUMNS * ROWS]
+    by_name = {camera.name: camera for camera in footage.cameras}
+    median = float(np.median([px for px, _, _ in ranked])) if ranked else 0.0
+    tiles = [
+        _tile(by_name[name].image(t), cameras[name], mesh(t), faces, f"{name}, timestep {t}: {px:.1f} px")
+        for px, name, t in shown
+    ]
+    with replacing(path) as partial:
+        _sheet(_chart(errors, footage.timesteps, median), tiles, median).save(partial, format="PNG")
+
+
+def _sheet(chart: Image.Image, tiles: list[Image.Image], median: float) -> Image.Image:
+    width, height = _tile_size()
+    rows = -(-len(tiles) // COLUMNS)
+    top = MARGIN + CAPTION + chart.height + MARGIN
+    size = 2 * MARGIN + COLUMNS * (width + GAP) - GAP, top + rows * (height + GAP) + MARGIN
+    sheet = Image.new("RGB", size, BACKGROUND)
+    title = f"Reprojection error, median {median:.2f} px; red from {COLOR_SCALE_END * median:.1f} px, gray: no face"
+    _write(sheet, (MARGIN, MARGIN), title)
+    sheet.paste(chart, (MARGIN, MARGIN + CAPTION))
+    for number, tile in enumerate(tiles):
+        row, column = divmod(number, COLUMNS)
+        sheet.paste(tile, (MARGIN + column * (width + GAP), top + row * (height + GAP)))
+    return sheet
+
+
+def _tile_size() -> tuple[int, int]:
+    return 2 * PICTURE[0], PICTURE[1] + CAPTION
+
+
+# Chart
+
+
+def _chart(errors: Errors, timesteps: tuple[int, ...], median: float) -> Image.Image:
+    """A row a camera (of many, those with the largest errors) and a column a timestep."""
+    worst = {name: max(own.values(), default=0.0) for name, own in errors.items()}
+    names = sorted(sorted(worst, key=lambda name: -worst[name])[:MAX_CHART_ROWS], key=list(errors).index)
+    width = COLUMNS * (_tile_size()[0] + GAP) - GAP
+    chart = Image.new("RGB", (width, CELL_HEIGHT * len(names)), BACKGROUND)
+    for row, name in enumerate(names):
+        _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
+        cells = np.array([_error_color(errors[name].get(t), median) for t in timesteps], np.uint8)[None]
+        strip = Image.fromarray(cells).resize((width - NAME_WIDTH, CELL_HEIGHT - 1), Image.Resampling.NEAREST)
+        chart.paste(strip, (NAME_WIDTH, row * CELL_HEIGHT))
+    return chart
+
+
+def _error_color(error: float | None, median: float) -> np.ndarray:
+    if error is None:
+        return np.array(NO_FACE)
+    place = min(error / max(COLOR_SCALE_END * median, 1e-9), 1.0) * (len(ERROR_COLORS) - 1)
+    return np.array([np.interp(place, range(len(ERROR_COLORS)), channel) for channel in ERROR_COLORS.T])
+
+
+# Views
+
+
+def _tile(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, caption: str) -> Image.Image:
+    """The head in the image, beside it the same with the mesh; below, the caption."""
+    left, top, right, bottom = _head_box(camera, vertices)
+    scale = min(PICTURE[0] / (right - left), PICTURE[1] / (bottom - top))
+    size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
+    picture = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC, box=(left, top, right, bottom))
+    cropped = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+    x, y = size[0] / cropped.width, size[1] / cropped.height
+    small = replace(
+        cropped,
+        width=size[0],
+        height=size[1],
+        fl_x=camera.fl_x * x,
+        fl_y=camera.fl_y * y,
+        cx=cropped.cx * x,
+        cy=cropped.cy * y,
+    )
+    tile = Image.new("RGB", _tile_size(), BACKGROUND)
+    tile.paste(picture, (0, 0))
+    tile.paste(Image.fromarray(_with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0))
+    _write(tile, (0, PICTURE[1] + 2), caption)
+    return tile
+
+
+def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of the head in the image; the whole image where it lies outside."""
+    pixels, depth = camera.project(vertices)
+    whole = 0, 0, camera.width, camera.height
+    if not (depth > 0).all():
+        return whole
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    margin = HEAD_MARGIN * (high - low)
+    left, top = np.floor(np.maximum(low - margin, 0)).astype(int).tolist()
+    right, bottom = np.ceil(np.minimum(high + margin, [camera.width, camera.height])).astype(int).tolist()
+    return (left, top, right, bottom) if right > left and bottom > top else whole
+
+
+def _with_mesh(picture: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """The mesh over the picture, colored by the direction of its surface."""
+    triangle, weights = rasterize(vertices, faces, camera)
+    seen = triangle >= 0
+    normals = vertex_normals(vertices, faces) @ camera.world_to_camera[:3, :3].T
+    smooth = (normals[faces[triangle[seen]]] * weights[seen][..., None]).sum(axis=1)
+    colors = 127.5 * (1 + smooth * [1, -1, -1])
+    drawn = picture.astype(np.float64)
+    drawn[seen] += MESH_OPACITY * (colors - drawn[seen])
+    return np.asarray(np.clip(drawn, 0, 255).round(), np.uint8)
+
+
+def _write(image: Image.Image, position: tuple[int, int], text: str, size: int = 12) -> None:
+    font: Any = ImageFont.load_default(size)
+    ImageDraw.Draw(image).text(position, text, fill=TEXT, font=font)

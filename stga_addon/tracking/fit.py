@@ -1,0 +1,209 @@
+"""From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and pose."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..capture.camera import Camera
+from ..flame.forward import axis_angle_matrices
+from .head_model import HeadModel
+from .mesh_image import vertex_normals
+from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints
+from .solve import Observation, person, solve_identity, solve_take
+from .triangulation import Triangulation, rays, triangulate
+
+IDENTITY_TIMESTEPS = 12
+"""Timesteps, spread over the take, that identity is solved from."""
+ROUNDS = 3
+MIN_VISIBILITY = 1e-3
+"""Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than left open."""
+RESIDUAL_SCALE_M = 0.004
+"""Landmarks whose rays miss each other by much more are not used."""
+POSIT_ITERATIONS = 20
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x ↦ scale · rotation x + translation: from the world of the cameras to the capture's, in meters, y up."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera in the capture's world."""
+        pose = np.eye(4)
+        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
+        pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - pose[:3, :3] @ self.translation
+        return replace(camera, world_to_camera=pose)
+
+
+@dataclass(frozen=True)
+class TimestepLandmarks:
+    """What the cameras that found a face at one timestep found: points (C, N, 2) pixels and confidence (C, N)."""
+
+    cameras: tuple[Camera, ...]
+    points: np.ndarray
+    confidence: np.ndarray
+
+
+@dataclass(frozen=True)
+class HeadFit:
+    """A head tracked through a take.
+
+    head        the person: identity in the template
+    shape       (I,) its coefficients
+    parameters  timestep -> (E + 18,) expression, pose of five joints, translation
+    to_capture  from the world of the cameras
+    """
+
+    head: HeadModel
+    shape: np.ndarray
+    parameters: Mapping[int, np.ndarray]
+    to_capture: Similarity
+
+
+def fit_head(
+    head: HeadModel,
+    places: SurfacePoints,
+    reliable: np.ndarray,
+    take: Mapping[int, TimestepLandmarks],
+    report: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> HeadFit:
+    """Fit the model to the landmarks of every timestep that has any (`take`).
+
+    Rounds of triangulation, identity and scale from timesteps spread over the take, then all timesteps; from the second
+    round on, a camera's landmarks count by the angle at which it sees the surface.
+    """
+    timesteps = sorted(take)
+    several = [t for t in timesteps if len(take[t].cameras) > 1]
+    spread = _spread(several or timesteps)
+    neutral = places.on(head.model.v_template, head.model.faces)
+    scale = 1.0  # without several cameras, the head's own size decides
+    found = {t: _triangulation(take[t], reliable, neutral, scale) for t in spread}
+    world = _average([_aligned(found[t], neutral, reliable) for t in spread])
+    seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
+    solved = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE))
+    for number in range(ROUNDS):
+        report("Fit", number, ROUNDS)
+        at = places.on(subject.model.v_template, subject.model.faces)
+        found = {t: _triangulation(seen[t], reliable, at, world.scale) for t in timesteps}
+        observed = {t: _observation(found[t], world, reliable) for t in spread}
+        starts = np.stack([_rigid(at, observed[t]) for t in spread])
+        identity = solve_identity(head, places, [observed[t] for t in spread], starts)
+        world = replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale)
+        shape, subject = identity.shape, person(head, identity.shape)
+        at = places.on(subject.model.v_template, subject.model.faces)
+        take_observed = [_observation(found[t], world, reliable) for t in timesteps]
+        solved[:] = 0
+        solved[:, -RIGID_SIZE:] = [_rigid(at, observation) for observation in take_observed]
+        solved = solve_take(subject, places, take_observed, solved)
+        seen = {
+            t: _by_visibility(take[t], subject, places, values, world)
+            for t, values in zip(timesteps, solved, strict=True)
+        }
+    report("Fit", ROUNDS, ROUNDS)
+    return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world)
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) (Umeyama)."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, values, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    scale = float((values * signs).sum() / (a**2).sum())
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+
+
+def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of a rigid object in the camera's world, from where they are seen: pixels (N, 2).
+
+    POSIT (DeMenthon and Davis 1995): scaled orthographic pose, corrected for perspective until it no longer changes.
+    """
+    seen = (pixels - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
+    center = points.mean(0)
+    system = np.column_stack([points - center, np.ones(len(points))])
+    stretch = np.ones(len(points))
+    rotation, place = np.eye(3), np.zeros(3)
+    for _ in range(POSIT_ITERATIONS):
+        rows = np.linalg.lstsq(system, seen * stretch[:, None], rcond=None)[0].T  # (2, 4)
+        size = float(np.sqrt(np.linalg.norm(rows[0, :3]) * np.linalg.norm(rows[1, :3])))
+        u, _, vt = np.linalg.svd(rows[:, :3] / size, full_matrices=False)
+        across = u @ vt
+        rotation = np.stack([*across, np.cross(*across)])
+        place = np.array([*rows[:, 3], 1.0]) / size
+        stretch = 1 + (points - center) @ rotation[2] / place[2]
+    local = (points - center) @ rotation.T + place
+    return np.asarray((local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3])
+
+
+def _spread(timesteps: Sequence[int]) -> list[int]:
+    rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), IDENTITY_TIMESTEPS)).round().astype(int)
+    return [timesteps[row] for row in rows]
+
+
+def _triangulation(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:
+    """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a single camera's are."""
+    found = triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
+    if len(landmarks.cameras) > 1:
+        return found
+    camera, pixels = landmarks.cameras[0], landmarks.points[0]
+    origin, directions = rays(camera, pixels)
+    guess = np.tile(origin, (len(head), 1))
+    guess[found.seen] = pose_from_one_camera(camera, pixels[found.seen], head[found.seen] / scale)
+    depth = ((guess - origin) * directions).sum(1, keepdims=True)
+    return replace(found, position=origin + depth * directions)
+
+
+def _observation(found: Triangulation, world: Similarity, reliable: np.ndarray) -> Observation:
+    """The triangulation in the capture's world."""
+    values, vectors = np.linalg.eigh(world.rotation @ found.information @ world.rotation.T)
+    root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
+    certain = np.exp(-((found.residual * world.scale / RESIDUAL_SCALE_M) ** 2))
+    return Observation(world.apply(found.position), root, np.where(found.seen & reliable, certain, 0.0))
+
+
+def _aligned(found: Triangulation, neutral: np.ndarray, reliable: np.ndarray) -> Similarity:
+    """The similarity that brings the landmarks onto the neutral head."""
+    use = found.seen & reliable
+    return similarity(found.position[use], neutral[use])
+
+
+def _average(found: Sequence[Similarity]) -> Similarity:
+    scale = float(np.median([one.scale for one in found]))
+    u, _, vt = np.linalg.svd(np.sum([one.rotation for one in found], axis=0))
+    rotation = u @ vt
+    centers = [-one.rotation.T @ one.translation / one.scale for one in found]
+    return Similarity(scale, rotation, -scale * rotation @ np.median(centers, axis=0))
+
+
+def _rigid(neutral: np.ndarray, observed: Observation) -> np.ndarray:
+    """(18,) pose that brings a neutral head's landmarks (N, 3) onto the observed ones."""
+    from scipy.spatial.transform import Rotation
+
+    use = observed.weight > 0
+    rotation = similarity(neutral[use], observed.position[use]).rotation
+    rigid = np.zeros(RIGID_SIZE)
+    rigid[:3] = Rotation.from_matrix(rotation).as_rotvec()
+    rigid[POSE_SIZE:] = observed.position[use].mean(0) - rotation @ neutral[use].mean(0)
+    return rigid
+
+
+def _by_visibility(
+    landmarks: TimestepLandmarks, subject: HeadModel, places: SurfacePoints, parameters: np.ndarray, world: Similarity
+) -> TimestepLandmarks:
+    """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY where it faces away."""
+    model = subject.model
+    rotation = axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0]
+    normals = places.on(vertex_normals(model.v_template, model.faces), model.faces) @ rotation.T
+    at = PosedPoints(model, places).positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+    towards = np.stack([world.apply(camera.position) - at for camera in landmarks.cameras])
+    length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
+    cosine = (normals * towards).sum(2) / length
+    visibility = np.clip(cosine, 0, 1) ** 2 + MIN_VISIBILITY
+    return replace(landmarks, confidence=landmarks.confidence * visibility)

@@ -1,0 +1,113 @@
+"""Head models that can be tracked: FLAME, or any linear model in an npz."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.flame_capture import flame_model
+from ..errors import StgaError
+from ..files import read_npz
+from ..flame.model import JOINTS, POSE_FEATURES, FlameModel
+
+LINEAR_KEYS = ("mean", "faces")
+MIN_EXTENT_M, MAX_EXTENT_M = 0.1, 2.0
+"""Extent of a head model along its longest axis; outside of it, the file is in other units."""
+MIN_JOINT_WEIGHT = 0.5
+"""Skinning weight that some vertex must have for a joint to count as present."""
+
+
+@dataclass(frozen=True)
+class HeadModel:
+    """A head with identity and expression components, in meters, y up, looking along +z.
+
+    model   its arrays in FLAME's form; a linear model without joints has all its weight on the root
+    layout  layout of the capture to write: "flame" or "mesh"
+    """
+
+    model: FlameModel
+    layout: str
+
+    @property
+    def joints(self) -> tuple[bool, ...]:
+        """Which of FLAME's joints the model has; the root always."""
+        present = (self.model.weights > MIN_JOINT_WEIGHT).any(axis=0)
+        return (True, *(bool(value) for value in present[1:]))
+
+
+def read_head_model(path: Path) -> HeadModel:
+    """Read a FLAME model (.pkl or .npz), or a linear model from an .npz.
+
+    A linear model has `mean` (V, 3) meters and `faces` (F, 3), and optionally `identity` (V, 3, I), `expression`
+    (V, 3, E), and `J_regressor` (5, V) with `weights` (V, 5) for the joints root, neck, jaw, left and right eye.
+    Components are scaled so that a coefficient is of the order of 1. Raises StgaError naming the file and the field.
+    """
+    if path.suffix.lower() == ".npz":
+        arrays = read_npz(path)
+        if "mean" in arrays:
+            return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
+    return checked(path, HeadModel(flame_model(path), "flame"))
+
+
+def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
+    """The linear model with these arrays (`read_head_model`) in FLAME's form; `path` is named in errors."""
+    for key in LINEAR_KEYS:
+        if key not in arrays:
+            raise StgaError(f"{path}: has no {key}, which a linear head model needs")
+    mean = _floats(path, arrays, "mean", (None, 3))
+    count = len(mean)
+    bases = [
+        _floats(path, arrays, key, (count, 3, None)) if key in arrays else np.zeros((count, 3, 0))
+        for key in ("identity", "expression")
+    ]
+    if not sum(base.shape[2] for base in bases):
+        raise StgaError(f"{path}: has neither identity nor expression, the components that a head is fitted with")
+    faces = arrays["faces"]
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not len(faces):
+        raise StgaError(f"{path}: faces is {faces.dtype} of shape {faces.shape}, expected whole numbers (any, 3)")
+    if faces.min() < 0 or faces.max() >= count:
+        raise StgaError(f"{path}: faces names vertices {faces.min()} to {faces.max()}, expected 0 to {count - 1}")
+    regressor, weights = _skeleton(path, arrays, count)
+    return FlameModel(
+        v_template=mean,
+        shapedirs=np.concatenate(bases, axis=2),
+        n_identity=bases[0].shape[2],
+        posedirs=np.zeros((count, 3, POSE_FEATURES)),
+        j_regressor=regressor,
+        parents=np.array([-1, 0, 1, 1, 1]),
+        weights=weights,
+        faces=np.ascontiguousarray(faces, np.int32),
+    )
+
+
+def checked(path: Path, head: HeadModel) -> HeadModel:
+    """The head model. Raises StgaError where it is not of a head's size in meters."""
+    extent = float(np.ptp(head.model.v_template, axis=0).max())
+    if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
+        raise StgaError(f"{path}: the head measures {extent:.3g}, expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters")
+    return head
+
+
+def _skeleton(path: Path, arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+    given = [key for key in ("J_regressor", "weights") if key in arrays]
+    if len(given) == 1:
+        raise StgaError(f"{path}: has {given[0]} alone; joints need both J_regressor and weights")
+    if given:
+        regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), count))
+        return regressor, _floats(path, arrays, "weights", (count, len(JOINTS)))
+    weights = np.zeros((count, len(JOINTS)))
+    weights[:, 0] = 1
+    return np.full((len(JOINTS), count), 1 / count), weights
+
+
+def _floats(path: Path, arrays: dict[str, np.ndarray], key: str, expected: tuple[int | None, ...]) -> np.ndarray:
+    array = arrays[key]
+    fits = array.ndim == len(expected) and all(
+        want in (None, size) for size, want in zip(array.shape, expected, strict=True)
+    )
+    if not fits or not array.shape[0]:
+        wanted = ", ".join("any" if size is None else str(size) for size in expected)
+        raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
+    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise StgaError(f"{path}: {key} holds {array.dtype} that are not all finite numbers")
+    return np.ascontiguousarray(array, np.float64)

@@ -1,0 +1,174 @@
+"""Landmarks of every frame: detected, or read from a folder of files."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import read_npz, write_npz
+from .detectors import Detector
+from .footage.model import Footage, FootageCamera
+from .posed_points import SurfacePoints
+
+PLACES_FILE = "head_model.npz"
+MIN_BARYCENTRIC = -1e-3
+MAX_TWO_FACES_SHARE = 0.34
+"""Share of a camera's frames with a second face, beyond which the footage is not of one person."""
+MIN_OVERLAP = 0.3
+"""Two faces whose boxes share this much of their area are one, found twice."""
+
+Report = Callable[[str, int, int], None]
+"""Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not detected again."""
+
+
+@dataclass(frozen=True)
+class CameraLandmarks:
+    """What one camera sees of N landmarks: timesteps (T,), points (T, N, 2) pixels, confidence (T, N); 0: not seen."""
+
+    timesteps: np.ndarray
+    points: np.ndarray
+    confidence: np.ndarray
+
+
+def landmark_file(folder: Path, camera: str) -> Path:
+    """The file of a camera; characters that file names cannot have become `_`."""
+    return folder / (re.sub(r"[^\w.-]", "_", camera) + ".npz")
+
+
+def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report: Report) -> dict[str, CameraLandmarks]:
+    """Landmarks by camera; each camera's are written to `folder`, and read from there where they are already.
+
+    A frame with several faces counts as one without a face. Raises StgaError for a camera that often sees several.
+    """
+    total = sum(len(camera.timesteps) for camera in footage.cameras)
+    found: dict[str, CameraLandmarks] = {}
+    done = 0
+    for camera in footage.cameras:
+        path = landmark_file(folder, camera.name)
+        if path.exists():
+            found[camera.name] = read_camera(path, camera)
+        else:
+            found[camera.name] = _detect(camera, detector, partial(_count, report, done, total))
+            write_camera(path, found[camera.name])
+        done += len(camera.timesteps)
+        report("Landmarks", done, total)
+    return found
+
+
+def read_landmarks(footage: Footage, folder: Path) -> dict[str, CameraLandmarks]:
+    """Landmarks by camera from files of any detector; cameras without a file are not used. Raises StgaError."""
+    files = {camera.name: landmark_file(folder, camera.name) for camera in footage.cameras}
+    found = {
+        camera.name: read_camera(files[camera.name], camera)
+        for camera in footage.cameras
+        if files[camera.name].exists()
+    }
+    if not found:
+        first = next(iter(files.values()))
+        raise StgaError(f"{folder}: has landmarks of no camera; expected files such as {first.name}")
+    counts = {name: landmarks.points.shape[1] for name, landmarks in found.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{files[name].name} {count}" for name, count in counts.items())
+        raise StgaError(f"{folder}: the files have different numbers of landmarks: {listed}")
+    return found
+
+
+def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
+    """One camera's file. Raises StgaError naming the file and the field."""
+    arrays = read_npz(path)
+    for key in ("timesteps", "points"):
+        if key not in arrays:
+            raise StgaError(f"{path}: has no {key}")
+    timesteps, points = arrays["timesteps"], arrays["points"]
+    if timesteps.ndim != 1 or timesteps.dtype.kind not in "iu" or not set(timesteps.tolist()) <= set(camera.timesteps):
+        raise StgaError(f"{path}: timesteps: expected timesteps of camera {camera.name}, whole numbers (any,)")
+    if points.ndim != 3 or points.dtype.kind != "f" or points.shape[::2] != (len(timesteps), 2):
+        raise StgaError(f"{path}: points has shape {points.shape}, expected ({len(timesteps)}, any, 2) numbers")
+    confidence = arrays.get("confidence", np.isfinite(points).all(2).astype(np.float32))
+    if confidence.shape != points.shape[:2] or not (np.isfinite(confidence) & (confidence >= 0)).all():
+        raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {points.shape[:2]} from 0 up")
+    if not np.isfinite(points[confidence > 0]).all():
+        raise StgaError(f"{path}: points holds values that are not finite; expected confidence 0 there")
+    return CameraLandmarks(timesteps, np.nan_to_num(points.astype(np.float64)), confidence.astype(np.float64))
+
+
+def write_camera(path: Path, landmarks: CameraLandmarks) -> None:
+    arrays = {
+        "timesteps": landmarks.timesteps,
+        "points": landmarks.points.astype(np.float32),
+        "confidence": landmarks.confidence.astype(np.float32),
+    }
+    write_npz(path, arrays)
+
+
+def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
+    """Where landmarks lie on the head model: `face` (N,), −1 for an unused one, and `barycentric` (N, 3).
+
+    Returns the places and (N,) bool which are used. Raises StgaError naming the file and the field.
+    """
+    arrays = read_npz(path)
+    for key in ("face", "barycentric"):
+        if key not in arrays:
+            raise StgaError(f"{path}: has no {key}")
+    face, barycentric = arrays["face"], arrays["barycentric"]
+    if face.ndim != 1 or face.dtype.kind not in "iu" or not ((face >= -1) & (face < triangles)).all():
+        raise StgaError(f"{path}: face: expected triangles from 0 to {triangles - 1}, or -1, of shape (any,)")
+    if barycentric.shape != (len(face), 3) or not (barycentric >= MIN_BARYCENTRIC).all():
+        raise StgaError(f"{path}: barycentric has shape {barycentric.shape}, expected ({len(face)}, 3) from 0 up")
+    if not np.allclose(barycentric[face >= 0].sum(1), 1, atol=1e-3):
+        raise StgaError(f"{path}: barycentric: expected rows that add up to 1")
+    return SurfacePoints(np.maximum(face, 0), barycentric.astype(np.float64)), face >= 0
+
+
+def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
+    write_npz(path, {"face": np.where(used, places.face, -1), "barycentric": places.barycentric})
+
+
+def timesteps_with_landmarks(found: Mapping[str, CameraLandmarks]) -> set[int]:
+    """Timesteps at which some camera sees something."""
+    return {
+        int(timestep)
+        for camera in found.values()
+        for timestep, seen in zip(camera.timesteps, camera.confidence.any(1), strict=True)
+        if seen
+    }
+
+
+def _count(report: Report, done: int, total: int, number: int) -> None:
+    report("Landmarks", done + number, total)
+
+
+def _detect(camera: FootageCamera, detector: Detector, report: Callable[[int], None]) -> CameraLandmarks:
+    faces: list[np.ndarray | None] = []
+    several: list[int] = []
+    for number, timestep in enumerate(camera.timesteps):
+        seen = _distinct(detector.detect(camera.image(timestep)))
+        if len(seen) > 1:
+            several.append(timestep)
+        faces.append(seen[0] if len(seen) == 1 else None)
+        report(number + 1)
+    if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
+        raise StgaError(
+            f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of {len(camera.timesteps)} frames "
+            f"with two faces, the first at timestep {several[0]}; expected one person"
+        )
+    count = next((len(face) for face in faces if face is not None), 0)
+    points = np.stack([np.zeros((count, 2)) if face is None else face for face in faces])
+    confidence = np.tile([[float(face is not None)] for face in faces], (1, count))
+    return CameraLandmarks(np.array(camera.timesteps), points, confidence)
+
+
+def _distinct(faces: list[np.ndarray]) -> list[np.ndarray]:
+    """The faces without those that are the first one found again."""
+    return [face for number, face in enumerate(faces) if number == 0 or _overlap(faces[0], face) < MIN_OVERLAP]
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of the bounding boxes of points (N, 2)."""
+    low, high = np.maximum(a.min(0), b.min(0)), np.minimum(a.max(0), b.max(0))
+    common = np.maximum(high - low, 0).prod()
+    return float(common / (np.ptp(a, axis=0).prod() + np.ptp(b, axis=0).prod() - common))

@@ -1,0 +1,186 @@
+"""Least squares for identity, expression and pose from triangulated landmarks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..flame.model import JOINTS, FlameModel
+from .head_model import HeadModel
+from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints
+
+LANDMARK_SIGMA_M = 0.002
+"""Standard deviation of a landmark over people and views; coefficients have a standard deviation of 1."""
+SCALE_SIGMA = 0.3
+"""Of the capture's scale, relative: the first guess comes from the average head."""
+JOINT_SIGMA_RAD = {
+    "root": (3.0, 3.0, 3.0),
+    "neck": (0.1, 0.1, 0.1),
+    "jaw": (0.3, 0.05, 0.03),
+    "left_eye": (0.3, 0.3, 0.01),
+    "right_eye": (0.3, 0.3, 0.01),
+}
+"""Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes the root's."""
+TRANSLATION_SIGMA_M = 10.0
+ABSENT_SIGMA = 1e-6
+EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.25, 0.015, 0.0015
+"""Standard deviations of second differences from one timestep to the next."""
+JUMP_SCALE = 3.0
+"""Standard deviations of a second difference beyond which it is a cut rather than a motion."""
+IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
+CONVERGED_STEP = 1e-3
+"""Largest change of a parameter (standard deviations, radians, meters) after which iterations stop."""
+WINDOW, OVERLAP = 192, 24
+"""Timesteps solved at once, and how many of them two windows share: memory does not grow with the take."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Landmarks of one timestep in meters: position (N, 3), square root of the information (N, 3, 3), weight (N,)."""
+
+    position: np.ndarray
+    root: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Result of `solve_identity`: coefficients (I,), relative scale, and (T, E + 18) parameters of its timesteps."""
+
+    shape: np.ndarray
+    scale: float
+    frames: np.ndarray
+
+
+def solve_identity(
+    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], rigid: np.ndarray
+) -> Identity:
+    """Identity common to some timesteps, with their expressions and poses; rigid (T, 18) is where poses start.
+
+    The scale of the world is solved as a component: a head `scale` times as large as the model's fits best.
+    """
+    model = head.model
+    known, expressions = model.n_identity, model.n_expression
+    columns = np.split(model.shapedirs, [known], axis=2)
+    sized = np.concatenate([columns[0], SCALE_SIGMA * model.v_template[..., None], columns[1]], axis=2)
+    points = PosedPoints(replace(model, shapedirs=sized), places)
+    shared, own = known + 1, expressions + RIGID_SIZE
+    prior = np.concatenate([np.ones(shared), np.tile(_precision(head), len(observations))])
+    state = np.zeros(shared + own * len(observations))
+    for number, start in enumerate(rigid):
+        state[shared + own * (number + 1) - RIGID_SIZE : shared + own * (number + 1)] = start
+    for _ in range(IDENTITY_ITERATIONS):
+        matrix, right = np.diag(prior), -prior * state
+        for number, observation in enumerate(observations):
+            frame = slice(shared + own * number, shared + own * (number + 1))
+            rows = np.r_[:shared, frame]
+            values = state[rows]
+            block, gradient = normal_equations(points, values, observation)
+            matrix[np.ix_(rows, rows)] += block
+            right[rows] += gradient
+        step = np.linalg.solve(matrix, right)
+        state += step
+        if np.abs(step).max() < CONVERGED_STEP:
+            break
+    scale = 1 + SCALE_SIGMA * state[known]
+    frames = state[shared:].reshape(len(observations), own)
+    frames[:, :expressions] /= scale
+    frames[:, -TRANSLATION_SIZE:] /= scale
+    return Identity(state[:known] / scale, float(scale), frames)
+
+
+def solve_take(
+    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], start: np.ndarray
+) -> np.ndarray:
+    """Expression and pose (T, E + 18) of consecutive timesteps of a person whose identity is in the template.
+
+    start (T, E + 18). Second differences over time are penalized, but for jumps: captures of single expressions, and
+    cuts, are not smoothed. Memory does not grow with the take beyond its observations.
+    """
+    points = PosedPoints(head.model, places)
+    solved = start.copy()
+    for first in range(0, len(start), WINDOW - OVERLAP):
+        window = slice(first, min(first + WINDOW, len(start)))
+        found = _solve_window(head, points, observations[window], solved[window])
+        kept = 0 if first == 0 else OVERLAP // 2
+        solved[first + kept : window.stop] = found[kept:]
+        if window.stop == len(start):
+            break
+    return solved
+
+
+def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
+    """The head model with identity coefficients (I,) in its template, and expression components alone."""
+    model = head.model
+    template = model.v_template + model.shapedirs[:, :, : model.n_identity] @ shape
+    shapes = np.ascontiguousarray(model.shapedirs[:, :, model.n_identity :])
+    return replace(head, model=replace(model, v_template=template, shapedirs=shapes, n_identity=0))
+
+
+def normal_equations(
+    points: PosedPoints, parameters: np.ndarray, observation: Observation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jᵀ W J and −Jᵀ W r of one timestep by its parameters (K + 18,), with soft-L1 weights."""
+    positions, jacobian = points.linearized(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+    residual = np.einsum("nij,nj->ni", observation.root, positions - observation.position) / LANDMARK_SIGMA_M
+    weight = observation.weight / np.sqrt(1 + (residual**2).sum(1))
+    rows = (np.sqrt(weight)[:, None, None] / LANDMARK_SIGMA_M) * (observation.root @ jacobian)
+    flat = rows.reshape(-1, rows.shape[2])
+    return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
+
+
+def _solve_window(
+    head: HeadModel, points: PosedPoints, observations: Sequence[Observation], start: np.ndarray
+) -> np.ndarray:
+    from scipy.linalg import solveh_banded
+
+    count, size = start.shape
+    prior, stiffness = _precision(head), _acceleration_precision(head.model)
+    state = start.copy()
+    for _ in range(TAKE_ITERATIONS):
+        band = np.zeros((2 * size + 1, count * size)) if count > 2 else np.zeros((size, count * size))
+        right = np.zeros((count, size))
+        for number, observation in enumerate(observations):
+            block, right[number] = normal_equations(points, state[number], observation)
+            block[np.diag_indices(size)] += prior
+            right[number] -= prior * state[number]
+            for offset in range(size):
+                band[offset, number * size : (number + 1) * size - offset] = np.diagonal(block, offset)
+        if count > 2:
+            _add_smoothness(band, right, state, stiffness)
+        step = solveh_banded(band, right.ravel(), lower=True)
+        state += step.reshape(count, size)
+        if np.abs(step).max() < CONVERGED_STEP:
+            break
+    return state
+
+
+def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray) -> None:
+    """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure weights."""
+    size = state.shape[1]
+    second = state[:-2] - 2 * state[1:-1] + state[2:]
+    weight = stiffness / (1 + second**2 * stiffness / JUMP_SCALE**2) ** 2
+    for number, (difference, share) in enumerate(zip(second, weight, strict=True)):
+        for row, first in enumerate((1.0, -2.0, 1.0)):
+            right[number + row] -= share * first * difference
+            for column, other in enumerate((1.0, -2.0, 1.0)[: row + 1]):
+                at = (number + column) * size
+                band[(row - column) * size, at : at + size] += share * first * other
+
+
+def _precision(head: HeadModel) -> np.ndarray:
+    """(E + 18,) inverse variances of a timestep's parameters around zero."""
+    joints = [
+        JOINT_SIGMA_RAD[name] if present else (ABSENT_SIGMA,) * 3
+        for name, present in zip(JOINTS, head.joints, strict=True)
+    ]
+    rigid = np.concatenate([*joints, (TRANSLATION_SIGMA_M,) * TRANSLATION_SIZE])
+    return np.concatenate([np.ones(head.model.n_expression), rigid**-2.0])
+
+
+def _acceleration_precision(model: FlameModel) -> np.ndarray:
+    sigma = np.repeat(
+        (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M),
+        (model.n_expression, POSE_SIZE, TRANSLATION_SIZE),
+    )
+    return np.asarray(sigma**-2.0)

@@ -1,0 +1,224 @@
+"""Tracking of a head: footage and a head model to a capture."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import read_json, write_json
+from .contact_sheet import write_contact_sheet
+from .correspondence import calibrate
+from .detectors import make_detector
+from .fit import HeadFit, TimestepLandmarks, fit_head
+from .footage.model import Footage
+from .head_model import read_head_model
+from .landmarks import (
+    PLACES_FILE,
+    CameraLandmarks,
+    Report,
+    detect_landmarks,
+    read_landmarks,
+    read_places,
+    timesteps_with_landmarks,
+    write_places,
+)
+from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .write_capture import SPLIT_FILES, posed_mesh, write_capture
+
+REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER = "tracking.json", "contact_sheet.png", "landmarks"
+OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
+"""A camera is at fault whose landmarks miss the fitted head by this many times those of the others, and by this share
+of the face's size."""
+
+
+@dataclass(frozen=True)
+class TrackingReport:
+    """What `track` found, as written to tracking.json.
+
+    reprojection_px  camera -> timestep -> median distance in pixels of its landmarks from those of the fitted head
+    interpolated     timesteps without a face, filled from their neighbors
+    scale            meters per unit of the cameras' world
+    warnings         one sentence each
+    """
+
+    reprojection_px: Mapping[str, Mapping[int, float]]
+    interpolated: tuple[int, ...]
+    scale: float
+    warnings: tuple[str, ...]
+
+    @property
+    def median_px(self) -> float:
+        return float(np.median([error for errors in self.reprojection_px.values() for error in errors.values()]))
+
+
+def track(
+    footage: Footage,
+    head_file: Path,
+    out: Path,
+    landmarks: Path | None = None,
+    task: Path | None = None,
+    meshes: bool = False,
+    report: Report = lambda stage, done, total: None,
+) -> TrackingReport:
+    """Track the head that the footage shows, and write a capture into the folder `out`.
+
+    landmarks: folder of landmark files in place of a detector; task: MediaPipe's .task file (`make_detector`).
+    What was detected is kept in OUT/landmarks: called again after an interruption, those cameras are not detected
+    again. The capture's world is in meters, y up, with the head near its origin. Raises StgaError.
+    """
+    if any((out / name).exists() for name in (*SPLIT_FILES, "transforms.json")):
+        raise StgaError(f"{out}: already holds a capture; give another --out")
+    head = read_head_model(head_file)
+    if landmarks is not None:
+        found = read_landmarks(footage, landmarks)
+        places, reliable = read_places(landmarks / PLACES_FILE, len(head.model.faces))
+    else:
+        detector = make_detector(task)
+        report("Head model", 0, 1)
+        places, reliable = calibrate(head.model, detector)
+        _begin(out, footage, head_file)
+        write_places(out / LANDMARKS_FOLDER / PLACES_FILE, places, reliable)
+        found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
+    seen = sorted(timesteps_with_landmarks(found) & set(footage.timesteps))
+    if not seen:
+        raise StgaError(f"{footage.root}: shows no face in any of {len(list(footage.views()))} frames")
+    _check_count(found, places)
+    take = {timestep: _at(footage, found, timestep, len(places)) for timestep in seen}
+    fit = fit_head(head, places, reliable, take, report)
+    errors = reprojection_errors(fit, places, reliable, take, footage, found)
+    _check_cameras(footage, errors)
+    parameters = interpolated(fit.parameters, footage.timesteps)
+    result = TrackingReport(
+        {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
+        tuple(t for t in footage.timesteps if t not in fit.parameters),
+        fit.to_capture.scale,
+        _warnings(footage, found, fit),
+    )
+    write_json(out / REPORT_FILE, _as_json(result))
+    report("Contact sheet", 0, 1)
+    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
+    write_contact_sheet(
+        out / SHEET_FILE,
+        footage,
+        cameras,
+        lambda timestep: posed_mesh(fit, parameters[timestep]),
+        fit.head.model.faces,
+        result.reprojection_px,
+    )
+    write_capture(out, footage, fit, parameters, meshes, report)
+    return result
+
+
+def interpolated(parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]) -> dict[int, np.ndarray]:
+    """Parameters of all timesteps: linear between the known ones, constant before the first and after the last."""
+    known = sorted(parameters)
+    values = np.stack([parameters[timestep] for timestep in known])
+    columns = np.stack([np.interp(timesteps, known, column) for column in values.T], axis=1)
+    return dict(zip(timesteps, columns, strict=True))
+
+
+def reprojection_errors(
+    fit: HeadFit,
+    places: SurfacePoints,
+    reliable: np.ndarray,
+    take: Mapping[int, TimestepLandmarks],
+    footage: Footage,
+    found: Mapping[str, CameraLandmarks],
+) -> dict[str, dict[int, tuple[float, float]]]:
+    """Camera -> timestep -> median distance of its landmarks from the fitted head's, in pixels and in face sizes."""
+    points = PosedPoints(fit.head.model, places)
+    errors: dict[str, dict[int, tuple[float, float]]] = {camera.name: {} for camera in footage.cameras}
+    for timestep, parameters in fit.parameters.items():
+        head = points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+        cameras = [name for name, own in found.items() if _row(own, timestep) is not None]
+        for name, camera, pixels, confidence in zip(
+            cameras, take[timestep].cameras, take[timestep].points, take[timestep].confidence, strict=True
+        ):
+            use = reliable & (confidence > 0)
+            projected, _ = fit.to_capture.camera(camera).project(head[use])
+            distance = float(np.median(np.linalg.norm(projected - pixels[use], axis=1)))
+            size = float(np.linalg.norm(np.ptp(pixels[use], axis=0)))
+            errors[name][timestep] = distance, distance / max(size, 1e-9)
+    return errors
+
+
+def _begin(out: Path, footage: Footage, head_file: Path) -> None:
+    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
+    path = out / LANDMARKS_FOLDER / "footage.json"
+    source = {
+        "footage": str(footage.root),
+        "cameras": [camera.name for camera in footage.cameras],
+        "timesteps": list(footage.timesteps),
+        "head_model": str(head_file.resolve()),
+    }
+    if path.exists() and read_json(path) != source:
+        raise StgaError(f"{out}: holds landmarks of other footage or frames; give another --out, or delete it")
+    write_json(path, source)
+
+
+def _check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:
+    for name, camera in found.items():
+        count = camera.points.shape[1]
+        if camera.confidence.any() and count != len(places):
+            raise StgaError(f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}")
+
+
+def _row(camera: CameraLandmarks, timestep: int) -> int | None:
+    rows = np.flatnonzero(camera.timesteps == timestep)
+    return int(rows[0]) if len(rows) and camera.confidence[rows[0]].any() else None
+
+
+def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int) -> TimestepLandmarks:
+    cameras = {camera.name: camera.camera for camera in footage.cameras}
+    rows = {name: row for name, own in found.items() if (row := _row(own, timestep)) is not None}
+    return TimestepLandmarks(
+        tuple(cameras[name] for name in rows),
+        np.stack([found[name].points[row] for name, row in rows.items()]),
+        np.stack([found[name].confidence[row] for name, row in rows.items()]),
+    )
+
+
+def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:
+    """Raise StgaError for a camera whose landmarks do not fit the head that the others see."""
+    share = {name: float(np.median([part for _, part in own.values()])) for name, own in errors.items() if own}
+    for name, value in share.items():
+        others = [other for other_name, other in share.items() if other_name != name] or [value]
+        if value > max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(others))):
+            worst = max(errors[name], key=lambda timestep: errors[name][timestep][1])
+            raise StgaError(
+                f"camera {name}: its landmarks are off by {errors[name][worst][0]:.0f} pixels at timestep {worst}, "
+                "far more than those of the other cameras; check its calibration, synchronization and mirroring"
+            )
+
+
+def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit) -> tuple[str, ...]:
+    missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
+    blind = [name for name, own in found.items() if not own.confidence.any()]
+    warnings = list(footage.warnings)
+    if missing:
+        listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
+        warnings.append(f"no face at {len(missing)} of {len(footage.timesteps)} timesteps, interpolated: {listed}")
+    if blind:
+        warnings.append(f"no face in any frame of: {', '.join(blind)}")
+    if len(footage.cameras) == 1:
+        warnings.append("one camera: size and distance of the head, and its depth, are those of the average head")
+    if not footage.calibrated:
+        warnings.append("the focal length is a guess; give it if it is known")
+    return tuple(warnings)
+
+
+def _as_json(result: TrackingReport) -> dict[str, Any]:
+    errors = {
+        name: {str(timestep): round(px, 3) for timestep, px in own.items()}
+        for name, own in result.reprojection_px.items()
+    }
+    return {
+        "median_reprojection_px": round(result.median_px, 3),
+        "meters_per_unit": result.scale,
+        "interpolated": list(result.interpolated),
+        "warnings": list(result.warnings),
+        "reprojection_px": errors,
+    }

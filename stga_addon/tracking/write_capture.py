@@ -1,0 +1,125 @@
+"""Writing of a tracked take as a capture: VHAP's layout for FLAME, the mesh layout for other models."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..capture.camera import Camera
+from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
+from ..files import replacing, write_json, write_npz
+from ..flame.forward import FlameFrame, flame_forward
+from .fit import HeadFit
+from .footage.model import Footage, FootageCamera
+from .landmarks import Report
+from .posed_points import RIGID_SIZE
+
+MIN_CAMERAS_TO_HOLD_OUT = 4
+SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+
+
+def write_capture(
+    out: Path, footage: Footage, fit: HeadFit, parameters: Mapping[int, np.ndarray], meshes: bool, report: Report
+) -> None:
+    """Write images, masks, the tracked head of each timestep, and at last the transforms that make it a capture.
+
+    parameters: timestep -> (E + 18,), interpolated ones included. With four cameras or more, the one nearest to the
+    middle is held out as `val`. Raises StgaError where `out` cannot be written.
+    """
+    views = [view for view in footage.views() if view[0] in parameters]
+    index = {camera.name: number for number, camera in enumerate(footage.cameras)}
+    frames: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
+    held_out = _middle_camera(footage) if len(footage.cameras) >= MIN_CAMERAS_TO_HOLD_OUT else None
+    for number, (timestep, camera) in enumerate(views):
+        entry = _entry(out, timestep, camera, index[camera.name], fit.to_capture.camera(camera.camera))
+        folder = (f"{PARAMETERS}", "npz") if fit.head.layout == "flame" else ("meshes", "obj")
+        entry["flame_param_path" if folder[1] == "npz" else "mesh_path"] = f"{folder[0]}/{timestep:05d}.{folder[1]}"
+        frames["val" if camera.name == held_out else "train"].append(entry)
+        report("Images", number + 1, len(views))
+    top = _write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)
+    for name, entries in zip(SPLIT_FILES, frames.values(), strict=True):
+        write_json(out / name, {**top, "frames": entries})
+
+
+def posed_mesh(fit: HeadFit, parameters: np.ndarray) -> np.ndarray:
+    """The head's vertices (V, 3) in the capture's world, in meters."""
+    return flame_forward(fit.head.model, np.zeros(0), flame_frame(parameters))
+
+
+def flame_frame(parameters: np.ndarray) -> FlameFrame:
+    """Parameters (E + 18,) as FLAME's."""
+    expr, rigid = parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
+    rotation, neck, jaw, eyes, translation = np.split(rigid, [3, 6, 9, 15])
+    return FlameFrame(expr, rotation, neck, jaw, translation, eyes)
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """A Wavefront OBJ of triangles; vertices in micrometer precision."""
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    with replacing(path) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _middle_camera(footage: Footage) -> str:
+    centers = np.array([camera.camera.position for camera in footage.cameras])
+    return footage.cameras[int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())].name
+
+
+def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera: Camera) -> dict[str, Any]:
+    """Copy image and mask; the entry of the transforms."""
+    file = source.file(timestep)
+    name = f"images/{timestep:05d}_{number:02d}" + (".png" if file is None else file.suffix.lower())
+    with replacing(out / name) as partial:
+        if file is None:
+            Image.fromarray(source.image(timestep)).save(partial, format="PNG")
+        else:
+            shutil.copyfile(file, partial)
+    entry: dict[str, Any] = {
+        "timestep_index": timestep,
+        "camera_index": number,
+        "camera_id": source.name,
+        "file_path": name,
+        "transform_matrix": camera.camera_to_world_gl.tolist(),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.height - camera.cy,  # counted from the bottom, as VHAP writes it
+    }
+    mask = source.mask(timestep)
+    if mask is not None:
+        entry["fg_mask_path"] = f"fg_masks/{timestep:05d}_{number:02d}.png"
+        with replacing(out / entry["fg_mask_path"]) as partial:
+            Image.fromarray(mask).save(partial, format="PNG")
+    return entry
+
+
+def _write_heads(
+    out: Path, fit: HeadFit, parameters: Mapping[int, np.ndarray], meshes: bool, report: Report
+) -> dict[str, str]:
+    """Write every timestep's head; returns the top level of the transforms."""
+    faces, neutral = fit.head.model.faces, np.zeros_like(next(iter(parameters.values())))
+    for number, (timestep, values) in enumerate(parameters.items()):
+        if fit.head.layout == "flame":
+            write_npz(out / PARAMETERS / f"{timestep:05d}.npz", _flame_arrays(fit, values))
+        if meshes:
+            write_obj(out / "meshes" / f"{timestep:05d}.obj", posed_mesh(fit, values), faces)
+        report("Heads", number + 1, len(parameters))
+    if meshes:
+        write_obj(out / "meshes" / "neutral.obj", posed_mesh(fit, neutral), faces)
+    if fit.head.layout == "flame":
+        write_npz(out / CANONICAL_NAME, _flame_arrays(fit, neutral))
+        return {}
+    return {"canonical_mesh_path": "meshes/neutral.obj"}
+
+
+def _flame_arrays(fit: HeadFit, parameters: np.ndarray) -> dict[str, np.ndarray]:
+    frame = flame_frame(parameters)
+    moving = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+    arrays = {name: getattr(frame, name)[None].astype(np.float32) for name in moving}
+    return arrays | {"shape": fit.shape.astype(np.float32)}

@@ -1,0 +1,87 @@
+"""The contact sheet: which views it shows, and where the mesh lies in them."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from stga_addon.capture.camera import look_at
+from stga_addon.capture.model import View
+from stga_addon.tracking.contact_sheet import COLUMNS, MESH_OPACITY, PICTURE, write_contact_sheet
+from stga_addon.tracking.footage.image_frames import ImageFrames
+from stga_addon.tracking.footage.model import Footage, FootageCamera
+
+SIZE = 120
+BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+FACES = np.asarray(BALL.faces, np.int32)
+
+
+def ball(timestep):
+    return np.add(BALL.vertices, (0.02 * timestep, 0, 0))
+
+
+def footage(folder, cameras, timesteps):
+    """Images in which the ball is white on black, by its exact outline; red says the camera, green the timestep."""
+    found = []
+    for number in range(cameras):
+        camera = look_at((0.2 * number, 0.1, 1.0), (0, 0, 0), SIZE, SIZE, 400.0)
+        views = {}
+        for t in range(timesteps):
+            y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+            rays = np.stack([(x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y, np.ones_like(x)], axis=-1)
+            center = camera.world_to_camera[:3, :3] @ [0.02 * t, 0, 0] + camera.world_to_camera[:3, 3]
+            along = rays @ center / np.linalg.norm(rays, axis=-1)
+            covered = center @ center - along**2 < 0.1**2
+            image = np.where(covered[..., None], 255, np.array([20 * number, 20 * t, 0])).astype(np.uint8)
+            path = folder / f"{number}_{t}.png"
+            Image.fromarray(image).save(path)
+            views[t] = View(t, number, camera, path.name, path)
+        found.append(FootageCamera(f"cam{number}", camera, ImageFrames(views)))
+    return Footage(folder, tuple(found), tuple(range(timesteps)))
+
+
+def write(folder, take, errors):
+    cameras = {camera.name: camera.camera for camera in take.cameras}
+    write_contact_sheet(folder / "sheet.png", take, cameras, ball, FACES, errors)
+    return np.asarray(Image.open(folder / "sheet.png").convert("RGB")).astype(int)
+
+
+def pictures(sheet, count):
+    """The pictures of each view: as recorded, and with the mesh, from the positions of the tiles."""
+    width, height = PICTURE
+    top = sheet.shape[0] - 12 - (-(-count // COLUMNS)) * (height + 18 + 8)
+    for number in range(count):
+        row, column = divmod(number, COLUMNS)
+        y, x = top + row * (height + 26), 12 + column * (2 * width + 8)
+        yield sheet[y : y + height, x : x + width], sheet[y : y + height, x + width : x + 2 * width]
+
+
+def test_worst_views_first(tmp_path):
+    """Catches views in the order of cameras, or the best ones, and a picture of another timestep."""
+    take = footage(tmp_path, 2, 3)
+    errors = {"cam0": {0: 1.0, 2: 5.0}, "cam1": {0: 2.0, 1: 9.0, 2: 0.5}}
+    sheet = write(tmp_path, take, errors)
+    corners = [plain[3, 3, :2].tolist() for plain, _ in pictures(sheet, 5)]
+    assert corners == [[20, 20], [0, 40], [20, 0], [0, 0], [20, 40]]
+
+
+def test_mesh_lies_on_the_head(tmp_path):
+    """Catches a mesh that is shifted, scaled or flipped against its image by the crop."""
+    take = footage(tmp_path, 2, 2)
+    sheet = write(tmp_path, take, {"cam0": {1: 1.0}, "cam1": {0: 2.0}})
+    for plain, drawn in pictures(sheet, 2):
+        head, changed = plain.min(axis=2) > 128, np.abs(plain - drawn).max(axis=2) > 255 * MESH_OPACITY / 8
+        assert head.mean() > 0.3
+        assert (head ^ changed)[:, :190].mean() < 0.02
+        y, x = (int(np.mean(axis)) for axis in np.nonzero(head))
+        assert drawn[y, x, 2] > drawn[y, x, 0]  # where the surface faces the camera, its color is blue
+        assert drawn[head.any(axis=1).argmax() + 12, x, 1] > drawn[y + (y - head.any(axis=1).argmax()) - 12, x, 1]
+
+
+@pytest.mark.parametrize("cameras", [1, 60])
+def test_many_cameras_and_none_seen(tmp_path, cameras):
+    """Catches a sheet that grows without bound, and one of a take in which nothing was measured."""
+    take = footage(tmp_path, cameras, 1)
+    sheet = write(tmp_path, take, {camera.name: {0: 1.0} for camera in take.cameras})
+    assert sheet.shape[0] < 2400
+    assert write(tmp_path, take, {camera.name: {} for camera in take.cameras}).size

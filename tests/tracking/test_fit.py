@@ -1,0 +1,192 @@
+"""The fit against heads whose parameters, cameras and landmarks are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flame.conftest import random_arrays, random_frame
+
+from stga_addon.capture.camera import look_at
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.tracking.fit import Similarity, TimestepLandmarks, fit_head, pose_from_one_camera
+from stga_addon.tracking.head_model import HeadModel, linear_model
+from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
+from stga_addon.tracking.track import interpolated
+from stga_addon.tracking.triangulation import rays, triangulate
+from stga_addon.tracking.write_capture import flame_frame, posed_mesh
+
+WORLD_SCALE, WORLD_ROTATION = 0.23, 1.1
+"""The cameras' world: its unit is not the meter and its axes are not the head's."""
+
+
+@pytest.fixture(scope="module")
+def head():
+    return HeadModel(synthetic_flame(0), "flame")
+
+
+def places_on(head, count, seed=0):
+    """Places all over the front of the skin."""
+    rng = np.random.default_rng(seed)
+    centers = head.model.v_template[head.model.faces].mean(1)
+    front = np.flatnonzero(centers[:, 2] > 0.04)
+    return SurfacePoints(rng.choice(front, count), rng.dirichlet([1, 1, 1], count))
+
+
+def frame_at(head, timestep):
+    """A take in which the head turns, smiles and opens its mouth."""
+    expr = np.zeros(head.model.n_expression)
+    expr[timestep % 3] = 0.5 + 0.4 * np.sin(timestep / 4)
+    turn = 0.25 * np.sin(timestep / 5)
+    jaw = np.array([0.1 + 0.1 * np.cos(timestep / 6), 0, 0])
+    zero = np.zeros(3)
+    return FlameFrame(expr, np.array([0.05, turn, 0.02]), zero, jaw, np.array([0.01, turn / 50, 0.0]), np.zeros(6))
+
+
+def cameras(count):
+    angles = np.linspace(-0.8, 0.8, count) if count > 1 else [0.1]
+    eyes = [(np.sin(a), 0.1 * (-1) ** k, np.cos(a)) for k, a in enumerate(angles)]
+    return [look_at(eye, (0, 0, 0), 800, 800, 2000) for eye in eyes]
+
+
+def moved_world():
+    turn = np.array([[np.cos(WORLD_ROTATION), -np.sin(WORLD_ROTATION), 0], [0, 0, -1], [0, 0, 0]])
+    turn[2, :2] = np.sin(WORLD_ROTATION), np.cos(WORLD_ROTATION)
+    turn[:, 2] = np.cross(turn[:, 0], turn[:, 1])
+    return Similarity(WORLD_SCALE, turn, np.array([3.0, -1.0, 2.0]))
+
+
+def seen(rig, points, noise=0.0, seed=0):
+    """Landmarks of points (N, 3) in every camera."""
+    rng = np.random.default_rng(seed)
+    pixels = np.stack([camera.project(points)[0] for camera in rig])
+    return TimestepLandmarks(tuple(rig), pixels + rng.normal(0, noise, pixels.shape), np.ones(pixels.shape[:2]))
+
+
+def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differences():
+    """Catches a joint, corrective or shape that moves landmarks otherwise than FLAME's own forward pass."""
+    head = HeadModel(random_flame(), "flame")
+    frame = random_frame(3, head.model.n_expression)
+    shape = np.random.default_rng(1).normal(size=head.model.n_identity)
+    places = SurfacePoints(np.arange(50), np.random.default_rng(2).dirichlet([1, 1, 1], 50))
+    points = PosedPoints(head.model, places)
+    coefficients = np.concatenate([shape, frame.expr])
+    rigid = np.concatenate([frame.pose.ravel(), frame.translation])
+    expected = places.on(flame_forward(head.model, shape, frame), head.model.faces)
+    positions, jacobian = points.linearized(coefficients, rigid)
+    np.testing.assert_allclose(positions, expected, atol=1e-12)
+    values = np.concatenate([coefficients, rigid])
+    for column in range(len(values)):
+        step = np.zeros(len(values))
+        step[column] = 1e-5
+        sides = [points.positions((values + s)[:-18], (values + s)[-18:]) for s in (step, -step)]
+        np.testing.assert_allclose(jacobian[..., column], (sides[0] - sides[1]) / 2e-5, atol=5e-6)
+
+
+def random_flame():
+    from stga_addon.flame.model import FlameModel
+
+    """A FLAME model of random numbers."""
+    arrays = random_arrays()
+    return FlameModel(
+        arrays["v_template"], arrays["shapedirs"], 9, arrays["posedirs"], arrays["J_regressor"],
+        np.array([-1, 0, 1, 1, 1]), arrays["weights"], arrays["f"].astype(np.int32),
+    )  # fmt: skip
+
+
+def test_triangulation_outvotes_a_wrong_camera():
+    """Catches a plain mean of rays, which one misdetected face pulls centimeters away."""
+    rig = cameras(6)
+    points = np.random.default_rng(0).normal(0, 0.05, (20, 3))
+    landmarks = seen(rig, points)
+    landmarks.points[2] += 60
+    found = triangulate(rig, landmarks.points, landmarks.confidence)
+    assert np.abs(found.position - points).max() < 2e-4
+    landmarks.confidence[:, 4] = 0
+    assert not triangulate(rig, landmarks.points, landmarks.confidence).seen[4]
+
+
+def test_rays_pass_through_what_a_camera_sees():
+    """Catches a principal point or an axis with the wrong sign."""
+    camera = replace(cameras(3)[0], cx=300.0, cy=450.0, fl_y=1800.0)
+    points = np.random.default_rng(1).normal(0, 0.05, (9, 3))
+    origin, directions = rays(camera, camera.project(points)[0])
+    np.testing.assert_allclose(np.cross(points - origin, directions), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [-0.7, 0.0, 0.5])
+def test_one_camera_gives_the_pose_of_a_rigid_head(angle):
+    """Catches a mirrored or collapsed pose of the only start that one camera has."""
+    camera = look_at((np.sin(angle), 0.2, np.cos(angle)), (0, 0, 0), 800, 800, 1000)
+    points = np.random.default_rng(0).normal(0, 0.05, (30, 3))
+    np.testing.assert_allclose(pose_from_one_camera(camera, camera.project(points)[0], points), points, atol=1e-5)
+
+
+def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
+    """Catches an error in scale, orientation, identity or expression: vertices would be millimeters off."""
+    shape = np.random.default_rng(5).normal(0, 0.7, head.model.n_identity)
+    world, places = moved_world(), places_on(head, 100)
+    rig = cameras(5)
+    foreign = [Similarity(world.scale, world.rotation, world.translation).camera(camera) for camera in rig]
+    take = {}
+    for timestep in range(12):
+        mesh = flame_forward(head.model, shape, frame_at(head, timestep))
+        take[timestep] = seen(foreign, world.apply(places.on(mesh, head.model.faces)), noise=0.3, seed=timestep)
+    take[7] = replace(
+        take[7], cameras=take[7].cameras[:1], points=take[7].points[:1], confidence=take[7].confidence[:1]
+    )
+    fit = fit_head(head, places, np.ones(100, bool), take)
+    assert fit.to_capture.scale == pytest.approx(1 / world.scale, rel=0.03)
+    for timestep in (0, 7, 11):
+        back = posed_mesh(fit, fit.parameters[timestep]) - fit.to_capture.translation
+        found = back @ fit.to_capture.rotation / fit.to_capture.scale
+        true = world.apply(flame_forward(head.model, shape, frame_at(head, timestep)))
+        error = np.linalg.norm(found - true, axis=1)[head.model.masks["face"]] / world.scale
+        assert error.mean() < (2e-3 if timestep == 7 else 0.8e-3)
+
+
+def test_jumps_are_not_smoothed(head):
+    """Catches smoothing across cuts: a capture of single expressions would lose all of them."""
+    places, rig = places_on(head, 100), cameras(4)
+    strong = np.eye(head.model.n_expression)
+    frames = [replace(frame_at(head, 0), expr=strong[k % head.model.n_expression]) for k in range(6)]
+    meshes = [flame_forward(head.model, np.zeros(head.model.n_identity), frame) for frame in frames]
+    take = {k: seen(rig, places.on(mesh, head.model.faces)) for k, mesh in enumerate(meshes)}
+    fit = fit_head(head, places, np.ones(100, bool), take)
+    for timestep, mesh in enumerate(meshes):
+        back = posed_mesh(fit, fit.parameters[timestep]) - fit.to_capture.translation
+        found = back @ fit.to_capture.rotation / fit.to_capture.scale
+        assert np.linalg.norm(found - mesh, axis=1)[head.model.masks["face"]].mean() < 0.8e-3
+
+
+def test_one_camera_follows_a_head(head):
+    """Catches a drift in depth or a flipped turn where no second camera helps."""
+    places, rig = places_on(head, 100), cameras(1)
+    shape = np.zeros(head.model.n_identity)
+    meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(5)]
+    take = {t: seen(rig, places.on(mesh, head.model.faces)) for t, mesh in enumerate(meshes)}
+    fit = fit_head(head, places, np.ones(100, bool), take)
+    for timestep, mesh in enumerate(meshes):
+        pixels, _ = fit.to_capture.camera(rig[0]).project(posed_mesh(fit, fit.parameters[timestep]))
+        error = np.linalg.norm(pixels - rig[0].project(mesh)[0], axis=1)[head.model.masks["face"]]
+        assert np.median(error) < 2  # of a face of 300 pixels
+
+
+def test_a_linear_model_without_joints_moves_rigidly():
+    """Catches rotation about joints that a plain shape-key head does not have."""
+    rng = np.random.default_rng(0)
+    faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]])
+    arrays = {"mean": rng.normal(0, 0.1, (8, 3)), "faces": faces, "expression": rng.normal(0, 0.01, (8, 3, 2))}
+    head = HeadModel(linear_model(None, arrays), "mesh")
+    assert head.joints == (True, False, False, False, False)
+    fit = np.concatenate([[0.5, -1.0], [0.3, 0.2, 0.1], np.zeros(12), [0.1, 0.2, 0.3]])
+    found = flame_forward(head.model, np.zeros(0), flame_frame(fit))
+    shaped = arrays["mean"] + arrays["expression"] @ [0.5, -1.0]
+    lengths = [np.linalg.norm(mesh[:, None] - mesh[None], axis=2) for mesh in (found, shaped)]
+    np.testing.assert_allclose(*lengths, atol=1e-12)
+
+
+def test_timesteps_without_a_face_are_interpolated():
+    """Catches gaps that keep the last pose, or extrapolate beyond the ends."""
+    found = interpolated({2: np.array([0.0, 1.0]), 6: np.array([4.0, 1.0])}, (1, 2, 3, 6, 7))
+    np.testing.assert_allclose([found[t][0] for t in (1, 2, 3, 6, 7)], [0, 0, 1, 4, 4])

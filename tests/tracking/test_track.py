@@ -1,0 +1,289 @@
+"""`stga track` from footage to a capture that opens, with landmark files and with the real detector."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.capture.camera import look_at
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+from stga_addon.development.demo.head import synthetic_flame, write_flame
+from stga_addon.errors import StgaError
+from stga_addon.files import read_json, write_json, write_npz
+from stga_addon.flame.forward import flame_forward
+from stga_addon.tracking.correspondence import calibrate, nearest_points
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.head_model import HeadModel, read_head_model
+from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
+from stga_addon.tracking.mesh_image import rasterize, shaded_image
+from stga_addon.tracking.track import track
+
+from .test_fit import frame_at, places_on
+
+SIZE, LANDMARKS = 64, 120
+
+
+@pytest.fixture(scope="module")
+def head():
+    return HeadModel(synthetic_flame(0), "flame")
+
+
+def rig(count=5, size=SIZE):
+    eyes = [(np.sin(a), 0.1, np.cos(a)) for a in np.linspace(-0.6, 0.6, count)]
+    return [look_at(eye, (0, -0.02, 0), size, size, 2.6 * size) for eye in eyes]
+
+
+def write_footage(folder, cameras, timesteps, picture):
+    """transforms.json with one entry an image; picture(camera, timestep) gives its pixels."""
+    frames = []
+    for number, camera in enumerate(cameras):
+        for timestep in range(timesteps):
+            name = f"images/{number}_{timestep}.png"
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture(camera, timestep)).save(folder / name)
+            entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
+            intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.height - camera.cy}
+            pose = {"transform_matrix": camera.camera_to_world_gl.tolist(), "w": camera.width, "h": camera.height}
+            frames.append({**entry, **intrinsics, **pose})
+    write_json(folder / "transforms.json", {"frames": frames})
+    return folder
+
+
+@pytest.fixture
+def recorded(tmp_path, head):
+    """Footage of blank images, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2."""
+    cameras, places = rig(), places_on(head, LANDMARKS)
+    write_footage(tmp_path / "footage", cameras, 5, lambda *_: np.zeros((SIZE, SIZE, 3), np.uint8))
+    write_flame(head.model, tmp_path / "head.npz")
+    write_places(tmp_path / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
+    shape = np.zeros(head.model.n_identity)
+    meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(5)]
+    for number, camera in enumerate(cameras):
+        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+        confidence = np.ones(points.shape[:2])
+        confidence[2] = 0
+        write_npz(
+            tmp_path / f"points/cam{number}.npz",
+            {"timesteps": np.arange(5), "points": points, "confidence": confidence},
+        )
+    return tmp_path, meshes
+
+
+def command(folder, *more):
+    out = ["--out", str(folder / "out"), "--landmarks", str(folder / "points")]
+    return main(["track", str(folder / "footage"), "--model", str(folder / "head.npz"), *out, *more])
+
+
+def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsys, head):
+    """Catches wrong axes, units or a principal point counted from the wrong side in what is written."""
+    folder, meshes = recorded
+    assert command(folder, "--meshes") == 0
+    printed = capsys.readouterr().out
+    assert "interpolated: 2" in printed
+    capture = open_capture(folder / "out", folder / "head.npz")
+    assert capture.layout == "flame"
+    assert capture.timesteps == (0, 1, 2, 3, 4)
+    assert len({view.camera_index for view in capture.views["val"]}) == 1
+    cameras = {f"cam{number}": camera for number, camera in enumerate(rig())}
+    face = head.model.masks["face"]
+    for view in (*capture.views["train"], *capture.views["val"]):
+        if view.timestep != 2:
+            pixels, _ = view.camera.project(capture.mesh(view.timestep)[face])
+            expected, _ = cameras[f"cam{view.camera_index}"].project(meshes[view.timestep][face])
+            assert np.abs(pixels - expected).mean() < 0.4
+    mesh = (folder / "out/meshes/00001.obj").read_text().splitlines()
+    written = np.array([line.split()[1:] for line in mesh if line.startswith("v ")], float)
+    np.testing.assert_allclose(written, capture.mesh(1), atol=2e-6)
+    assert read_json(folder / "out/tracking.json")["interpolated"] == [2]
+    assert (folder / "out/contact_sheet.png").is_file()
+
+
+@pytest.mark.parametrize("offset", ["cam0", "cam0=soon", "=", "cam0=1.5"])
+def test_offsets_that_are_none(recorded, capsys, offset):
+    """Catches an offset that is left out without a word."""
+    with pytest.raises(SystemExit, match="2"):
+        command(recorded[0], "--offset", offset)
+    assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
+
+
+def test_a_linear_model_gives_a_mesh_capture(recorded, head):
+    """Catches a layout that only FLAME's own files open in."""
+    folder, _ = recorded
+    model = head.model
+    arrays = {
+        "mean": model.v_template,
+        "faces": model.faces,
+        "identity": model.shapedirs[:, :, : model.n_identity],
+        "expression": model.shapedirs[:, :, model.n_identity :],
+    }
+    write_npz(folder / "head.npz", arrays)
+    assert command(folder) == 0
+    capture = open_capture(folder / "out")
+    assert capture.layout == "mesh"
+    assert len(capture.neutral) == len(model.v_template)
+
+
+def test_a_camera_that_does_not_fit_is_named(recorded, capsys):
+    """Catches a mirrored or misplaced camera that quietly ruins the capture."""
+    folder, _ = recorded
+    points = dict(np.load(folder / "points/cam3.npz"))
+    points["points"][..., 0] = SIZE - points["points"][..., 0] + 9
+    write_npz(folder / "points/cam3.npz", points)
+    assert command(folder) == 2
+    message = capsys.readouterr().err
+    assert "camera cam3" in message
+    assert "timestep" in message
+    assert not (folder / "out/transforms_train.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"points": np.zeros((5, 3))}, "points has shape"),
+        ({"timesteps": np.array([0, 1, 2, 3, 99])}, "timesteps: expected timesteps of camera cam0"),
+        ({"confidence": np.full((5, LANDMARKS), -1.0)}, "confidence"),
+        ({"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))}, "different numbers of landmarks"),
+    ],
+)
+def test_wrong_landmark_files_are_named(recorded, capsys, change, expected):
+    """Catches landmark files that are read as something else."""
+    folder, _ = recorded
+    write_npz(folder / "points/cam0.npz", dict(np.load(folder / "points/cam0.npz")) | change)
+    assert command(folder) == 2
+    message = capsys.readouterr().err
+    assert expected in message
+    assert "points" in message
+
+
+def test_footage_without_a_face(recorded, capsys):
+    """Catches a crash, or a capture of nothing, where nobody is in the picture."""
+    folder, _ = recorded
+    for number in range(5):
+        arrays = dict(np.load(folder / f"points/cam{number}.npz"))
+        write_npz(folder / f"points/cam{number}.npz", arrays | {"confidence": np.zeros((5, LANDMARKS))})
+    assert command(folder) == 2
+    assert "shows no face in any of 25 frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 2]])}, "neither identity nor expression"),
+        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 9]]), "identity": np.ones((4, 3, 1))}, "names vertices"),
+        ({"mean": np.eye(4, 3) * 30, "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))}, "meters"),
+        ({"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((5, 3, 1))}, "identity has shape"),
+    ],
+)
+def test_wrong_head_models_are_named(tmp_path, arrays, expected):
+    """Catches head models whose mistake shows up as a strange fit minutes later."""
+    write_npz(tmp_path / "model.npz", arrays)
+    with pytest.raises(StgaError, match=f"model.npz: .*{expected}"):
+        read_head_model(tmp_path / "model.npz")
+
+
+class Counting:
+    """A detector that sees `faces` in each image."""
+
+    def __init__(self, faces):
+        self.faces, self.calls = faces, 0
+
+    def detect(self, image):
+        self.calls += 1
+        return self.faces
+
+
+def test_detection_resumes_camera_by_camera(recorded):
+    """Catches a canceled detection that starts from the beginning, or keeps half a camera."""
+    folder, _ = recorded
+    footage, detector = open_footage(folder / "footage"), Counting([np.ones((3, 2)), np.ones((3, 2))])
+
+    def cancel(stage, done, total):
+        if done == 13:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        detect_landmarks(footage, detector, folder / "found", cancel)
+    assert len(list((folder / "found").iterdir())) == 2
+    detector.calls = 0
+    found = detect_landmarks(footage, detector, folder / "found", lambda *_: None)
+    assert detector.calls == 15
+    assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
+    camera = footage.cameras[0]
+    np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+
+
+def test_two_faces_are_reported_with_camera_and_frame(recorded):
+    """Catches a head that jumps between two people."""
+    folder, _ = recorded
+    two = np.array([[0.0, 0.0], [9.0, 9.0]])
+    with pytest.raises(StgaError, match=r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
+        detect_landmarks(open_footage(folder / "footage"), Counting([two, two + 30]), folder / "found", lambda *_: None)
+
+
+def test_the_picture_of_a_mesh_shows_its_nearest_triangles(head):
+    """Catches a wrong depth order or barycentric coordinates, against rays through pixel centers."""
+    camera, vertices, faces = rig(3, 48)[0], head.model.v_template, head.model.faces
+    triangle, weights = rasterize(vertices, faces, camera)
+    rows, columns = np.nonzero(triangle >= 0)
+    assert 300 < len(rows) < 48 * 48
+    corners = vertices[faces]
+    for y, x in np.random.default_rng(0).permutation(np.column_stack([rows, columns]))[:60]:
+        local = np.array([(x + 0.5 - camera.cx) / camera.fl_x, (y + 0.5 - camera.cy) / camera.fl_y, 1.0])
+        direction = local @ camera.world_to_camera[:3, :3]
+        system = np.stack(
+            [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], 0 * corners[:, 0] - direction], 2
+        )
+        usable = np.abs(np.linalg.det(system)) > 1e-12
+        hits = np.linalg.solve(system[usable], (camera.position - corners[usable, 0])[..., None])[..., 0]
+        inside = (hits[:, :2] >= -1e-9).all(1) & (hits[:, :2].sum(1) <= 1 + 1e-9) & (hits[:, 2] > 0)
+        nearest = np.flatnonzero(usable)[inside][hits[inside, 2].argmin()]
+        assert triangle[y, x] == nearest
+        pixel, _ = camera.project((weights[y, x] @ corners[nearest])[None])
+        np.testing.assert_allclose(pixel[0], [x + 0.5, y + 0.5], atol=0.05)
+
+
+def test_nearest_points_of_a_mesh(head):
+    """Catches a nearest triangle that is only the one with the nearest center."""
+    points = np.random.default_rng(0).normal(0, 0.08, (40, 3))
+    places, distance = nearest_points(head.model.v_template, head.model.faces, points)
+    on = places.on(head.model.v_template, head.model.faces)
+    np.testing.assert_allclose(np.linalg.norm(on - points, axis=1), distance, atol=1e-9)
+    corners = head.model.v_template[head.model.faces]
+    weights = np.random.default_rng(1).dirichlet([1, 1, 1], 60)
+    samples = np.einsum("sk,fkc->fsc", weights, corners).reshape(-1, 3)
+    for point, found in zip(points, distance, strict=True):
+        assert found <= np.linalg.norm(samples - point, axis=1).min() + 1e-9
+
+
+def test_mediapipe_tracks_pictures_of_a_head(tmp_path, head):
+    """Catches a correspondence or a detector's convention that is off: everything from pixels, nothing given."""
+    pytest.importorskip("mediapipe", reason="mediapipe is not installed")
+    shape = np.random.default_rng(1).normal(0, 0.5, head.model.n_identity)
+    meshes = [
+        flame_forward(head.model, shape, replace(frame_at(head, t), expr=np.zeros(head.model.n_expression)))
+        for t in range(2)
+    ]
+    footage = write_footage(
+        tmp_path / "footage", rig(5, 256), 2, lambda camera, t: shaded_image(meshes[t], head.model.faces, camera)
+    )
+    write_flame(head.model, tmp_path / "head.npz")
+    result = track(open_footage(footage), tmp_path / "head.npz", tmp_path / "out")
+    assert result.median_px < 3
+    capture = open_capture(tmp_path / "out", tmp_path / "head.npz")
+    face = head.model.masks["face"]
+    for view in capture.views["train"]:
+        pixels, _ = view.camera.project(capture.mesh(view.timestep)[face])
+        expected, _ = rig(5, 256)[view.camera_index].project(meshes[view.timestep][face])
+        assert np.median(np.linalg.norm(pixels - expected, axis=1)) < 5  # of a face of 120 pixels
+
+
+def test_mediapipe_finds_no_face_on_the_back_of_a_head(head):
+    """Catches a head model without a face that is fitted all the same."""
+    pytest.importorskip("mediapipe", reason="mediapipe is not installed")
+    from stga_addon.tracking.detectors import make_detector
+
+    turned = replace(head.model, v_template=head.model.v_template * [-1, 1, -1])
+    with pytest.raises(StgaError, match=r"shows a face in . of 9 pictures"):
+        calibrate(turned, make_detector())
