@@ -148,16 +148,18 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
             is_running = False if event.type == "ESC" else job.step()
             context.workspace.status_text_set(f"Exporting frame {job.done} of {job.total}   Esc: Cancel")
             if not is_running:
-                return self._end(context, job)
+                return self._end(context)
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: Any) -> None:
         """Blender closes, or the file dialog is left."""
         if self._range is not None:
-            self._end(context, self._range)
+            self._end(context)
 
     @reporting
-    def _end(self, context: Any, job: RangeExport) -> set[str]:
+    def _end(self, context: Any) -> set[str]:
+        job = self._range
+        assert job is not None
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
         if job.finish():

@@ -4,6 +4,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -264,9 +265,21 @@ def range_export(extension, folder: Path, frames: range, stop_after: int | None 
         export_avatar(folder, read_avatar(folder.parent / "avatar.npz"), "ply-sequence", meshes)
 
     job = module.RangeExport(bpy.context.scene.stga.head, frames, write)
-    while job.step() and (stop_after is None or job.done < stop_after):
+    operator = sys.modules[f"{extension.__name__}.operators.export"].ExportAvatar
+    said = []
+    context = SimpleNamespace(
+        window_manager=SimpleNamespace(event_timer_remove=said.append),
+        workspace=SimpleNamespace(status_text_set=said.append),
+    )
+    dialog = SimpleNamespace(_range=job, _timer="timer", filepath="", report=lambda kind, text: said.append(text))
+    dialog._end = lambda context: operator._end(dialog, context)
+    result = {"RUNNING_MODAL"}
+    while result == {"RUNNING_MODAL"}:
+        key = "TIMER" if stop_after is None or job.done < stop_after else "ESC"
+        result = operator.modal(dialog, context, SimpleNamespace(type=key))
         time.sleep(0.001)
-    assert job.finish() == (stop_after is None)
+    assert result == ({"FINISHED"} if stop_after is None else {"CANCELLED"})
+    assert said[-3:-1] == ["timer", None]
     return sorted(folder.glob("*.ply"))
 
 
