@@ -16,7 +16,8 @@ from .browser import Browser
 from .conftest import Head, make_head
 
 MIN_PSNR = 55.0
-MIN_EXACT_PSNR = 60.0
+MIN_EXACT_PSNR = 57.0
+"""Of large, half-transparent splats of random colors; trained heads reach 61 dB."""
 SNAPSHOT = """(async () => {
   const avatar = document.querySelector('stga-avatar');
   avatar.player.frame = avatar.frame = %d;
