@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: demo test test-fast test-gui lint fuzz extension clean
+.PHONY: demo test test-fast test-gui lint lint-web fuzz extension clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -21,6 +21,10 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Node.js: format of the web page's player
+lint-web:
+	npx --yes prettier@3.6.2 --check 'stga_addon/avatar/web/player/*.js' 'stga_addon/avatar/web/player/*.css'
 
 fuzz: .venv/ready
 	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} STGA_FUZZ_CASES=$${STGA_FUZZ_CASES:-5000} \

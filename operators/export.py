@@ -20,6 +20,7 @@ from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from . import ids
 from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
 from .export_range import RangeExport
+from .export_web import exact_motion, scene_playback
 
 STEP_INTERVAL_S = 0.005
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
@@ -51,6 +52,11 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     )
 
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    motion_only: bpy.props.BoolProperty(
+        name="Motion Only",
+        description="Leave out blend shapes, skeleton and sliders, which are derived from the FLAME model: its licence "
+        "decides who may receive them",
+    )
     _range: RangeExport | None = None
     _is_invoked = False
 
@@ -77,6 +83,8 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         self.layout.use_property_split = True
         self.layout.prop(self, "format")
         self.layout.prop(self, "avatar")
+        if self.format == "web":
+            self.layout.prop(self, "motion_only")
         if FORMATS[self.format].source == "range":
             frames = _frames(context)
             column = self.layout.column()
@@ -121,13 +129,16 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
             path = path.with_suffix(self.filename_ext)
         avatar = read_avatar(self._source(context))
         check_head(avatar, head)
-        motion = None
+        motion = playback = None
+        if self.format == "web":
+            playback = scene_playback(context, head, frames, self.motion_only)
+            motion = None if self.motion_only else exact_motion(head, frames, self._warn)
         if format.source == "range":
             check_free_space(path, range_bytes(avatar, self.format, len(frames)))
         elif format.source == "motion":
             motion = sample_motion(head, flame_of(capture_of(head), head.name), frames, self._warn)
         fps = frames_per_second(context.scene)
-        return path, lambda meshes: export_avatar(path, avatar, self.format, meshes, motion, fps)
+        return path, lambda meshes: export_avatar(path, avatar, self.format, meshes, motion, fps, playback)
 
     def modal(self, context: Any, event: Any) -> set[str]:
         """Export one frame a timer event; Esc cancels."""
@@ -137,16 +148,18 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
             is_running = False if event.type == "ESC" else job.step()
             context.workspace.status_text_set(f"Exporting frame {job.done} of {job.total}   Esc: Cancel")
             if not is_running:
-                return self._end(context, job)
+                return self._end(context)
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: Any) -> None:
         """Blender closes, or the file dialog is left."""
         if self._range is not None:
-            self._end(context, self._range)
+            self._end(context)
 
     @reporting
-    def _end(self, context: Any, job: RangeExport) -> set[str]:
+    def _end(self, context: Any) -> set[str]:
+        job = self._range
+        assert job is not None
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
         if job.finish():

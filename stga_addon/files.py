@@ -131,15 +131,15 @@ def write_json(path: Path, value: Any) -> None:
         partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
-def read_npz(path: Path, max_bytes: int | None = None, max_compression: int = MAX_COMPRESSION) -> dict[str, np.ndarray]:
+def read_npz(path: Path, max_compression: int = MAX_COMPRESSION) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle.
 
-    `max_bytes` bounds the unpacked size, so that a small hostile file cannot fill the memory; by default 128 MiB and
-    `max_compression` times the file's own size.
+    It may unpack to 128 MiB and `max_compression` times its own size, so that a small hostile file cannot fill the
+    memory.
     Raises StgaError naming the file where it is missing, truncated, too large or holds objects.
     """
     size = file_size(path)
-    allowed = MIN_NPZ_ALLOWANCE_BYTES + max_compression * size if max_bytes is None else max_bytes
+    allowed = MIN_NPZ_ALLOWANCE_BYTES + max_compression * size
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())

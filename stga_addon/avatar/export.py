@@ -14,12 +14,13 @@ from .embedding import to_world
 from .file import Avatar
 from .gaussian_avatars import MOTION_NAME, PLY_NAME, write_gaussian_avatars
 from .gltf import write_gltf
+from .playback import DEFAULT_FPS, Playback
 from .ply import PROPERTIES, write_ply
 from .splats import Splats
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
+from .web.write import web_bytes, write_web
 
-DEFAULT_FPS = 25.0
 Meshes = Iterable[tuple[int, np.ndarray]]
 """Pairs of a number and a posed mesh (V, 3) meters."""
 
@@ -45,6 +46,12 @@ FORMATS = {
         "GaussianAvatars", "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads", (), "motion"
     ),
     "usd": Format("USD", "The frames of the scene as an animated particle field", (".usdc", ".usdz"), "range"),
+    "web": Format(
+        "Web Page",
+        "The frames of the scene as a page that plays them, or as data for a server",
+        (".html", ".stga"),
+        "range",
+    ),
     "gltf": Format("glTF", "The current frame, for viewers with KHR_gaussian_splatting", (".glb",), "frame"),
     "spz": Format("SPZ", "The current frame compressed, a tenth of a PLY's size", (".spz",), "frame"),
 }
@@ -57,14 +64,16 @@ def export_avatar(
     meshes: Meshes = (),
     sequence: FlameSequence | None = None,
     fps: float = DEFAULT_FPS,
+    playback: Playback | None = None,
 ) -> list[Path]:
     """Write an avatar in one of FORMATS; returns the files written.
 
     path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its number) and
              "gaussian-avatars" (point_cloud.ply and flame_param.npz)
     meshes   taken one at a time; a "frame" takes the first
-    sequence the FLAME motion, for "gaussian-avatars"
+    sequence the FLAME motion, for "gaussian-avatars"; for "web", where its rig is to go along
     fps      meshes per second
+    playback what else a "web" page shows, and its meshes per second
     Raises StgaError where the format needs what is not given, or a file cannot be written.
     """
     if format == "gaussian-avatars":
@@ -72,6 +81,8 @@ def export_avatar(
             raise StgaError(f"{path}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture")
         write_gaussian_avatars(path, avatar, sequence)
         return [path / PLY_NAME, path / MOTION_NAME]
+    if format == "web":
+        return write_web(path, avatar, playback or Playback(fps=fps), (mesh for _, mesh in meshes), sequence)
     frames = _world_frames(path, avatar, meshes)
     match format:
         case "usd":
@@ -91,6 +102,8 @@ def range_bytes(avatar: Avatar, format: str, frames: int) -> int:
     """Size of the files that a range of frames takes in a format of the source "range"."""
     if format == "usd":
         return usd_bytes(avatar.splats, frames, _has_moving_color(avatar))
+    if format == "web":
+        return web_bytes(avatar)
     return 4 * len(PROPERTIES) * len(avatar.splats) * frames
 
 

@@ -6,6 +6,10 @@ from .embedding import face_areas, face_frames
 from .splats import Splats
 
 NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
+SCALE, FLATNESS = 0.6, 0.5
+"""Standard deviation per spacing of the lattice, and along the normal per that in the triangle's plane."""
+INSET = 0.1
+"""Share of the way to the centroid by which points lie inside their triangle: neighbors' points must not coincide."""
 MIN_SPACING_M = 1e-6  # the scale of splats on a triangle without area still needs a logarithm
 
 
@@ -14,9 +18,6 @@ def lattice_splats(
     faces: np.ndarray,
     order: int = 2,
     sh_degree: int = 3,
-    scale_factor: float = 0.6,
-    flatness: float = 0.5,
-    inset: float = 0.1,
     opacity_logit: float = 0.0,
     convention: str = "stga",
 ) -> Splats:
@@ -24,21 +25,19 @@ def lattice_splats(
 
     neutral (V, 3) meters, faces (F, 3). Order 0 puts one splat on the centroid, order 2 the corners of the four
     triangles that the edge midpoints cut, order 4 their midpoints too (STGA, initialization: 15 a triangle).
-    `inset` is the share of the way to the centroid by which every point is pulled inside its triangle, so that
-    neighboring triangles' points do not coincide. The standard deviation is scale_factor · sqrt(2 · area) / order
-    in the triangle's plane (sqrt(2 · area): the leg of the right isosceles triangle of that area) and
-    `flatness` times that along the normal. Color starts at raw zero: gray.
+    The standard deviation is SCALE · sqrt(2 · area) / order in the triangle's plane (sqrt(2 · area): the leg of the
+    right isosceles triangle of that area). Color starts at raw zero: gray.
     """
-    weights = lattice_weights(order, inset)
+    weights = lattice_weights(order, INSET)
     frames = face_frames(neutral, faces, neutral, convention)
     corners = np.asarray(neutral, np.float64)[faces] - frames.origin[:, None]
     local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING_M)[:, None, None]
     xyz = np.einsum("pc,fci->fpi", weights, local).reshape(-1, 3)
 
     spacing = np.sqrt(2 * face_areas(neutral, faces)) / max(order, 1)
-    sigma = scale_factor * np.maximum(spacing, MIN_SPACING_M) / np.maximum(frames.scale, MIN_SPACING_M)
+    sigma = SCALE * np.maximum(spacing, MIN_SPACING_M) / np.maximum(frames.scale, MIN_SPACING_M)
     stretch = np.ones(3)
-    stretch[NORMAL_AXIS[convention]] = flatness
+    stretch[NORMAL_AXIS[convention]] = FLATNESS
     count = len(xyz)
     return Splats(
         xyz=xyz.astype(np.float32),

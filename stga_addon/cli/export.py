@@ -2,13 +2,15 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..avatar.export import DEFAULT_FPS, FORMATS, Meshes, check_free_space, export_avatar, range_bytes
+from ..avatar.export import FORMATS, Meshes, check_free_space, export_avatar, range_bytes
 from ..avatar.file import Avatar
+from ..avatar.playback import DEFAULT_FPS
 from ..capture.model import Capture
 from ..errors import StgaError
 from ..format import format_bytes
 from ..jobs.delegate import OpenHead
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
+from .export_web import export_web
 from .inputs import open_avatar
 
 NAME, HELP = "export", "write an avatar in another format"
@@ -26,7 +28,13 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--frames", type=frame_span, metavar="FIRST:LAST", help="of a format that holds several (default: all)"
     )
     parser.add_argument(
-        "--fps", type=frame_rate, default=DEFAULT_FPS if head is None else head.fps, help="frames per second of usd"
+        "--fps",
+        type=frame_rate,
+        default=DEFAULT_FPS if head is None else head.fps,
+        help="frames per second of usd and web",
+    )
+    parser.add_argument(
+        "--motion-only", action="store_true", help="web: leave out the blend shapes and skeleton of the FLAME file"
     )
     parser.add_argument("--out", type=usable_path, required=True)
 
@@ -40,6 +48,9 @@ def run(options: Namespace) -> None:
             raise StgaError(
                 f"--{option} cannot be combined with --format {options.format}, only with {', '.join(names)}"
             )
+    if options.format == "web":
+        export_web(avatar, capture, options)
+        return
     if source == "motion":
         meshes: Meshes = ()
     elif source == "range":

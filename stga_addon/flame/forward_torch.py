@@ -9,7 +9,7 @@ from .model import JOINTS, FlameModel
 
 @dataclass(frozen=True)
 class FlameTensors:
-    """A `FlameModel`'s arrays as tensors of one dtype on one device; shapes as there."""
+    """A `FlameModel`'s arrays as tensors of one dtype; shapes as there."""
 
     v_template: torch.Tensor
     shapedirs: torch.Tensor
@@ -19,12 +19,10 @@ class FlameTensors:
     parents: tuple[int, ...]
 
 
-def flame_tensors(
-    model: FlameModel, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> FlameTensors:
-    """The model's arrays on `device`."""
+def flame_tensors(model: FlameModel, dtype: torch.dtype = torch.float32) -> FlameTensors:
+    """The model's arrays on the CPU."""
     names = ("v_template", "shapedirs", "posedirs", "j_regressor", "weights")
-    tensors = {name: torch.as_tensor(getattr(model, name), dtype=dtype, device=device) for name in names}
+    tensors = {name: torch.as_tensor(getattr(model, name), dtype=dtype) for name in names}
     return FlameTensors(**tensors, parents=tuple(model.parents.tolist()))
 
 

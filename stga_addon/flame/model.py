@@ -48,10 +48,10 @@ class FlameModel:
         return int(self.shapedirs.shape[2]) - self.n_identity
 
 
-def read_flame(path: Path, masks: Path | None = None) -> FlameModel:
+def read_flame(path: Path) -> FlameModel:
     """Read a FLAME model from the published .pkl or from an .npz with the same keys.
 
-    Vertex masks come from `masks`, else from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
+    Vertex masks come from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
     beside the model where there is one. Any sizes that agree with each other are accepted. Raises StgaError naming the
     file and key that is missing, of the wrong shape or not finite, and any class in a pickle that is not an array.
     """
@@ -73,7 +73,7 @@ def read_flame(path: Path, masks: Path | None = None) -> FlameModel:
         parents=_parents(path, arrays),
         weights=_floats(path, arrays, "weights", (vertices, len(JOINTS))),
         faces=_faces(path, arrays, vertices),
-        masks=_masks(path, arrays, masks, vertices),
+        masks=_masks(path, arrays, vertices),
     )
 
 
@@ -132,13 +132,12 @@ def _faces(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> np.nd
     return np.ascontiguousarray(faces, np.int32)
 
 
-def _masks(path: Path, arrays: Mapping[str, np.ndarray], given: Path | None, vertices: int) -> dict[str, np.ndarray]:
+def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[str, np.ndarray]:
     source = path
     found = {key[len(MASK_PREFIX) :]: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
     beside = path.with_name(MASK_FILE)
-    if given is not None or (not found and beside.is_file()):
-        source = Path(given) if given is not None else beside
-        found = read_pickled_arrays(source)
+    if not found and beside.is_file():
+        source, found = beside, read_pickled_arrays(beside)
     masks = {}
     for name, ids in found.items():
         flat = _integers(source, name, ids).astype(np.int64)

@@ -122,9 +122,9 @@ def remove_job(run: Path) -> None:
     remove_status_folder(job_folder(run), (JOB, SELECTION, PREVIEW))
 
 
-def worker_arguments(run: Path) -> list[str]:
-    """Arguments of the worker's interpreter, after `-m`."""
-    return ["stga_addon", "job", str(run.resolve())]
+def worker_arguments(folder: Path) -> list[str]:
+    """Arguments of the worker's interpreter, after `-m`; folder: a run with a job, or a video job."""
+    return ["stga_addon", "job", str(folder.resolve())]
 
 
 def run_training_job(run: Path, also: "Report | None" = None) -> Path:

@@ -82,11 +82,6 @@ def is_video_job(folder: Path) -> bool:
     return (folder / VIDEO).is_file()
 
 
-def worker_arguments(folder: Path) -> list[str]:
-    """Arguments of the worker's interpreter, after `-m`."""
-    return ["stga_addon", "job", str(folder.resolve())]
-
-
 def remove_video_job(folder: Path) -> None:
     """Remove the job's files; what it has written stays. Raises StgaError while its worker is running."""
     remove_status_folder(folder, (VIDEO, IMAGES))

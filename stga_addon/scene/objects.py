@@ -15,16 +15,16 @@ Warn = Callable[[str], None]
 log_warning: Warn = logging.getLogger(__name__).warning
 
 
-def capture_root(source: Path, name: str | None = None) -> Any:
+def capture_root(source: Path) -> Any:
     """The Empty that is the parent of all imported from the folder or file `source`; created where there is none.
 
     Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so that its children keep the capture's
-    own coordinates. It is in a collection of its own; both are called `name` (default: source's name).
+    own coordinates. It is in a collection of its own; both are called like the source.
     """
     existing = tags.find(tags.ROOT, source)
     if existing:
         return existing[0]
-    name = name or source.resolve().stem
+    name = source.resolve().stem
     collection = bpy.data.collections.new(name)
     bpy.context.scene.collection.children.link(collection)
     root = bpy.data.objects.new(name, None)

@@ -62,8 +62,8 @@ class TrainingSettings:
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     unbound_scale_limit  the limit of unbound splats, a multiple of the distance between hull points
-    unbound_opacity_weight  of the sum of the unbound splats' opacities over the number of all splats: what few views
-                   see, and other splats explain as well, fades
+    unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points that few cameras
+                   see fade, unless nothing else explains what these cameras see
     distance_weight, distance_limit   the same for the distance from the triangle's origin
     ema_share      share of the latest step in each splat's exponential moving average, which the avatar is made of;
                    1: no averaging
@@ -111,7 +111,7 @@ class TrainingSettings:
     scale_weight: float = setting(1.0, 0, MAX_WEIGHT)
     scale_limit: float = setting(4.0, 0, MAX_WEIGHT)
     unbound_scale_limit: float = setting(5.0, 0, MAX_WEIGHT)
-    unbound_opacity_weight: float = setting(0.03, 0, MAX_WEIGHT)
+    unseen_opacity_weight: float = setting(0.06, 0, MAX_WEIGHT)
     distance_weight: float = setting(0.0, 0, MAX_WEIGHT)
     distance_limit: float = setting(1.0, 0, MAX_WEIGHT)
     ema_share: float = setting(0.05, 0, 1)

@@ -59,7 +59,7 @@ def test_studio_head_evaluates_to_its_tracked_meshes(shared_data):
 
 def test_up_axis_is_z(tmp_path):
     """Fails when the capture's up (y) is not Blender's (z), or when the head is mirrored on the way."""
-    head = import_head(mesh_capture(tmp_path, timesteps=(1,)), name="anna")
+    head = import_head(mesh_capture(tmp_path / "anna", timesteps=(1,)))
     bpy.context.view_layer.update()
     turned = np.array(head.matrix_world)[:3, :3]
     np.testing.assert_allclose(turned @ [0, 1, 0], [0, 0, 1], atol=1e-6)

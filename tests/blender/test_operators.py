@@ -4,12 +4,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from avatar.web.web_data import read_web_data  # noqa: E402
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
@@ -236,6 +238,26 @@ def test_exports_for_other_tools(extension, mesh_capture, tmp_path):
         np.testing.assert_allclose(positions.Get(frame), expected, atol=1e-5)
 
 
+def test_export_of_a_web_page(extension, mesh_capture, tmp_path):
+    """Catches a page of other frames than the scene's, at another rate, or seen from elsewhere than its camera."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene = bpy.context.scene
+    scene.render.fps, scene.frame_start = 30, 1
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web") == {"FINISHED"}
+    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    assert header["fps"] == 30
+    assert len(arrays["translation"]) == 3
+    centers = [open_capture(mesh_capture).mesh(timestep).mean(0) for timestep in (1, 3)]
+    np.testing.assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
+    camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
+    head_to_camera = np.array(scene.camera.matrix_world.inverted() @ scene.stga.head.matrix_world)
+    np.testing.assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
+    up = np.array(scene.stga.head.matrix_world.to_3x3()) @ header["up"]
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-5)
+
+
 def range_export(extension, folder: Path, frames: range, stop_after: int | None = None) -> list[Path]:
     """The files of a range exported step by step, as the dialog does; cancelled after some steps."""
     module = sys.modules[f"{extension.__name__}.operators.export_range"]
@@ -244,9 +266,21 @@ def range_export(extension, folder: Path, frames: range, stop_after: int | None 
         export_avatar(folder, read_avatar(folder.parent / "avatar.npz"), "ply-sequence", meshes)
 
     job = module.RangeExport(bpy.context.scene.stga.head, frames, write)
-    while job.step() and (stop_after is None or job.done < stop_after):
+    operator = sys.modules[f"{extension.__name__}.operators.export"].ExportAvatar
+    said = []
+    context = SimpleNamespace(
+        window_manager=SimpleNamespace(event_timer_remove=said.append),
+        workspace=SimpleNamespace(status_text_set=said.append),
+    )
+    dialog = SimpleNamespace(_range=job, _timer="timer", filepath="", report=lambda kind, text: said.append(text))
+    dialog._end = lambda context: operator._end(dialog, context)
+    result = {"RUNNING_MODAL"}
+    while result == {"RUNNING_MODAL"}:
+        key = "TIMER" if stop_after is None or job.done < stop_after else "ESC"
+        result = operator.modal(dialog, context, SimpleNamespace(type=key))
         time.sleep(0.001)
-    assert job.finish() == (stop_after is None)
+    assert result == ({"FINISHED"} if stop_after is None else {"CANCELLED"})
+    assert said[-3:-1] == ["timer", None]
     return sorted(folder.glob("*.ply"))
 
 

@@ -253,7 +253,7 @@ def test_export_refuses_what_does_not_fit(
     """Catches options that are ignored, and a range that fills the disk."""
     out = ["--out", tmp_path / "o"]
     message = refused(capsys, "export", trained, "--format", "gltf", "--frames", "0:1", *out)
-    assert "--frames cannot be combined with --format gltf, only with ply-sequence, usd" in message
+    assert "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web" in message
     message = refused(capsys, "export", trained, "--format", "usd", "--timestep", 1, *out)
     assert "--timestep cannot be combined with --format usd" in message
     message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)

@@ -34,7 +34,7 @@ from .toys import bits, quick_settings
 
 def settings_of(**changes: Any) -> TrainingSettings:
     """Every term of the loss at work on most splats."""
-    limits = {"scale_limit": 0.2, "distance_weight": 0.1, "distance_limit": 0.3}
+    limits = {"scale_limit": 0.2, "distance_weight": 0.1, "distance_limit": 0.3, "unseen_opacity_weight": 0.5}
     return quick_settings("selective", **{**limits, "strain_color": True, "antialiased": True, **changes})
 
 
@@ -46,6 +46,7 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
         value += torch.randn(value.shape, generator=generator) * (1e-3 if value.ndim == 2 else 0.2)
     state.steps += torch.arange(len(state), dtype=torch.int32) % 7
     state.unbound[::5] = True
+    state.unseen_share[::5] = 0.7
     return state
 
 

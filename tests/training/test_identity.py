@@ -183,20 +183,19 @@ def test_every_command_checks_the_identity(copy: Path, toy: Capture, tmp_path: P
     move_cameras(other)
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
     assert main(["train", str(other), "--out", str(copy), "--resume"]) == 2
-    with pytest.raises(StgaError, match="has other camera poses"):
-        write_job(copy, TrainingJob(other, None, "vhap", None))
-    with pytest.raises(StgaError, match="principal point 'vhap', not 'opencv'"):
-        write_job(copy, TrainingJob(toy.root, None, "opencv", None))
-    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
-    write_job(copy, TrainingJob(toy.root, None, "vhap", None))
-    factory.edit(copy / "job/job.json", lambda document: document.update(capture=str(other)))
+    write_job(copy, TrainingJob(toy.root, None, "opencv", None))
     assert main(["job", str(copy)]) == 2
+    write_job(copy, TrainingJob(other, None, "vhap", None))
+    assert main(["job", str(copy)]) == 2
+    assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
     cameras = str(other / "transforms_test.json")
     assert main(["eval", str(copy)]) == 2
     assert main(["render", str(copy), "--cameras", cameras, "--out", str(tmp_path / "pictures")]) == 2
     assert main(["export", str(copy), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 2
-    assert capsys.readouterr().err.count("other camera poses or intrinsics; train into another folder") == 5
+    told = capsys.readouterr().err
+    assert told.count("other camera poses or intrinsics; train into another folder") == 5
+    assert told.count("principal point 'vhap', not 'opencv'") == 1
     # Another capture that is named drives the avatar: only its triangles must fit.
     assert (
         main(["export", str(copy), "--capture", str(other), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 0

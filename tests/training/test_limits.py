@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stga_addon.raster.cpu.optimizer import distance_limit, scale_limit, unbound_opacity
+from stga_addon.raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.density import reset_strays
 from stga_addon.training.optimize.state import new_state
@@ -65,15 +65,15 @@ def test_distance_limit(scene) -> None:
     np.testing.assert_array_equal(out[untouched], 0.25)
 
 
-def test_opacity_of_unbound_splats(scene) -> None:
-    """Catches a pull on bound or unlisted splats, in the wrong direction, or of the logit instead of the opacity."""
+def test_opacity_weight(scene) -> None:
+    """Catches a pull on unlisted splats, in the wrong direction, without the share, or of the logit itself."""
     splats, rows, _ = scene
-    listed = rows[splats.unbound[rows]]
-    assert 0 < len(listed) < len(rows)
+    share = np.random.default_rng(3).random(50, np.float32)
     x = torch.tensor(splats.opacity, dtype=torch.float64, requires_grad=True)
-    (WEIGHT * torch.sigmoid(x[listed]).sum()).backward()
+    (WEIGHT * torch.from_numpy(share)[rows] * torch.sigmoid(x[rows])).sum().backward()
     out = np.full(50, 0.25, np.float32)
-    unbound_opacity(rows, splats.opacity, splats.unbound, WEIGHT, out)
+    opacity_weight(rows, splats.opacity, share, WEIGHT, out)
+    assert x.grad is not None
     np.testing.assert_allclose(out - 0.25, x.grad.numpy(), rtol=1e-4, atol=1e-6)
 
 

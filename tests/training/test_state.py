@@ -13,7 +13,7 @@ def test_flat_names_round_trip() -> None:
     """Catches a tensor that a checkpoint would lose or put under another's name."""
     state = random_state(9, 5)
     flat = tensors_of(state)
-    assert len(flat) == 5 * 6 + 5
+    assert len(flat) == 5 * 6 + 6
     some = {
         "parameters/xyz",
         "average/sh",

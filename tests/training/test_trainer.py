@@ -12,12 +12,13 @@ import trimesh
 from capture import factory
 from PIL import Image
 
+from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
-from stga_addon.training.optimize.initial_splats import initial_splats
+from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
 from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.schedule import view_order
@@ -223,6 +224,25 @@ def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
     assert full.unbound[len(bare) :].all()
     for name, value in vars(bare).items():
         np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
+
+
+def test_unseen_share(toy: Capture) -> None:
+    """Catches seen taken for unseen, a camera of another timestep, pixels off the image, and shares of bound splats."""
+    splats = initial_splats(toy, quick_settings(lattice=0))
+    splats.unbound[::2] = True
+    splats.xyz[:] += np.random.default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
+    found = unseen_share(toy, "stga", splats)
+    first = toy.views["train"][0].timestep
+    world = to_world(splats, face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")).xyz.astype(np.float64)
+    unseen = []
+    for view in (view for view in toy.views["train"] if view.timestep == first):
+        camera = view.camera
+        x, y, z = camera.world_to_camera[:3, :3] @ world.T + camera.world_to_camera[:3, 3:]
+        column, row = camera.fl_x * x / z + camera.cx, camera.fl_y * y / z + camera.cy
+        unseen.append((z < 0.01) | (column < 0) | (column >= camera.width) | (row < 0) | (row >= camera.height))
+    np.testing.assert_allclose(found[::2], np.mean(unseen, axis=0)[::2], atol=1e-6)
+    assert not found[1::2].any()
+    assert 0.05 < found[::2].mean() < 0.95
 
 
 def test_nothing_beside_the_mesh_gives_no_hull_points(toy: Capture) -> None:

@@ -32,6 +32,7 @@ def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> Trai
         for tensor in part:
             tensor.copy_(torch.rand(tensor.shape, generator=generator))
     state.steps += torch.arange(1, count + 1, dtype=torch.int32)
+    state.unseen_share += torch.rand(count, generator=generator)
     state.screen_gradient += torch.rand(count, generator=generator)
     state.gradient_count += torch.arange(1, count + 1)
     return state

@@ -8,10 +8,13 @@ from PIL import Image
 from tqdm import tqdm
 
 from ...avatar.embedding import to_world
+from ...avatar.export import export_avatar
 from ...avatar.file import Avatar, read_avatar
+from ...avatar.playback import Playback
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
+from ...cli.export_web import capture_views
 from ...effects.plan import with_effect_plan
 from ...errors import StgaError
 from ...files import replacing, write_json
@@ -26,6 +29,8 @@ from .capture import CaptureOptions, make_capture
 from .pictures import selection_picture, side_by_side
 
 SEED = 0
+POSES_PER_SECOND = 1.5
+"""At which the web page plays the capture's expressions, which are single poses."""
 FRAMES_PER_SECOND = 8
 """Of demo.blend: its capture has a second of motion at this rate."""
 MAX_POSITION_ERROR_M = 1e-5
@@ -35,7 +40,8 @@ MAX_POSITION_ERROR_M = 1e-5
 def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -> None:
     """Make a capture of a synthetic head, import it into Blender, select, train, and show the avatar.
 
-    Leaves avatar.npz, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's bpy.
+    Leaves avatar.npz, avatar.html, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's
+    bpy.
     Raises StgaError where the folder cannot be written or Blender places a splat elsewhere than numpy does.
     """
     begin = perf_counter()
@@ -47,12 +53,13 @@ def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -
     avatar = _train(capture, model, out, seconds, selection)
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
+    _page(capture, avatar, selection, out / "avatar.html")
     metrics = _measure(capture, avatar)
     write_json(out / "metrics.json", {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error})
     for split, values in metrics.items():
         print(f"{split}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
     print(f"Blender places the splats within {error:.1e} m of numpy")
-    print(f"{out}: avatar.npz, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
+    print(f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
 
 
 def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
@@ -134,6 +141,17 @@ def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray],
     selected = selection[busiest.timestep]
     picture = selection_picture(avatar, capture.mesh(busiest.timestep), busiest.camera, selected)
     _save(out / "selection.png", to_uint8(picture))
+
+
+def _page(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], path: Path) -> None:
+    """Write the web page, which blends from one of the capture's few poses to the next."""
+    playback = Playback(
+        title="STGA demo head",
+        fps=POSES_PER_SECOND,
+        views=capture_views(capture),
+        selection=[selection[timestep] for timestep in capture.timesteps],
+    )
+    export_avatar(path, avatar, "web", sequence=capture.flame, playback=playback)
 
 
 def _save(path: Path, pixels: np.ndarray) -> None:

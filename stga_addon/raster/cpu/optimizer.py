@@ -101,13 +101,15 @@ def scale_limit(rows, log_scale, face, unbound, limits, weight, gradient):
 
 
 @jit
-def unbound_opacity(rows, opacity, unbound, weight, gradient):
-    """weight · Σ sigmoid(opacity) over the unbound ones of the listed rows; its gradient is added to gradient (N,)."""
+def opacity_weight(rows, opacity, share, weight, gradient):
+    """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).
+
+    share (N,) float32.
+    """
     for n in range(len(rows)):
         i = rows[n]
-        if unbound[i]:
-            value = ONE / (ONE + math.exp(-opacity[i]))
-            gradient[i] += np.float32(weight) * value * (ONE - value)
+        value = ONE / (ONE + math.exp(-opacity[i]))
+        gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
 
 
 @jit

@@ -125,19 +125,19 @@ def scale_limit(
 
 
 @wp.kernel
-def unbound_opacity(
+def opacity_weight(
     wanted: wp.array[wp.uint8],
-    unbound: wp.array[wp.uint8],
     opacity: wp.array[wp.float32],
+    share: wp.array[wp.float32],
     weight: wp.float32,
     gradient: wp.array[wp.float32],
 ):
-    """Add the gradient of weight · Σ sigmoid(opacity) over the unbound splats."""
+    """Add the gradient of weight · Σ share · sigmoid(opacity)."""
     i = wp.tid()
-    if wanted[i] == UNMARKED or unbound[i] == UNMARKED:
+    if wanted[i] == UNMARKED:
         return
     value = 1.0 / (1.0 + wp.exp(-opacity[i]))
-    gradient[i] = gradient[i] + weight * value * (1.0 - value)
+    gradient[i] = gradient[i] + weight * share[i] * value * (1.0 - value)
 
 
 @wp.kernel

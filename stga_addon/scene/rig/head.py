@@ -13,7 +13,7 @@ from ..objects import Warn, capture_root, log_warning, place, reset
 from .flame_rig import add_rig, remove_rig
 
 
-def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warning, correctives: str = "all") -> Any:
+def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "all") -> Any:
     """The capture's head as a mesh object, animated so that Blender's frame number is the capture's timestep.
 
     A FLAME capture becomes a rig (see `flame_rig.add_rig`); any other gets one shape key per timestep, `t00012`, with
@@ -26,20 +26,20 @@ def import_head(capture: Capture, name: str | None = None, warn: Warn = log_warn
     sequence = capture.flame
     if sequence is not None:
         frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-        head = _place_head(capture, name)
+        head = _place_head(capture)
         add_rig(head, sequence, frames, warn, correctives)
         return head
     meshes = np.empty((len(capture.timesteps), *capture.neutral.shape), np.float32)
     for row, timestep in enumerate(capture.timesteps):
         meshes[row] = capture.mesh(timestep)
-    head = _place_head(capture, name)
+    head = _place_head(capture)
     remove_rig(head)
     _add_timestep_keys(head, capture.timesteps, meshes)
     return head
 
 
-def _place_head(capture: Capture, name: str | None) -> Any:
-    root = capture_root(capture.root, name)
+def _place_head(capture: Capture) -> Any:
+    root = capture_root(capture.root)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
     if head is not None and has_triangles(head.data, capture.faces):
         _update_mesh(head, capture)

@@ -6,7 +6,7 @@ from ...avatar.embedding import frame_backward
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import distance_limit, scale_limit, unbound_opacity
+from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..settings import TrainingSettings
 from . import adam
@@ -105,9 +105,10 @@ class CpuBackend:
         if settings.scale_weight:
             gradient, log_scale = state.gradients.log_scale.numpy(), state.parameters.log_scale.numpy()
             scale_limit(rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient)
-        if settings.unbound_opacity_weight:
-            weight, gradient = settings.unbound_opacity_weight / len(state), state.gradients.opacity.numpy()
-            unbound_opacity(rows, state.parameters.opacity.numpy(), unbound, weight, gradient)
+        if settings.unseen_opacity_weight:
+            opacity, gradient = state.parameters.opacity.numpy(), state.gradients.opacity.numpy()
+            weight = settings.unseen_opacity_weight / len(state)
+            opacity_weight(rows, opacity, state.unseen_share.numpy(), weight, gradient)
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._units
             gradient = state.gradients.xyz.numpy()

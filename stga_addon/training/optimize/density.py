@@ -22,8 +22,9 @@ def control_density(
     """Split the splats with the largest mean screen gradient and prune those of low opacity.
 
     budget: how many splats may be added; max_share: largest share of the splats that is split. Every triangle with
-    bound splats keeps one. Children inherit triangle and binding, lie within the parent's Gaussian in local units, and
-    keep Adam's second moment and step count, without which their first steps would all be as long as the rate.
+    bound splats keeps one. Children inherit triangle, binding and unseen share, lie within the parent's Gaussian in
+    local units, and keep Adam's second moment and step count, without which their first steps would all be as long as
+    the rate.
     """
     gradient = (state.screen_gradient / state.gradient_count.clamp_min(1)).numpy()
     count = max(0, min(budget, int(max_share * len(state))))
@@ -31,7 +32,12 @@ def control_density(
     split = split[gradient[split] > 0]
     parents = keep_rows(state, torch.from_numpy(split))
     pairs = join(parents, parents)
-    children = replace(new_state(_halves(parents.splats(), rng)), second=pairs.second, steps=pairs.steps)
+    children = replace(
+        new_state(_halves(parents.splats(), rng)),
+        second=pairs.second,
+        steps=pairs.steps,
+        unseen_share=pairs.unseen_share,
+    )
     keep = ~_prunable(state)
     keep[split] = False
     state = join(keep_rows(state, torch.from_numpy(keep)), children)

@@ -48,6 +48,7 @@ class _DeviceState:
     steps: wp.array
     face: wp.array
     unbound: wp.array
+    unseen_share: wp.array
     screen_gradient: wp.array
     gradient_count: wp.array
 
@@ -115,6 +116,7 @@ class GpuBackend:
             steps=_tensor(state.steps),
             face=_tensor(state.face),
             unbound=_tensor(state.unbound).bool(),
+            unseen_share=_tensor(state.unseen_share),
             screen_gradient=_tensor(state.screen_gradient),
             gradient_count=_tensor(state.gradient_count),
         )
@@ -142,6 +144,7 @@ class GpuBackend:
                 steps=array(state.steps, wp.int32),
                 face=array(state.face, wp.int32),
                 unbound=array(state.unbound.to(torch.uint8), wp.uint8),
+                unseen_share=array(state.unseen_share, wp.float32),
                 screen_gradient=array(state.screen_gradient, wp.float32),
                 gradient_count=array(state.gradient_count, wp.float32),
             )
@@ -264,11 +267,10 @@ class GpuBackend:
             launch(optimizer.scale_excess, n, *given, squares)
             wp.utils.array_sum(squares, out=square)
             launch(optimizer.scale_limit, n, *given, settings.scale_weight, square, _rows(state.gradients).log_scale)
-        if settings.unbound_opacity_weight:
-            weight, gradient = settings.unbound_opacity_weight / n, _rows(state.gradients).opacity
-            launch(
-                optimizer.unbound_opacity, n, wanted, state.unbound, _rows(state.parameters).opacity, weight, gradient
-            )
+        if settings.unseen_opacity_weight:
+            opacity, gradient = _rows(state.parameters).opacity, _rows(state.gradients).opacity
+            weight = settings.unseen_opacity_weight / n
+            launch(optimizer.opacity_weight, n, wanted, opacity, state.unseen_share, weight, gradient)
         if settings.distance_weight:
             given = wanted, state.unbound, xyz, state.face, self._distance_limit
             launch(optimizer.distance_excess, n, *given, squares)

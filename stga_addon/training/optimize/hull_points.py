@@ -104,6 +104,11 @@ def _foreground(view: View) -> np.ndarray:
     return np.asarray((read_image(view) < 247).any(axis=2))
 
 
+def in_image(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N,) bool: whether world points (N, 3) lie in the camera's image."""
+    return _pixels(points, camera)[2]
+
+
 def _pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in the image."""
     pixels, depth = camera.project(points)

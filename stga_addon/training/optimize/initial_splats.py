@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...avatar.embedding import face_frames, to_world
 from ...avatar.lattice import lattice_splats
 from ...avatar.splats import Splats
 from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.model import Capture
 from ..settings import TrainingSettings
-from .hull_points import hull_points
+from .hull_points import hull_points, in_image
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
@@ -27,6 +28,22 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     strains = STRAIN_COMPONENTS if settings.strain_color else 0
     parts = [replace(part, strain_color=np.zeros((len(part), strains, 3), np.float32)) for part in parts]
     return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
+
+
+def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarray:
+    """Share (N,) of the cameras of the first training timestep in whose image an unbound splat does not lie.
+
+    0 for bound splats. A hull point outside of most images is held by few masks only, and often in the air.
+    """
+    share, unbound = np.zeros(len(splats), np.float32), np.flatnonzero(splats.unbound)
+    if not len(unbound):
+        return share
+    first = capture.views["train"][0].timestep
+    views = [view for view in capture.views["train"] if view.timestep == first]
+    frames = face_frames(capture.mesh(first), capture.faces, capture.neutral, convention)
+    points = to_world(splats.rows(unbound), frames).xyz.astype(np.float64)
+    share[unbound] = 1 - np.mean([in_image(points, view.camera) for view in views], axis=0)
+    return share
 
 
 def teeth_triangles(capture: Capture) -> np.ndarray:

@@ -13,7 +13,7 @@ from ...capture.camera import Camera
 from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
-from ...raster.cpu.optimizer import distance_limit, scale_limit, unbound_opacity
+from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
 from ...worker.launch import same_interpreter_environment
@@ -119,6 +119,7 @@ def _limit() -> None:
     face, unbound = state.face.numpy(), state.unbound.numpy()
     limits, log_scale = np.ones((2, 1), np.float32), state.parameters.log_scale.numpy()
     scale_limit(rows, log_scale, face, unbound, limits, 1.0, state.gradients.log_scale.numpy())
-    unbound_opacity(rows, state.parameters.opacity.numpy(), unbound, 1.0, state.gradients.opacity.numpy())
+    opacity, share = state.parameters.opacity.numpy(), state.unseen_share.numpy()
+    opacity_weight(rows, opacity, share, 1.0, state.gradients.opacity.numpy())
     xyz, gradient = state.parameters.xyz.numpy(), state.gradients.xyz.numpy()
     distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradient)

@@ -19,6 +19,8 @@ class TrainState:
     average  running average of the parameters over their steps, from which the avatar is made
     steps    (N,) int32 Adam steps per row
     face, unbound    (N,) int32 and (N,) bool, as in `Splats`
+    unseen_share     (N,) float32 share of the cameras that did not see an unbound splat where training put it or its
+                     parent; 0 for bound splats
     screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density control
     gradient_count   (N,) float32 number of summands
     """
@@ -31,6 +33,7 @@ class TrainState:
     steps: torch.Tensor
     face: torch.Tensor
     unbound: torch.Tensor
+    unseen_share: torch.Tensor
     screen_gradient: torch.Tensor
     gradient_count: torch.Tensor
 
@@ -54,8 +57,8 @@ class TrainState:
         return Splats(**arrays, face=self.face.numpy().copy(), unbound=self.unbound.numpy().copy())
 
 
-def new_state(splats: Splats) -> TrainState:
-    """A copy of the splats with zero moments."""
+def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainState:
+    """A copy of the splats with zero moments; unseen_share (N,), zeros if None."""
     values = [torch.from_numpy(getattr(splats, name).astype(np.float32)) for name in Parameters._fields]
     n = len(splats)
 
@@ -71,6 +74,7 @@ def new_state(splats: Splats) -> TrainState:
         steps=torch.zeros(n, dtype=torch.int32),
         face=torch.from_numpy(splats.face.astype(np.int32)),
         unbound=torch.from_numpy(splats.unbound.astype(bool)),
+        unseen_share=torch.zeros(n) if unseen_share is None else torch.from_numpy(unseen_share.astype(np.float32)),
         screen_gradient=torch.zeros(n),
         gradient_count=torch.zeros(n),
     )

@@ -10,7 +10,7 @@ from ..settings import TrainingSettings
 from .backend import Batch
 from .device import make_backend
 from .frames import FrameStore
-from .initial_splats import initial_splats
+from .initial_splats import initial_splats, unseen_share
 from .losses import limit_units
 from .state import TrainState, new_state
 from .strategies import DensityControl, PostStep, StrayReset, make_strategy
@@ -42,7 +42,9 @@ class Trainer:
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
         self._limit_units = limit_units(capture, settings.convention)
-        state = new_state(initial_splats(capture, settings)) if state is None else state
+        if state is None:
+            splats = initial_splats(capture, settings)
+            state = new_state(splats, unseen_share(capture, settings.convention, splats))
         self._backend = make_backend(device, settings, self._limit_units, self.frames, state)
         self.initial_count = len(self)
 

@@ -3,7 +3,7 @@
 run.json        what is trained, with which settings
 selection.npz   timestep -> selected triangles
 checkpoint.npz  the whole state of training
-avatar.npz      the best avatar so far, by the evaluation views
+avatar.npz      the sharpest avatar so far, by the evaluation views; without them the latest
 tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
 metrics.jsonl   one line per evaluation
 """

@@ -248,7 +248,7 @@ class _Loop:
         return self.settings.stop_when_flat and plateau_start(curve) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
-        """Measure the evaluation views, keep the avatar if it is the best so far, and append a line of metrics."""
+        """Measure the evaluation views, keep the avatar if it is the sharpest so far, and append a line of metrics."""
         share = min(1.0, self._share())
         self.evaluations = max(self.evaluations, int(share * EVALUATIONS))
         begin = perf_counter()

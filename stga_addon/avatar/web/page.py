@@ -1,0 +1,47 @@
+"""The web page of an avatar: player, styles and data in one HTML file that asks for nothing else."""
+
+import base64
+import html
+import re
+from functools import cache
+from pathlib import Path
+
+PLAYER = Path(__file__).parent / "player"
+MODULES = (
+    "data.js",
+    "rotation.js",
+    "motion.js",
+    "rig.js",
+    "face_frames.js",
+    "depth_sort.js",
+    "shaders.js",
+    "renderer.js",
+    "camera.js",
+    "player.js",
+    "controls.js",
+    "stga-avatar.js",
+)
+"""Modules of the custom element, each after those that it imports."""
+IMPORT = re.compile(r"^import\b[^;]*?'\./[\w-]+\.js';\n", re.MULTILINE)
+EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
+
+
+@cache
+def element_script() -> str:
+    """The custom element as one module: the player's files without their imports and exports, under their licence."""
+    sources = [EXPORT.sub("", IMPORT.sub("", (PLAYER / name).read_text(encoding="utf-8"))) for name in MODULES]
+    licence = (PLAYER / "LICENSE").read_text(encoding="utf-8")
+    return "/*!\n" + licence + "*/\n" + "\n".join(sources)
+
+
+def page(title: str, notice: str, data: bytes) -> str:
+    """The HTML of a page that plays `data` (`data_file`); `notice`: a sentence on its licence, or ""."""
+    template = (PLAYER / "page.html").read_text(encoding="utf-8")
+    parts = {
+        "title": html.escape(title),
+        "notice": html.escape(notice),
+        "style": (PLAYER / "page.css").read_text(encoding="utf-8"),
+        "script": element_script() + "\n" + IMPORT.sub("", (PLAYER / "page.js").read_text(encoding="utf-8")),
+        "data": base64.b64encode(data).decode("ascii"),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)

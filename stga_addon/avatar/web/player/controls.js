@@ -1,0 +1,73 @@
+// Orbit, pan and zoom with mouse, pen and touch.
+
+import { dollied, orbited, panned } from './camera.js';
+
+const ORBIT_PER_PIXEL = 0.008; // radians
+const ZOOM_PER_WHEEL_PIXEL = 0.0012;
+const WHEEL_LINE_PX = 16;
+const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
+
+/** Let pointers on `element` move the camera of the player that `player()` gives; `changed()` after each move. */
+export function addControls(element, player, changed) {
+  const pointers = new Map();
+  element.addEventListener('contextmenu', (event) => event.preventDefault());
+  element.addEventListener('pointerdown', (event) => {
+    element.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  });
+  for (const name of ['pointerup', 'pointercancel']) {
+    element.addEventListener(name, (event) => pointers.delete(event.pointerId));
+  }
+  element.addEventListener('pointermove', (event) => {
+    if (!pointers.has(event.pointerId) || !player()) return;
+    const before = [...pointers.values()];
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    const after = [...pointers.values()];
+    if (after.length === 1) drag(player(), element, before[0], after[0], event.shiftKey || event.buttons > 1);
+    else pinch(player(), element, before, after);
+    changed();
+  });
+  element.addEventListener(
+    'wheel',
+    (event) => {
+      if (!player()) return;
+      event.preventDefault();
+      const pixels = event.deltaY * (event.deltaMode === 1 ? WHEEL_LINE_PX : 1);
+      const limited = Math.max(-MAX_WHEEL_PX, Math.min(MAX_WHEEL_PX, pixels));
+      zoomBy(player(), Math.exp(limited * ZOOM_PER_WHEEL_PIXEL));
+      changed();
+    },
+    { passive: false },
+  );
+}
+
+export function orbitBy(player, dx, dy) {
+  const { up } = player.data.header;
+  player.camera = orbited(player.camera, player.pivot, up, -dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
+}
+
+export function zoomBy(player, factor) {
+  player.camera = dollied(player.camera, player.pivot, factor);
+}
+
+function drag(player, element, before, after, pans) {
+  const [dx, dy] = [after[0] - before[0], after[1] - before[1]];
+  if (pans) panBy(player, element, dx, dy);
+  else orbitBy(player, dx, dy);
+}
+
+/** Two fingers: their middle pans, their distance zooms. */
+function pinch(player, element, before, after) {
+  const middle = ([a, b]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
+  const distance = ([a, b]) => Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));
+  const [from, to] = [middle(before), middle(after)];
+  panBy(player, element, to[0] - from[0], to[1] - from[1]);
+  zoomBy(player, distance(before) / distance(after));
+}
+
+/** Pan by pixels of the page, of which a pixel of the camera may be several. */
+function panBy(player, element, dx, dy) {
+  const { size } = player.camera;
+  const scale = Math.max(size[0] / element.clientWidth, size[1] / element.clientHeight);
+  [player.camera, player.pivot] = panned(player.camera, player.pivot, dx * scale, dy * scale);
+}

@@ -1,0 +1,193 @@
+// Reading of web data files: container, arrays, and checks of everything that the player relies on.
+
+export class DataError extends Error {}
+
+const VERSION = 1;
+const MAX_BYTES = 1 << 30;
+const MAX_HEADER_BYTES = 1 << 24;
+const CHANNELS = 3;
+
+/** Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence. */
+export async function readData(bytes) {
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) throw new DataError('This is not an avatar data file.');
+  const raw = await inflate(bytes);
+  const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
+  if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741)
+    throw new DataError('This is not an avatar data file.');
+  const version = view.getUint32(4, true);
+  if (version !== VERSION)
+    throw new DataError(`The avatar has format version ${version}; this player reads ${VERSION}.`);
+  const length = view.getUint32(8, true);
+  if (length > MAX_HEADER_BYTES || 12 + length > raw.length) throw new DataError('The avatar data is cut off.');
+  const header = parseHeader(raw.subarray(12, 12 + length));
+  const arrays = readArrays(header, raw.subarray(12 + length));
+  checkData(header, arrays);
+  return { header, arrays };
+}
+
+async function inflate(bytes) {
+  const chunks = [];
+  let size = 0;
+  try {
+    const reader = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip')).getReader();
+    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+      chunks.push(part.value);
+      size += part.value.length;
+      if (size > MAX_BYTES) throw new DataError('The avatar data is too large.');
+    }
+  } catch (error) {
+    throw error instanceof DataError ? error : new DataError('The avatar data is damaged.');
+  }
+  const raw = new Uint8Array(size);
+  let at = 0;
+  for (const chunk of chunks) {
+    raw.set(chunk, at);
+    at += chunk.length;
+  }
+  return raw;
+}
+
+function parseHeader(bytes) {
+  try {
+    const header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(bytes));
+    if (header && header.format === 'stga-web' && header.version === VERSION) return header;
+  } catch {
+    // reported below
+  }
+  throw new DataError('The header of the avatar data is damaged.');
+}
+
+function readArrays(header, payload) {
+  const arrays = {};
+  let at = 0;
+  for (const [name, entry] of Object.entries(object(header.arrays, 'arrays'))) {
+    const shape = list(object(entry, name).shape, `${name}.shape`);
+    require(shape.every((size) => Number.isSafeInteger(size) && size >= 0), `${name}.shape`);
+    const count = shape.reduce((product, size) => product * size, 1);
+    const planes = entry.type === 'float32' ? 4 : entry.planes;
+    require(Number.isInteger(planes) && planes >= 1 && planes <= 4, `${name}.planes`);
+    if (!(at + planes * count <= payload.length)) throw new DataError('The avatar data is cut off.');
+    const block = payload.subarray(at, at + planes * count);
+    arrays[name] = { shape, values: decoded(name, entry, block, count) };
+    at += planes * count;
+  }
+  return arrays;
+}
+
+function decoded(name, entry, block, count) {
+  if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
+  const step = entry.type === 'fixed' ? entry.step : 1;
+  require((entry.type === 'fixed' || entry.type === 'integer') && step > 0 && Number.isFinite(step), `${name}.type`);
+  require(Number.isSafeInteger(entry.low), `${name}.low`);
+  const values = entry.type === 'fixed' ? new Float32Array(count) : new Int32Array(count);
+  const columns = count ? (entry.shape.at(-1) ?? 1) : 0;
+  let from = 0;
+  for (let column = 0; column < columns; column++) {
+    for (let to = column; to < count; to += columns, from++) {
+      let integer = 0;
+      for (let plane = entry.planes - 1; plane >= 0; plane--) integer = integer * 256 + block[plane * count + from];
+      values[to] = (integer + entry.low) * step;
+    }
+  }
+  return values;
+}
+
+/** Throw a DataError unless header and arrays fit each other and hold usable values. */
+export function checkData(header, arrays) {
+  const splats = size(arrays, 'xyz', 0);
+  const vertices = size(arrays, 'base', 0);
+  const faces = size(arrays, 'faces', 0);
+  const shapes = size(arrays, 'basis', 0);
+  const frames = size(arrays, 'coefficients', 0);
+  const joints = list(header.parents, 'parents').length;
+  require(vertices > 0 && faces > 0 && joints > 0 && frames > 0, 'number of vertices, triangles, joints or frames');
+  const shapesOf = {
+    xyz: [splats, 3],
+    rotation: [splats, 3],
+    rotation_largest: [splats],
+    log_scale: [splats, 3],
+    opacity: [splats],
+    color: [splats, CHANNELS],
+    faces: [faces, 3],
+    neutral: [vertices, 3],
+    splats_per_face: [faces],
+    base: [vertices, 3],
+    basis: [shapes, vertices, 3],
+    correctives: [9 * (joints - 1), vertices, 3],
+    weights: [vertices, joints],
+    joint_rest: [joints, 3],
+    joint_basis: [shapes, joints, 3],
+    coefficients: [frames, shapes],
+    pose: [frames, joints, 3],
+    translation: [frames, 3],
+  };
+  if (arrays.selection) shapesOf.selection = [frames, Math.ceil(faces / 8)];
+  if (arrays.strain_color) shapesOf.strain_color = [splats, 3 * CHANNELS];
+  if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
+  for (const [name, shape] of Object.entries(shapesOf)) checkArray(arrays, name, shape);
+  require(!arrays.sh || [9, 24, 45].includes(arrays.sh.shape[1]), 'sh');
+  checkRange(arrays.faces.values, vertices, 'faces');
+  checkRange(arrays.rotation_largest.values, 4, 'rotation_largest');
+  checkRange(arrays.splats_per_face.values, splats + 1, 'splats_per_face');
+  require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) === splats, 'splats_per_face');
+  require(header.parents.every(
+    (parent, joint) => parent === -1 || (Number.isInteger(parent) && parent >= 0 && parent < joint),
+  ), 'parents');
+  checkHeader(header, joints, shapes);
+}
+
+function checkHeader(header, joints, shapes) {
+  require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
+  require(typeof header.antialiased === 'boolean', 'antialiased');
+  require(typeof header.title === 'string', 'title');
+  require(header.fps > 0 && header.fps <= 1000, 'fps');
+  require(numbers(header.background, 3) && header.background.every((value) => value >= 0 && value <= 1), 'background');
+  require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
+  require(list(header.joints, 'joints').length === joints, 'joints');
+  for (const slider of list(header.sliders, 'sliders')) {
+    require(typeof slider?.name === 'string' &&
+      slider.reach > 0 &&
+      slider.component >= 0 &&
+      slider.component < shapes, 'sliders');
+  }
+  for (const view of list(header.views, 'views')) {
+    require(typeof view?.name === 'string' && numbers(view.size, 2) && Math.min(...view.size) >= 1, 'views');
+    require(numbers(view.focal, 2) && Math.min(...view.focal) > 0 && numbers(view.center, 2), 'views');
+    require(numbers(view.world_to_camera, 16), 'views');
+  }
+}
+
+function checkArray(arrays, name, shape) {
+  const array = arrays[name];
+  require(array &&
+    array.shape.length === shape.length &&
+    shape.every((size, axis) => size === array.shape[axis]), name);
+  if (array.values instanceof Float32Array) require(array.values.every(Number.isFinite), name);
+}
+
+function checkRange(values, past, name) {
+  require(values.every((value) => Number.isInteger(value) && value >= 0 && value < past), name);
+}
+
+function size(arrays, name, axis) {
+  require(arrays[name] && arrays[name].shape.length > axis, name);
+  return arrays[name].shape[axis];
+}
+
+function numbers(value, count) {
+  return Array.isArray(value) && value.length === count && value.every(Number.isFinite);
+}
+
+function list(value, name) {
+  require(Array.isArray(value), name);
+  return value;
+}
+
+function object(value, name) {
+  require(value !== null && typeof value === 'object', name);
+  return value;
+}
+
+function require(holds, field) {
+  if (!holds) throw new DataError(`The avatar data is damaged: ${field} is missing or malformed.`);
+}

@@ -1,0 +1,96 @@
+// One avatar on one canvas: follows motion and camera, and draws when something has changed.
+
+import { cameraOfView, fitted, frontCamera, bounds } from './camera.js';
+import { DepthSort } from './depth_sort.js';
+import { FaceFrames } from './face_frames.js';
+import { Motion } from './motion.js';
+import { Renderer, RendererError } from './renderer.js';
+import { Rig } from './rig.js';
+
+const TIMING_SHARE = 0.1; // of the newest frame in the running mean
+
+export class Player {
+  /** `data` of readData. Throws RendererError where the browser cannot draw it. */
+  constructor(canvas, data) {
+    const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
+    this.gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
+    if (!this.gl)
+      throw new RendererError('This page needs WebGL 2, which this browser or graphics driver does not offer.');
+    const { header, arrays } = data;
+    this.canvas = canvas;
+    this.data = data;
+    this.motion = new Motion(data);
+    this.rig = new Rig(data);
+    const withStrain = Boolean(arrays.strain_color);
+    this.faceFrames = new FaceFrames(arrays.faces.values, arrays.neutral.values, header.convention, withStrain);
+    this.depthSort = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values);
+    this.renderer = new Renderer(this.gl, data);
+    this.background = [...header.background, 1];
+    this.showSelection = false;
+    this.posed = null; // frame that faceFrames hold
+    this.frame = 0;
+    this.milliseconds = 0;
+    this.pose();
+    [this.middle] = bounds(this.rig.vertices);
+    const [view] = header.views;
+    this.home = view ? cameraOfView(view) : frontCamera(this.rig.vertices, header.up);
+    this.resetCamera();
+  }
+
+  get frameCount() {
+    return this.motion.frames;
+  }
+
+  resetCamera() {
+    this.camera = this.home;
+    this.pivot = this.middle;
+  }
+
+  /** Draw the current frame on the canvas. */
+  draw() {
+    const begin = performance.now();
+    const camera = fitted(this.camera, this.canvas.width, this.canvas.height);
+    const order = this.prepare(camera);
+    this.renderer.draw(order, camera, this.background, this.showSelection);
+    const spent = performance.now() - begin;
+    this.milliseconds += (this.milliseconds ? TIMING_SHARE : 1) * (spent - this.milliseconds);
+  }
+
+  /** Pixels of the current frame from `camera`, which has its own size (Renderer.read). */
+  read(camera) {
+    return this.renderer.read(this.prepare(camera), camera, this.background, this.showSelection);
+  }
+
+  /** Forget the pose, because pinned values have changed. */
+  invalidate() {
+    this.posed = null;
+  }
+
+  prepare(camera) {
+    this.pose();
+    const values = this.renderer.frameValues;
+    this.faceFrames.compose(camera.matrix, values);
+    return this.depthSort.sort(values);
+  }
+
+  pose() {
+    if (this.posed === this.frame) return;
+    this.motion.sample(this.frame);
+    const { coefficients, pose, translation } = this.motion;
+    this.faceFrames.update(this.rig.pose(coefficients, pose, translation));
+    this.faceFrames.annotate(this.selectionBits(), this.renderer.frameValues);
+    this.posed = this.frame;
+  }
+
+  selectionBits() {
+    const { selection } = this.data.arrays;
+    if (!selection) return null;
+    const [, bytes] = selection.shape;
+    const first = bytes * Math.min(Math.round(this.frame), this.frameCount - 1);
+    return selection.values.subarray(first, first + bytes);
+  }
+
+  dispose() {
+    this.renderer.dispose();
+  }
+}

@@ -1,0 +1,251 @@
+// Splats on a WebGL2 canvas: blended back to front into a float target, then over the background.
+
+import {
+  FACE_TEXELS,
+  OVER_FRAGMENT_SHADER,
+  OVER_VERTEX_SHADER,
+  SPLAT_FRAGMENT_SHADER,
+  SPLAT_TEXELS,
+  TEXTURE_WIDTH,
+  splatVertexShader,
+  tailTexels,
+} from './shaders.js';
+
+const SH_C0 = 0.28209479177387814;
+
+export class RendererError extends Error {}
+
+export class Renderer {
+  /** Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw them. */
+  constructor(gl, data) {
+    if (!gl.getExtension('EXT_color_buffer_float')) {
+      throw new RendererError('This browser cannot draw to float textures, which the avatar needs.');
+    }
+    this.gl = gl;
+    const { arrays, header } = data;
+    this.antialiased = header.antialiased;
+    this.count = arrays.xyz.shape[0];
+    this.faces = arrays.faces.shape[0];
+    const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
+    const strains = arrays.strain_color ? 3 : 0;
+    this.splatProgram = program(gl, splatVertexShader(harmonics, strains), SPLAT_FRAGMENT_SHADER);
+    this.overProgram = program(gl, OVER_VERTEX_SHADER, OVER_FRAGMENT_SHADER);
+    this.splatTexture = texture(gl, gl.RGBA32F, splatTexels(arrays));
+    this.tailTexture = texture(gl, gl.RGBA16F, tailValues(arrays, tailTexels(harmonics, strains)));
+    this.frameValues = new Float32Array(paddedLength(this.faces * FACE_TEXELS));
+    this.frameTexture = texture(gl, gl.RGBA32F, this.frameValues);
+    this.makeIndexArray();
+    this.target = null;
+    this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
+  }
+
+  makeIndexArray() {
+    const gl = this.gl;
+    this.vertexArray = gl.createVertexArray();
+    gl.bindVertexArray(this.vertexArray);
+    this.indexBuffer = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+  }
+
+  /**
+   * Draw `order` (back to front) of the splats on the frames in `frameValues`.
+   * camera: { size, focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas;
+   * format: of the target in which they are blended.
+   */
+  draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
+    const gl = this.gl;
+    const [width, height] = camera.size;
+    this.resizeTarget(width, height, format);
+    this.upload(order);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.drawSplats(camera, showSelection);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.useProgram(this.overProgram.program);
+    bindTexture(gl, 0, this.target.texture, this.overProgram.uniforms.uPicture);
+    const [red, green, blue, alpha] = background;
+    gl.uniform4f(this.overProgram.uniforms.uBackground, red * alpha, green * alpha, blue * alpha, alpha);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  upload(order) {
+    const gl = this.gl;
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.frameTexture);
+    const rows = this.frameValues.length / (4 * TEXTURE_WIDTH);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, this.frameValues);
+    gl.bindVertexArray(this.vertexArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+  }
+
+  drawSplats(camera, showSelection) {
+    const gl = this.gl;
+    const { program, uniforms } = this.splatProgram;
+    gl.useProgram(program);
+    bindTexture(gl, 0, this.frameTexture, uniforms.uFaces);
+    bindTexture(gl, 1, this.splatTexture, uniforms.uSplats);
+    bindTexture(gl, 2, this.tailTexture, uniforms.uTail);
+    const m = camera.matrix;
+    // Rows of world to camera are columns of its transpose, camera to world.
+    gl.uniformMatrix3fv(uniforms.uToWorld, false, [m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]]);
+    gl.uniform2f(uniforms.uFocal, ...camera.focal);
+    gl.uniform2f(uniforms.uCenter, ...camera.center);
+    gl.uniform2f(uniforms.uSize, ...camera.size);
+    gl.uniform1i(uniforms.uAntialiased, this.antialiased);
+    gl.uniform1i(uniforms.uShowSelection, showSelection);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.disable(gl.BLEND);
+  }
+
+  resizeTarget(width, height, format) {
+    const { target } = this;
+    if (target?.width === width && target.height === height && target.format === format) return;
+    if (target) deleteTarget(this.gl, target);
+    this.target = makeTarget(this.gl, format, width, height);
+  }
+
+  /** The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied with alpha. */
+  read(order, camera, background, showSelection) {
+    const gl = this.gl;
+    const [width, height] = camera.size;
+    const copy = makeTarget(gl, gl.RGBA8, width, height);
+    this.draw(order, camera, background, showSelection, copy.framebuffer, this.finest);
+    const flipped = new Uint8Array(4 * width * height);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, flipped);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    deleteTarget(gl, copy);
+    const pixels = new Uint8ClampedArray(flipped.length);
+    for (let row = 0; row < height; row++) {
+      const from = 4 * width * (height - 1 - row);
+      pixels.set(flipped.subarray(from, from + 4 * width), 4 * width * row);
+    }
+    return pixels;
+  }
+
+  dispose() {
+    const gl = this.gl;
+    for (const item of [this.splatTexture, this.tailTexture, this.frameTexture]) gl.deleteTexture(item);
+    gl.deleteBuffer(this.indexBuffer);
+    gl.deleteVertexArray(this.vertexArray);
+    for (const item of [this.splatProgram, this.overProgram]) gl.deleteProgram(item.program);
+    if (this.target) deleteTarget(gl, this.target);
+  }
+}
+
+function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_scale, opacity, color }) {
+  const values = new Float32Array(paddedLength(xyz.shape[0] * SPLAT_TEXELS));
+  for (let face = 0, splat = 0; face < splats_per_face.values.length; face++) {
+    for (const end = splat + splats_per_face.values[face]; splat < end; splat++) {
+      const to = 4 * SPLAT_TEXELS * splat;
+      const from = 3 * splat;
+      for (let k = 0; k < 3; k++) {
+        values[to + k] = xyz.values[from + k];
+        values[to + 8 + k] = Math.exp(log_scale.values[from + k]);
+        values[to + 12 + k] = 0.5 + SH_C0 * color.values[from + k];
+      }
+      values[to + 3] = face; // a float holds whole numbers up to 2^24
+      values.set(wholeQuaternion(rotation.values.subarray(from, from + 3), rotation_largest.values[splat]), to + 4);
+      values[to + 11] = opacity.values[splat];
+    }
+  }
+  return values;
+}
+
+/** The unit quaternion whose parts but the largest, which is positive, are `smaller`. */
+export function wholeQuaternion(smaller, largest) {
+  const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
+  const whole = Array.from(smaller);
+  whole.splice(largest, 0, rest);
+  return whole;
+}
+
+function tailValues({ xyz, sh, strain_color }, texels) {
+  const values = new Float32Array(paddedLength(Math.max(1, xyz.shape[0] * texels)));
+  let offset = 0;
+  for (const array of [sh, strain_color]) {
+    if (!array) continue;
+    const size = array.shape[1];
+    for (let splat = 0; splat < xyz.shape[0]; splat++) {
+      values.set(array.values.subarray(size * splat, size * (splat + 1)), 4 * texels * splat + offset);
+    }
+    offset += size;
+  }
+  return values;
+}
+
+function paddedLength(texels) {
+  return 4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
+}
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, source] of [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+    gl.deleteShader(shader);
+  }
+  gl.bindAttribLocation(made, 0, 'splatIndex');
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
+    throw new RendererError(`The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`);
+  }
+  const uniforms = {};
+  const count = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) ?? 0;
+  for (let k = 0; k < count; k++) {
+    const { name } = gl.getActiveUniform(made, k);
+    uniforms[name] = gl.getUniformLocation(made, name);
+  }
+  return { program: made, uniforms };
+}
+
+function texture(gl, format, values) {
+  const height = values.length / (4 * TEXTURE_WIDTH);
+  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+    throw new RendererError('The avatar has more splats than this graphics card can hold.');
+  }
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXTURE_WIDTH, height, 0, gl.RGBA, gl.FLOAT, values);
+  return made;
+}
+
+function bindTexture(gl, unit, bound, uniform) {
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_2D, bound);
+  gl.uniform1i(uniform ?? null, unit);
+}
+
+function makeTarget(gl, format, width, height) {
+  const made = gl.createTexture();
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  const framebuffer = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+  return { texture: made, framebuffer, format, width, height };
+}
+
+function deleteTarget(gl, target) {
+  gl.deleteFramebuffer(target.framebuffer);
+  gl.deleteTexture(target.texture);
+}

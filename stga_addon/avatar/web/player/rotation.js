@@ -1,0 +1,50 @@
+// Rotations as axis-angle vectors, unit quaternions (w, x, y, z) and 3×3 matrices, row by row.
+
+const SMALL_ANGLE = 1e-8;
+
+/** Write the matrix of the axis-angle vector at `from` of `vectors` to `out` (9 numbers from `to`). */
+export function matrixFromAxisAngle(vectors, from, out, to) {
+  const [x, y, z] = [vectors[from], vectors[from + 1], vectors[from + 2]];
+  const angle = Math.hypot(x, y, z);
+  const first = angle < SMALL_ANGLE ? 1 : Math.sin(angle) / angle;
+  const half = angle < SMALL_ANGLE ? 1 : Math.sin(angle / 2) / (angle / 2);
+  const second = (half * half) / 2; // (1 − cos) / angle², without cancellation
+  out[to] = 1 - second * (y * y + z * z);
+  out[to + 1] = second * x * y - first * z;
+  out[to + 2] = second * x * z + first * y;
+  out[to + 3] = second * x * y + first * z;
+  out[to + 4] = 1 - second * (x * x + z * z);
+  out[to + 5] = second * y * z - first * x;
+  out[to + 6] = second * x * z - first * y;
+  out[to + 7] = second * y * z + first * x;
+  out[to + 8] = 1 - second * (x * x + y * y);
+}
+
+/** Axis-angle vector on the shortest arc from axis-angle vector `a` to `b`, at `share` of the way. */
+export function slerpAxisAngle(a, b, share) {
+  const p = quaternionFromAxisAngle(a);
+  let q = quaternionFromAxisAngle(b);
+  let cosine = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
+  if (cosine < 0) {
+    q = q.map((part) => -part);
+    cosine = -cosine;
+  }
+  const angle = Math.acos(Math.min(1, cosine));
+  const sine = Math.sin(angle);
+  const before = sine < SMALL_ANGLE ? 1 - share : Math.sin((1 - share) * angle) / sine;
+  const after = sine < SMALL_ANGLE ? share : Math.sin(share * angle) / sine;
+  return axisAngleFromQuaternion(p.map((part, k) => before * part + after * q[k]));
+}
+
+function quaternionFromAxisAngle([x, y, z]) {
+  const angle = Math.hypot(x, y, z);
+  const factor = angle < SMALL_ANGLE ? 0.5 : Math.sin(angle / 2) / angle;
+  return [Math.cos(angle / 2), factor * x, factor * y, factor * z];
+}
+
+function axisAngleFromQuaternion([w, x, y, z]) {
+  const length = Math.hypot(x, y, z);
+  const angle = 2 * Math.atan2(length, w);
+  const factor = length < SMALL_ANGLE ? 2 : angle / length;
+  return [factor * x, factor * y, factor * z];
+}

@@ -1,0 +1,302 @@
+// <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element (docs/web.md).
+
+import { cameraOfView } from './camera.js';
+import { addControls } from './controls.js';
+import { DataError, readData } from './data.js';
+import { Player } from './player.js';
+import { RendererError } from './renderer.js';
+
+const MAX_PIXEL_RATIO = 2;
+const MAX_STEP_S = 0.25; // of playback time between two frames: a hidden tab resumes where it was
+
+const STYLE = `
+:host { display: block; position: relative; overflow: hidden; contain: content; }
+canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab; outline: none; }
+canvas:active { cursor: grabbing; }
+p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 30em; padding: 1em; text-align: center;
+  font: 16px/1.5 system-ui, sans-serif; }
+[hidden] { display: none; }`;
+
+export class StgaAvatar extends HTMLElement {
+  static observedAttributes = ['src', 'loop', 'speed', 'background'];
+
+  #player = null;
+  #playing = false;
+  #time = 0; // in frames
+  #last = 0;
+  #request = 0;
+  #loading = 0;
+  #canvas;
+  #message;
+
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: 'open' });
+    root.innerHTML = `<style>${STYLE}</style><canvas></canvas><p role="alert" hidden></p>`;
+    this.#canvas = root.querySelector('canvas');
+    this.#message = root.querySelector('p');
+    this.speed = 1;
+    this.loop = false;
+    addControls(
+      this.#canvas,
+      () => this.#player,
+      () => this.#changed('camerachange'),
+    );
+    this.#canvas.addEventListener('webglcontextlost', (event) => event.preventDefault());
+    this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
+    new ResizeObserver(() => this.#resize()).observe(this);
+  }
+
+  attributeChangedCallback(name, before, value) {
+    if (name === 'src' && value) this.load(value).catch(() => {});
+    if (name === 'loop') this.loop = value !== null;
+    if (name === 'speed') this.speed = Number(value) || 1;
+    if (name === 'background' && value && this.#player) this.background = value;
+  }
+
+  /** Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array). Rejects, and says why on the page. */
+  async load(source) {
+    const loading = ++this.#loading;
+    try {
+      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(source);
+      const data = await readData(bytes);
+      if (loading !== this.#loading) return; // another load has begun
+      this.#show(new Player(this.#canvas, data));
+    } catch (error) {
+      if (loading === this.#loading) this.#fail(error);
+      throw error;
+    }
+  }
+
+  /** What the data file says of itself: title, fps, views, sliders, joints, …; null before it is loaded. */
+  get info() {
+    return this.#player?.data.header ?? null;
+  }
+
+  get frameCount() {
+    return this.#player?.frameCount ?? 0;
+  }
+
+  /** Whole or fractional frame that is shown, from 0. */
+  get frame() {
+    return this.#time;
+  }
+
+  set frame(value) {
+    this.#time = Math.min(Math.max(Number(value) || 0, 0), Math.max(0, this.frameCount - 1));
+    this.#changed('frame');
+  }
+
+  get playing() {
+    return this.#playing;
+  }
+
+  play() {
+    if (!this.#player || this.#playing || this.frameCount < 2) return;
+    if (!this.loop && this.#time >= this.frameCount - 1) this.#time = 0;
+    this.#playing = true;
+    this.#last = 0;
+    this.#changed('play');
+  }
+
+  /** Stop on a recorded frame. */
+  pause() {
+    if (!this.#playing) return;
+    this.#playing = false;
+    this.#time = Math.min(Math.round(this.#time), this.frameCount - 1);
+    this.#changed('pause');
+  }
+
+  /** Replace an expression (its name or component) by a value; null: as recorded. */
+  setExpression(name, value) {
+    const component = this.#component(name);
+    this.#player.motion.pinnedCoefficients[component] = value ?? NaN;
+    this.#posed();
+  }
+
+  getExpression(name) {
+    return this.#player.motion.coefficients[this.#component(name)];
+  }
+
+  /** Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded; null: all parts. */
+  setPose(joint, rotation) {
+    const at = 3 * this.#joint(joint);
+    const { pinnedPose } = this.#player.motion;
+    for (let k = 0; k < 3; k++) pinnedPose[at + k] = rotation?.[k] ?? NaN;
+    this.#posed();
+  }
+
+  getPose(joint) {
+    const at = 3 * this.#joint(joint);
+    return Array.from(this.#player.motion.pose.subarray(at, at + 3));
+  }
+
+  /** Give expressions and joints back to the recorded motion. */
+  release() {
+    this.#player?.motion.release();
+    this.#posed();
+  }
+
+  /** { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes, meters). */
+  get camera() {
+    return this.#player?.camera ?? null;
+  }
+
+  /** A camera as above, or the name of one of the file's views. */
+  set camera(value) {
+    const view = typeof value === 'string' ? this.info.views.find(({ name }) => name === value) : null;
+    if (typeof value === 'string' && !view) throw new RangeError(`There is no view "${value}".`);
+    this.#player.camera = view ? cameraOfView(view) : value;
+    this.#player.pivot = this.#player.middle;
+    this.#changed('camerachange');
+  }
+
+  resetCamera() {
+    this.#player?.resetCamera();
+    this.#changed('camerachange');
+  }
+
+  /** "#rrggbb" or "transparent". */
+  get background() {
+    const [red, green, blue, alpha] = this.#player?.background ?? [1, 1, 1, 1];
+    const hex = (part) =>
+      Math.round(255 * part)
+        .toString(16)
+        .padStart(2, '0');
+    return alpha ? `#${hex(red)}${hex(green)}${hex(blue)}` : 'transparent';
+  }
+
+  set background(value) {
+    const parts = /^#(..)(..)(..)$/
+      .exec(value)
+      ?.slice(1)
+      .map((part) => parseInt(part, 16) / 255);
+    if (!parts && value !== 'transparent') throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
+    if (this.#player) this.#player.background = parts ? [...parts, 1] : [0, 0, 0, 0];
+    this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+  }
+
+  /** Whether splats on triangles that the frame did not train are gray. */
+  get showSelection() {
+    return this.#player?.showSelection ?? false;
+  }
+
+  set showSelection(value) {
+    if (this.#player) this.#player.showSelection = Boolean(value) && this.hasSelection;
+    this.#changed('frame');
+  }
+
+  get hasSelection() {
+    return Boolean(this.#player?.data.arrays.selection);
+  }
+
+  get splatCount() {
+    return this.#player?.data.arrays.xyz.shape[0] ?? 0;
+  }
+
+  /** Milliseconds of JavaScript that a frame takes (running mean). */
+  get frameTime() {
+    return this.#player?.milliseconds ?? 0;
+  }
+
+  /** The current frame as a PNG (Blob) from `camera`, by default the current one at its own size. */
+  async snapshot(camera = this.camera) {
+    const pixels = this.#player.read(camera);
+    const picture = document.createElement('canvas');
+    [picture.width, picture.height] = camera.size;
+    picture.getContext('2d').putImageData(new ImageData(pixels, ...camera.size), 0, 0);
+    return new Promise((resolve) => picture.toBlob(resolve, 'image/png'));
+  }
+
+  /** The player, for what this interface leaves out. */
+  get player() {
+    return this.#player;
+  }
+
+  #component(name) {
+    const slider = this.info.sliders.find((found) => found.name === name || found.component === name);
+    if (!slider) throw new RangeError(`There is no expression "${name}".`);
+    return slider.component;
+  }
+
+  #joint(name) {
+    const index = this.info.joints.indexOf(name);
+    if (index < 0) throw new RangeError(`There is no joint "${name}".`);
+    return index;
+  }
+
+  #show(player) {
+    this.#player?.dispose();
+    this.#player = player;
+    this.#playing = false;
+    this.#time = 0;
+    this.#canvas.hidden = false;
+    this.#message.hidden = true;
+    const background = this.getAttribute('background');
+    if (background) this.background = background;
+    this.#resize();
+    player.draw();
+    this.dispatchEvent(new CustomEvent('load'));
+    if (this.hasAttribute('autoplay')) this.play();
+  }
+
+  /** The graphics driver was restarted: upload everything again. */
+  #restore() {
+    if (!this.#player) return;
+    const { camera, pivot, background, showSelection, data } = this.#player;
+    this.#player = Object.assign(new Player(this.#canvas, data), { camera, pivot, background, showSelection });
+    this.#changed('frame');
+  }
+
+  #fail(error) {
+    const known = error instanceof DataError || error instanceof RendererError;
+    this.#message.textContent = known ? error.message : `The avatar cannot be shown: ${error.message}`;
+    this.#message.hidden = false;
+    this.#canvas.hidden = true;
+    this.dispatchEvent(new CustomEvent('error', { detail: error }));
+  }
+
+  #posed() {
+    this.#player?.invalidate();
+    this.#changed('frame');
+  }
+
+  #changed(event) {
+    if (this.#player) this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    this.dispatchEvent(new CustomEvent(event));
+  }
+
+  #tick(now) {
+    this.#request = 0;
+    if (!this.#player || this.#player.gl.isContextLost()) return;
+    if (this.#playing) this.#advance(now);
+    this.#player.frame = this.#time;
+    this.#player.draw();
+    if (this.#playing) this.#changed('frame');
+  }
+
+  #advance(now) {
+    const step = this.#last ? Math.min(Math.max((now - this.#last) / 1000, 0), MAX_STEP_S) : 0;
+    this.#last = now;
+    this.#time += step * this.info.fps * this.speed;
+    const end = this.loop ? this.frameCount : this.frameCount - 1;
+    if (this.#time < end) return;
+    if (this.loop) this.#time %= this.frameCount;
+    else this.pause();
+  }
+
+  #resize() {
+    const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
+    this.#canvas.width = Math.max(1, Math.round(this.clientWidth * ratio));
+    this.#canvas.height = Math.max(1, Math.round(this.clientHeight * ratio));
+    if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas
+  }
+}
+
+async function fetchBytes(address) {
+  const response = await fetch(address);
+  if (!response.ok) throw new DataError(`${address} cannot be loaded (${response.status}).`);
+  return new Uint8Array(await response.arrayBuffer());
+}
+
+customElements.define('stga-avatar', StgaAvatar);

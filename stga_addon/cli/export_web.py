@@ -1,0 +1,97 @@
+"""Web pages on the command line: what of a capture and its run plays in the page."""
+
+from argparse import Namespace
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ..avatar.export import export_avatar
+from ..avatar.file import Avatar
+from ..avatar.playback import MAX_VIEWS, Playback
+from ..avatar.web.write import RIG_NOTICE
+from ..capture.camera import Camera
+from ..capture.model import Capture
+from ..errors import StgaError
+from ..selection import SelectionOptions, select_capture
+
+SPLITS = ("val", "train", "test")
+
+
+def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> None:
+    """Write the page of --out with the capture's timesteps (--frames), or the neutral mesh without a capture."""
+    if capture is None:
+        playback = Playback(title=_title(options), fps=options.fps, motion_only=True)
+        export_avatar(options.out, avatar, "web", [(0, avatar.neutral)], playback=playback)
+        return
+    first, last = options.frames or (capture.timesteps[0], capture.timesteps[-1])
+    timesteps = tuple(timestep for timestep in capture.timesteps if first <= timestep <= last)
+    if not timesteps:
+        raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
+    playback = Playback(
+        title=_title(options),
+        fps=options.fps,
+        views=capture_views(capture),
+        up=_up(capture),
+        selection=_selection(capture, timesteps, options),
+        motion_only=options.motion_only,
+    )
+    sequence = None if capture.flame is None else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
+    if sequence is not None and not options.motion_only:
+        print(f"{RIG_NOTICE} --motion-only leaves them out.")
+    export_avatar(options.out, avatar, "web", _meshes(capture, timesteps), sequence, playback=playback)
+
+
+def _title(options: Namespace) -> str:
+    path = options.avatar.resolve()
+    return str(path.parent.name if path.name == "avatar.npz" else path.stem)
+
+
+def capture_views(capture: Capture) -> dict[str, Camera]:
+    """The first pose of each camera, a held-out one first."""
+    cameras: dict[int, Camera] = {}
+    for split in SPLITS:
+        for view in capture.views.get(split, ()):
+            cameras.setdefault(view.camera_index, view.camera)
+    held_out = [view.camera_index for view in capture.views.get("val", ())][:1]
+    order = [*held_out, *(index for index in sorted(cameras) if index not in held_out)]
+    return {f"Camera {index}": cameras[index] for index in order[:MAX_VIEWS]}
+
+
+def _up(capture: Capture) -> tuple[float, float, float]:
+    """The axis of the capture that its cameras hold upright; y without cameras."""
+    cameras = [view.camera for views in capture.views.values() for view in views]
+    if not cameras:
+        return (0.0, 1.0, 0.0)
+    mean = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
+    axis = np.zeros(3)
+    axis[np.abs(mean).argmax()] = np.sign(mean[np.abs(mean).argmax()])
+    return (float(axis[0]), float(axis[1]), float(axis[2]))
+
+
+def _selection(capture: Capture, timesteps: tuple[int, ...], options: Namespace) -> list[np.ndarray] | None:
+    """What each timestep trains: the open head's or the run's selection, else by the rule."""
+    from ..training.run.checkpoint import read_selection
+    from ..training.run.folder import SELECTION
+
+    chosen = None
+    if options.head is not None:
+        chosen = options.head.selection()
+    elif (options.avatar / SELECTION).exists():
+        chosen = read_selection(options.avatar, len(capture.faces))
+    if not chosen and options.head is None:
+        chosen = select_capture(capture, SelectionOptions())
+    everything = np.ones(len(capture.faces), bool)
+    return [chosen.get(timestep, everything) for timestep in timesteps] if chosen else None
+
+
+def _flame_timesteps(capture: Capture, timesteps: tuple[int, ...]) -> tuple[int, ...]:
+    """The timesteps of `capture.flame` for those of the capture, which an open head numbers by the scene's frames."""
+    assert capture.flame is not None
+    numbered = dict(zip(capture.timesteps, capture.flame.timesteps, strict=True))
+    return tuple(numbered[timestep] for timestep in timesteps)
+
+
+def _meshes(capture: Capture, timesteps: tuple[int, ...]) -> Iterator[tuple[int, np.ndarray]]:
+    for timestep in timesteps:
+        yield timestep, capture.mesh(timestep)

@@ -1,0 +1,112 @@
+"""The page in a real browser: its pictures against the renderer, its interface, and damaged data."""
+
+import base64
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.avatar.web.page import page
+from stga_addon.raster.render import render_avatar, to_uint8
+
+from .browser import Browser
+from .conftest import Head, make_head
+
+MIN_PSNR = 55.0
+MIN_EXACT_PSNR = 57.0
+"""Of large, half-transparent splats of random colors; trained heads reach 61 dB."""
+SNAPSHOT = """(async () => {
+  const avatar = document.querySelector('stga-avatar');
+  avatar.player.frame = avatar.frame = %d;
+  avatar.camera = 'front';
+  avatar.background = '#ffffff';
+  const blob = await avatar.snapshot();
+  const reader = new FileReader();
+  return new Promise((done) => Object.assign(reader, { onload: () => done(reader.result) }).readAsDataURL(blob));
+})()"""
+READY = """new Promise((done) => {
+  const avatar = document.querySelector('stga-avatar');
+  const look = () => (avatar.info || avatar.shadowRoot?.querySelector('p').textContent ? done() : setTimeout(look, 20));
+  look();
+})"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    opened = Browser(tmp_path_factory.mktemp("profile"), (500, 400))
+    yield opened
+    opened.close()
+
+
+def show(browser: Browser, folder: Path, data: bytes) -> None:
+    """Open the page of a data file from disk."""
+    (folder / "a.html").write_text(page("Zoë", "", data), encoding="utf-8")
+    browser.open((folder / "a.html").as_uri())
+    browser.evaluate(READY)
+
+
+def psnr(browser: Browser, head: Head, frame: int) -> float:
+    """Of the page's picture against the renderer's, both in eight bits."""
+    encoded = browser.evaluate(SNAPSHOT % frame).partition(",")[2]
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"), float)
+    expected = to_uint8(render_avatar(head.avatar, head.meshes[frame], head.camera))
+    return float(10 * np.log10(255**2 / np.mean((picture - expected) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("options", "exact"),
+    [
+        ({}, True),
+        ({}, False),
+        ({"convention": "gaussian_avatars", "sh_degree": 1, "strain": False, "antialiased": False}, True),
+    ],
+)
+def test_picture_is_the_renderers(options, exact, browser, tmp_path):
+    """Catches any difference of projection, color, blending or quantization, and any request that a page makes."""
+    head = make_head(**options)
+    show(browser, tmp_path, head.data(exact=exact))
+    for frame in (0, 2):
+        assert psnr(browser, head, frame) >= (MIN_EXACT_PSNR if exact else MIN_PSNR)
+    assert browser.errors == []
+    assert browser.requests == [(tmp_path / "a.html").as_uri()]
+
+
+def test_controls(browser, head, tmp_path):
+    """Catches a slider, key or property of the page that does nothing, or something else than it says."""
+    show(browser, tmp_path, head.data())
+    found = browser.evaluate("""(() => {
+      const avatar = document.querySelector('stga-avatar');
+      const rows = [...document.querySelectorAll('.slider')];
+      const name = rows[0].firstChild.textContent;
+      const input = rows[0].querySelector('input');
+      input.value = 0.5;
+      input.dispatchEvent(new Event('input'));
+      avatar.frame = 1;
+      document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true }));
+      document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 's', bubbles: true }));
+      const before = [...avatar.camera.matrix];
+      avatar.setPose('jaw', [0.3, null, null]);
+      avatar.player.draw();
+      return { sliders: rows.length, pinned: document.querySelectorAll('.pinned').length, frame: avatar.frame,
+        value: avatar.player.motion.pinnedCoefficients[avatar.info.sliders[0].component], shown: avatar.showSelection,
+        notice: document.getElementById('number').textContent, name, jaw: avatar.player.motion.pinnedPose[6],
+        views: document.getElementById('view').options.length, before };
+    })()""")
+    assert found["sliders"] == head.sequence.model.n_expression + 6
+    assert (found["pinned"], found["value"], found["frame"], found["shown"]) == (1, 0.5, 2, True)
+    assert found["jaw"] == pytest.approx(0.3)
+    assert found["notice"] == "3 / 3"
+    assert np.allclose(found["before"], head.camera.world_to_camera.ravel())
+    assert browser.errors == []
+
+
+def test_damaged_data_shows_a_sentence(browser, head, tmp_path):
+    """Catches a blank page."""
+    data = head.data()
+    show(browser, tmp_path, data[: len(data) // 2])
+    shown = browser.evaluate("document.querySelector('stga-avatar').shadowRoot.querySelector('p').textContent")
+    assert shown == "The avatar data is damaged."
+    assert browser.errors == []

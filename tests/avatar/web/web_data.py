@@ -1,0 +1,58 @@
+"""An independent reader of web data files, written from docs/formats.md."""
+
+import gzip
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from stga_addon.avatar.splats import Splats
+
+
+def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays (float32 or int64) of a data file."""
+    raw = gzip.decompress(data)
+    magic, version, length = struct.unpack_from("<4sII", raw)
+    assert magic == b"STGA"
+    assert version == 1
+    header = json.loads(raw[12 : 12 + length])
+    at = 12 + length
+    arrays = {}
+    for name, entry in header["arrays"].items():
+        shape, count = entry["shape"], int(np.prod(entry["shape"]))
+        if entry["type"] == "float32":
+            arrays[name] = np.frombuffer(raw, "<f4", count, at).reshape(shape)
+            at += 4 * count
+            continue
+        planes = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).reshape(entry["planes"], count)
+        at += planes.size
+        integers = sum(plane.astype(np.int64) << 8 * k for k, plane in enumerate(planes)) + entry["low"]
+        integers = np.moveaxis(np.reshape(integers, [*shape[-1:], *shape[:-1]]), 0, -1)
+        arrays[name] = integers if entry["type"] == "integer" else (integers * entry["step"]).astype(np.float32)
+    assert at == len(raw)
+    return header, arrays
+
+
+def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
+    """The splats of a data file, sorted by triangle."""
+    count = len(arrays["xyz"])
+    largest, smaller = arrays["rotation_largest"], arrays["rotation"].astype(np.float64)
+    rotation = np.empty((count, 4))
+    for row in range(4):
+        chosen = largest == row
+        rotation[chosen, row] = np.sqrt(1 - np.minimum(1, (smaller[chosen] ** 2).sum(1)))
+        rotation[np.ix_(chosen, [k for k in range(4) if k != row])] = smaller[chosen]
+    opacity = np.clip(arrays["opacity"].astype(np.float64), 1e-6, 1 - 1e-6)
+    rest = arrays.get("sh", np.zeros((count, 0))).reshape(count, -1, 3)
+    per_face = arrays["splats_per_face"]
+    return Splats(
+        xyz=arrays["xyz"],
+        rotation=rotation.astype(np.float32),
+        log_scale=arrays["log_scale"],
+        opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
+        sh=np.concatenate([arrays["color"][:, None], rest], axis=1).astype(np.float32),
+        face=np.repeat(np.arange(len(per_face)), per_face).astype(np.int32),
+        unbound=np.zeros(count, bool),
+        strain_color=arrays.get("strain_color", np.zeros((count, 0), np.float32)).reshape(count, -1, 3),
+    )

@@ -1,0 +1,52 @@
+"""`stga export --format web`: which frames, cameras and selection go into the page."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from avatar.web.web_data import read_web_data
+from capture.factory import write_mesh_capture
+
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+
+
+@pytest.fixture
+def avatar_file(tmp_path: Path) -> Path:
+    """An avatar of the mesh capture in the folder `capture` beside it."""
+    capture = open_capture(write_mesh_capture(tmp_path / "capture"))
+    neutral = capture.neutral.astype(np.float32)
+    splats = lattice_splats(neutral, capture.faces, sh_degree=1, convention="stga")
+    write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
+    return tmp_path / "anna.npz"
+
+
+def test_frames_cameras_and_selection_of_a_capture(avatar_file, tmp_path):
+    """Catches frames outside the range, cameras that are missing, and a rate that is not the one asked for."""
+    capture = open_capture(tmp_path / "capture")
+    first, last = capture.timesteps[1], capture.timesteps[-1]
+    words = ["--capture", str(capture.root), "--frames", f"{first}:{last}", "--fps", "30"]
+    assert main(["export", str(avatar_file), "--format", "web", *words, "--out", str(tmp_path / "a.stga")]) == 0
+    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    frames = len(capture.timesteps) - 1
+    assert (header["title"], header["fps"]) == ("anna", 30)
+    assert len(arrays["pose"]) == len(arrays["selection"]) == frames
+    cameras = {view.camera_index for views in capture.views.values() for view in views}
+    assert {view["name"] for view in header["views"]} == {f"Camera {index}" for index in cameras}
+
+
+def test_an_avatar_alone_is_a_still(avatar_file, tmp_path):
+    """Catches a page that cannot be made without a capture."""
+    assert main(["export", str(avatar_file), "--format", "web", "--out", str(tmp_path / "a.html")]) == 0
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "<title>anna</title>" in text
+    assert "{{" not in text.partition('<script type="module">')[0]
+
+
+def test_mistakes_are_one_sentence(avatar_file, tmp_path, capsys):
+    """Catches a traceback, or a page under a name that no browser opens."""
+    assert main(["export", str(avatar_file), "--format", "web", "--out", str(tmp_path / "a.txt")]) == 2
+    assert ".html" in capsys.readouterr().err
+    assert not (tmp_path / "a.txt").exists()
