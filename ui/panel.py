@@ -88,6 +88,10 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
                 column.prop(owner, prop, text=name)
         if viewport_display.display.problem:
             draw_text(layout, context, viewport_display.display.problem, "ERROR")
+        bounces = transparent_bounces_hint(context.scene)
+        if bounces:
+            layout.label(text=bounces, icon="ERROR")
+            layout.operator(ids.MORE_BOUNCES)
         if display_mode(splats) == AS_TRAINED:
             return
         if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
@@ -97,10 +101,6 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         if view_transform_hint(context.scene):
             layout.label(text="View transform changes the colors", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)
-        hint = transparent_bounces_hint(context.scene)
-        if hint:
-            layout.label(text=hint, icon="ERROR")
-            layout.operator(ids.MORE_BOUNCES)
 
 
 CLASSES = (

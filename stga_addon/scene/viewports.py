@@ -45,8 +45,6 @@ def frame_demo(head: Any, scene: Any, frames_per_second: int) -> None:
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, scene.view_layers[0], False)
     frame_head(head, scene.camera, bpy.data.screens)
-    for space in _viewports(bpy.data.screens):
-        space.shading.type = "MATERIAL"
 
 
 def _bounds(vertices: Any) -> tuple[Any, Any]:

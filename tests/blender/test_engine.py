@@ -248,7 +248,11 @@ def test_objects_are_sorted_together(tmp_path):
         splats = random_splats(1, count, degree=2)
         xyz = rng.normal(0, 0.1, (count, 3)).astype(np.float32)
         sh = np.random.default_rng(seed).normal(0, 0.1, (count, 9, 3)).astype(np.float32)
-        scans.append(replace(splats, xyz=xyz, sh=sh, log_scale=np.full((count, 3), -3.5, np.float32)))
+        # The rasterizer leaves out the splat that would bring a pixel's transmittance to 1e-4, the GPU draws it. Of an
+        # opacity below 0.96 that is less than 1/255.
+        opacity = np.minimum(splats.opacity, 3)
+        log_scale = np.full((count, 3), -3.5, np.float32)
+        scans.append(replace(splats, xyz=xyz, sh=sh, log_scale=log_scale, opacity=opacity))
     place = Matrix.Translation((0.02, 0.05, 0.1)) @ Matrix.Rotation(0.8, 4, "X")
     show_world_splats(scans[0], "still")
     show_world_splats(scans[1], "moved").matrix_world = place
@@ -259,10 +263,7 @@ def test_objects_are_sorted_together(tmp_path):
     reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
     view = expected_camera(camera, bpy.data.objects["still"])
     expected = render_splats(reference, view, (0.0,) * 3)
-    difference = np.abs(displayed(render(tmp_path), 0.0) - expected)
-    # Colors reach 2 here: where rounding decides whether an alpha of 1/255 counts, that is 2/255.
-    assert difference.max() < 2 * TOLERANCE
-    assert (difference > TOLERANCE).mean() < 1e-3
+    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
 
 
 def _merged(scans, spaces, eye):

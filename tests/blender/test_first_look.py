@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 bpy = pytest.importorskip("bpy")
 
@@ -9,8 +10,13 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 from mathutils import Vector  # noqa: E402
 
 from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS, QUADS  # noqa: E402
+from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
+from stga_addon.scene.display.splat_object import set_input  # noqa: E402
 from stga_addon.scene.objects import layers_of  # noqa: E402
 from stga_addon.scene.viewports import frame_head  # noqa: E402
+
+from .test_operators import write_ball_avatar  # noqa: E402
 
 
 @pytest.fixture
@@ -60,3 +66,21 @@ def test_heads_without_bones_say_so(extension, tmp_path):
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     with pytest.raises(RuntimeError, match="poll"):
         bpy.ops.stga.pose_head()
+
+
+def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
+    """Catches images by Blender's own engines in which an avatar shown as trained is missing, or is points."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+    scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(tmp_path / "image.png")
+    images = {}
+    for mode in (AS_TRAINED, QUADS, POINTS):
+        set_input(scene.stga.splats, DISPLAY, mode)
+        bpy.ops.render.render(write_still=True)
+        images[mode] = np.asarray(Image.open(tmp_path / "image.png")).astype(int)
+    assert images[QUADS][..., :3].max() > 50
+    np.testing.assert_array_equal(images[AS_TRAINED], images[QUADS])
+    assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20

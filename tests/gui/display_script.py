@@ -155,7 +155,15 @@ def finish() -> None:
     bpy.ops.wm.quit_blender()
 
 
+def fill_screen() -> None:
+    """Without a title bar, so that pixels of the window are pixels of the screenshot."""
+    with bpy.context.temp_override(window=viewport()[0]):
+        bpy.ops.wm.window_fullscreen_toggle()
+
+
 def steps() -> Any:
+    fill_screen()
+    yield
     viewport_display.register()
     engine.register(no_python)
     shown = set_up()

@@ -5,6 +5,7 @@ import os
 import shlex
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
 pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
 MIN_PSNR_DB = 42.0
+BORDER_PX = 40
+"""Of the viewport, where Blender draws rounded corners and arrows."""
 BEHIND = linear_to_srgb(np.array([0.2, 0.3, 0.4]))
 BLACK = np.zeros(3)
 
@@ -50,14 +53,16 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 
 
 def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarray, Camera]:
-    """(3, H, W) sRGB of the viewport in the screenshot, and its camera."""
+    """(3, H, W) sRGB of the viewport in the screenshot, less its border, and the camera of that part."""
     with np.load(folder / "views.npz") as views:
         width, height, *lens = views[name].tolist()
         camera = Camera(int(width), int(height), *lens, views[f"{name} pose"])
     x, y = (int(result["pictures"][name][axis]) for axis in "xy")
     with Image.open(folder / f"{name}.png") as screenshot:
         pixels = np.asarray(screenshot.convert("RGB"), np.float32)[y : y + camera.height, x : x + camera.width]
-    return pixels.transpose(2, 0, 1) / 255, camera
+    width, height, m = camera.width - 2 * BORDER_PX, camera.height - 2 * BORDER_PX, BORDER_PX
+    middle = replace(camera, width=width, height=height, cx=camera.cx - m, cy=camera.cy - m)
+    return pixels[m:-m, m:-m].transpose(2, 0, 1) / 255, middle
 
 
 @pytest.mark.parametrize(

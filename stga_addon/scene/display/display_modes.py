@@ -25,9 +25,10 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
     visible: field, which splats; size: factor on their standard deviations.
     """
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
-    # Nothing in viewports, where `gpu.viewport_display` draws; points in images by engines other than STGA Splats.
+    # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads that
+    # face the camera.
     is_viewport = nodes.out("GeometryNodeIsViewport")
-    in_images = nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": made[POINTS]}, input_type="GEOMETRY")
+    in_images = nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": made[QUADS]}, input_type="GEOMETRY")
     geometries = {AS_TRAINED: in_images, **made}
     native = native_splats(nodes.tree, geometries[POINTS])
     if native is not None:

@@ -21,8 +21,6 @@ VIEW_TEXELS = 3 + CLIP_PLANES
 LAYER_TEXELS = 5
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
-MAX_DEPTH_STEP = 1e-5
-"""Coarsest step of the sort's keys, as a share of the nearest splat's depth; where 16 bits are coarser, 32 are used."""
 
 
 @dataclass(frozen=True)
@@ -149,13 +147,10 @@ def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.n
     if len(inside) < len(depth):
         depth = depth[inside]
     nearest, farthest = float(depth.min()), float(depth.max())
-    if farthest - nearest <= 65535 * MAX_DEPTH_STEP * (nearest + frames.base):
-        key = ((depth - nearest) * (65535 / max(farthest - nearest, 1e-30))).astype(np.uint16)
-        order = np.argsort(key, kind="stable")  # of 16 bits: a radix sort
-    else:
-        key = ((depth.astype(np.float64) - nearest) * ((2**32 - 1) / (farthest - nearest))).astype(np.uint32)
-        order = np.argsort(key.astype(np.uint16), kind="stable")
-        order = order[np.argsort((key >> 16).astype(np.uint16)[order], kind="stable")]
+    # Keys of 32 bits in two stable passes over 16, which numpy sorts by radix. Fewer bits would swap close splats.
+    key = ((depth.astype(np.float64) - nearest) * ((2**32 - 1) / max(farthest - nearest, 1e-30))).astype(np.uint32)
+    order = np.argsort(key.astype(np.uint16), kind="stable")
+    order = order[np.argsort((key >> 16).astype(np.uint16)[order], kind="stable")]
     # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
     return np.asarray(inside[order[::-1]], np.float32)
 
