@@ -144,3 +144,11 @@ def allow_depth_write(shader: Any) -> None:
     """Let a shader's fragments set their depth; versions before 5.0 need no declaration."""
     if hasattr(shader, "depth_write"):
         shader.depth_write("ANY")
+
+
+def has_scene_depth(space: Any) -> bool:
+    """Whether a 3D viewport's depth buffer holds the scene when draw handlers run.
+
+    Before 5.2, render engines leave it zero where overlays are off (seen in 4.3).
+    """
+    return bpy.app.version >= (5, 2) or space.overlay.show_overlays or space.shading.type in ("SOLID", "WIREFRAME")

@@ -99,7 +99,9 @@ def pictures(shown: Any) -> None:
     for mode in ("SOLID", "WIREFRAME", "MATERIAL"):
         space.shading.type = mode
         picture(mode.lower())
-    space.shading.type = "SOLID"
+    space.overlay.show_overlays = True
+    picture("material with overlays")
+    space.shading.type, space.overlay.show_overlays = "SOLID", False
     space.region_3d.view_perspective = "ORTHO"
     picture("orthographic")
     space.region_3d.view_perspective = "PERSP"
@@ -118,7 +120,31 @@ def pictures(shown: Any) -> None:
     quad.from_pydata([(-1, -1, 0.02), (1, -1, 0.02), (1, 1, 0.02), (-1, 1, 0.02)], [], [(0, 1, 2, 3)])
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("quad", quad))
     picture("quad")
+    parts_of_the_view(area)
     bpy.data.objects.remove(bpy.data.objects["quad"])
+
+
+def in_viewport(operator: Any, **settings: Any) -> None:
+    window, area, region = viewport()
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        operator(**settings)
+
+
+def parts_of_the_view(area: Any) -> None:
+    """Local view of the quad alone, and a clipping region of the world's x > 0."""
+    quad = bpy.data.objects["quad"]
+    for candidate in bpy.context.view_layer.objects:
+        candidate.select_set(candidate == quad)
+    bpy.context.view_layer.objects.active = quad
+    in_viewport(bpy.ops.view3d.localview, frame_selected=False)
+    picture("local view")
+    in_viewport(bpy.ops.view3d.localview, frame_selected=False)
+    quad.hide_set(True)
+    view = area.spaces.active.region_3d
+    view.clip_planes = [(1.0, 0.0, 0.0, 0.0)] + [(0.0, 0.0, 0.0, 1.0)] * 5
+    view.use_clip_planes = True
+    picture("clipped")
+    view.use_clip_planes = False
 
 
 def failure() -> None:
@@ -169,6 +195,10 @@ def steps() -> Any:
     shown = set_up()
     yield
     pictures(shown)
+    in_viewport(bpy.ops.screen.region_quadview)
+    yield  # regions get their places between two steps
+    picture("four views")
+    in_viewport(bpy.ops.screen.region_quadview)
     yield
     failure()
     yield

@@ -85,16 +85,26 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
 
 
 def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches splats of a hidden object, splats that ignore other objects' depth, and modes without splats."""
+    """Catches splats where they are hidden or clipped, splats that ignore depth, and modes and views without splats."""
     folder, result = shown
     assert result["problem"] == ""
     pictures = {name: on_screen(folder, result, name)[0] for name in result["pictures"]}
     assert np.ptp(pictures["hidden"], axis=(1, 2)).max() < 0.02
-    for name in ("material", "engine filmic"):
-        assert pictures[name].std() > 0.02, name
+    for name in ("material", "material with overlays", "engine filmic"):
+        assert (np.ptp(pictures[name], axis=0) > 0.25).sum() > 1000, name
     with_quad = np.abs(pictures["quad"] - pictures["solid"]).max(0) > 0.1
     splats = np.abs(pictures["solid"] - pictures["hidden"]).max(0) > 0.05
     assert 0.2 < (with_quad & splats).sum() / splats.sum() < 0.8, "the quad cuts the ball in half"
+    colored = {name: np.ptp(picture, axis=0) > 0.25 for name, picture in pictures.items()}
+    assert colored["solid"].sum() > 1000
+    assert not colored["local view"].any()
+    assert 0.3 < colored["clipped"].sum() / colored["solid"].sum() < 0.85
+    with Image.open(folder / "four views.png") as screenshot:
+        whole = np.ptp(np.asarray(screenshot.convert("RGB"), np.float32) / 255, axis=2) > 0.5
+    height, width = whole.shape[0] * 9 // 10, whole.shape[1] * 8 // 10
+    assert all(
+        whole[y : y + height // 2, x : x + width // 2].sum() > 100 for y in (0, height // 2) for x in (0, width // 2)
+    )
 
 
 def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:

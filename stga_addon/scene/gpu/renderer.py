@@ -51,16 +51,21 @@ class SplatRenderer:
         return ComposedImage(rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None)
 
     def composite(
-        self, corner: tuple[int, int], to_depth: tuple[float, ...], behind: tuple[float, ...] | None = None
+        self,
+        corner: tuple[int, int],
+        to_depth: tuple[float, ...],
+        behind: tuple[float, ...] | None = None,
+        test_depth: bool = True,
     ) -> None:
         """Put what was drawn last into the active framebuffer, which blends linearly and has the scene's depth.
 
         corner: pixel of the framebuffer for the image's bottom left. to_depth (a, b, c, d): depth in −1…1 is
         (a + b·z) / (c + d·z) at z meters along the view axis. behind: sRGB expected behind the splats, if known.
+        test_depth: whether objects in front hide splats; not where the framebuffer lacks the scene's depth.
         """
         gpu.state.blend_set("ALPHA_PREMULT")
         gpu.state.depth_mask_set(False)
-        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
         shader = self._composite
         shader.bind()
         shader.uniform_sampler("color_image", self._color)

@@ -15,7 +15,7 @@ from bpy.app.handlers import persistent
 
 from ...errors import StgaError
 from .. import tags
-from ..compat import world_nodes
+from ..compat import has_scene_depth, world_nodes
 from ..display import splat_nodes
 from ..display.colors import linear_to_srgb
 from ..display.display_modes import AS_TRAINED, POINTS
@@ -87,7 +87,7 @@ class GpuDisplay:
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
-        self._renderer.composite((x, y), to_depth, expected_background(context))
+        self._renderer.composite((x, y), to_depth, expected_background(context), has_scene_depth(space))
 
     def _fail(self, problem: str) -> None:
         self.stop()
