@@ -2,8 +2,7 @@
 
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-
-from tqdm import tqdm
+from typing import Any
 
 from ..jobs.delegate import OpenHead
 from .arguments import real_number, usable_path, whole_number
@@ -64,7 +63,7 @@ class _Bar:
 
     def __enter__(self) -> "_Bar":
         self._stage = ""
-        self._bar: tqdm[None] | None = None
+        self._bar: Any = None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -74,6 +73,8 @@ class _Bar:
         if stage != self._stage:
             self._close()
             self._stage = stage
+            from tqdm import tqdm
+
             self._bar = tqdm(desc=stage, total=total, dynamic_ncols=True)
         if self._bar is not None:
             self._bar.update(done - self._bar.n)

@@ -127,7 +127,7 @@ SET_BY_PANEL = {
     "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "effects"},
     "apply_motion": {"filter_glob"},
     "show_avatar": {"hide_head", "filter_glob"},
-    "export_avatar": {"format", "motion_only", "filter_glob", "check_existing"},
+    "export_avatar": {"format", "filter_glob", "check_existing", "motion_only"},
     "export_cameras": {"selected_only", "filter_glob", "check_existing"},
     "heat_map": set(),
     "copy_report": set(),

@@ -7,7 +7,7 @@ import pytest
 from avatar.web.web_data import read_web_data
 from capture.factory import write_mesh_capture
 
-from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
@@ -35,6 +35,19 @@ def test_frames_cameras_and_selection_of_a_capture(avatar_file, tmp_path):
     assert len(arrays["pose"]) == len(arrays["selection"]) == frames
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     assert {view["name"] for view in header["views"]} == {f"Camera {index}" for index in cameras}
+
+
+def test_a_run_brings_its_capture(tmp_path):
+    """Catches a run whose page lacks the motion, cameras or selection that it was trained with."""
+    capture = open_capture(write_mesh_capture(tmp_path / "capture"))
+    run = tmp_path / "anna"
+    assert main(["train", str(capture.root), "--out", str(run), "--iterations", "2", "--schedule", "paper"]) == 0
+    assert main(["export", str(run), "--format", "web", "--out", str(tmp_path / "a.stga")]) == 0
+    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    assert header["title"] == "anna"
+    assert len(header["views"]) == len({view.camera_index for views in capture.views.values() for view in views})
+    assert len(arrays["pose"]) == len(arrays["selection"]) == len(capture.timesteps)
+    assert len(arrays["xyz"]) == len(read_avatar(run / "avatar.npz").splats)
 
 
 def test_an_avatar_alone_is_a_still(avatar_file, tmp_path):

@@ -15,8 +15,8 @@ from .rig import WebRig
 
 Arrays = dict[str, np.ndarray | FixedPoint]
 
-# Steps of fixed-point values: half of one is the largest error. Together they cost less than 60 dB PSNR
-# (tests/avatar/test_web_quality.py).
+# Steps of fixed-point values: half of one is the largest error. Together they leave a picture of large
+# random splats 55 dB PSNR at least (tests/avatar/web/test_page.py).
 POSITION_STEP_M = 8e-6
 ROTATION_STEP = 1 / 724
 """The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each."""

@@ -56,9 +56,11 @@ uniform mat3 uToWorld;
 uniform vec2 uFocal, uCenter, uSize;
 uniform bool uAntialiased, uShowSelection;
 in uint splatIndex;
-out vec2 vOffset;
+flat out vec2 vCenter;
+flat out mat2 vToUnit;
 flat out vec4 vColor;
 
+const float SNAP = 0.07; // pixels: more than a corner moves to the driver's grid, of 1/16 pixel at the coarsest
 const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.15, MIN_ALPHA = 1.0 / 255.0;
 
 ivec2 texel(int index) {
@@ -108,9 +110,12 @@ void main() {
   vec2 axis = xx >= yy ? vec2(longer - yy, xy) : vec2(xy, longer - xx);
   axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
-  vOffset = corner * (sqrt(2.0 * log(255.0 * opacity)) + 0.001);
+  vec2 deviation = vec2(sqrt(longer), sqrt(det / longer));
+  vec2 reach = corner * (sqrt(2.0 * log(255.0 * opacity)) * deviation + SNAP);
   vec2 pixel = uFocal * center.xy / center.z + uCenter;
-  pixel += vOffset.x * sqrt(longer) * axis + vOffset.y * sqrt(det / longer) * vec2(-axis.y, axis.x);
+  vCenter = vec2(pixel.x, uSize.y - pixel.y); // gl_FragCoord counts from below
+  vToUnit = mat2(vec2(axis.x, -axis.y) / deviation.x, -axis.yx / deviation.y);
+  pixel += reach.x * axis + reach.y * vec2(-axis.y, axis.x);
 
   vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb;
   vec4 face = texelFetch(uFaces, texel(at + 3), 0);
@@ -124,13 +129,16 @@ void main() {
 }`;
 }
 
+// From the pixel's own place: an interpolated offset would move with the corners, which drivers round to a grid.
 export const SPLAT_FRAGMENT_SHADER = `#version 300 es
 precision highp float;
-in vec2 vOffset;
+flat in vec2 vCenter;
+flat in mat2 vToUnit;
 flat in vec4 vColor;
 out vec4 result;
 void main() {
-  float alpha = min(0.999, vColor.a * exp(-0.5 * dot(vOffset, vOffset)));
+  vec2 offset = (gl_FragCoord.xy - vCenter) * vToUnit; // in standard deviations
+  float alpha = min(0.999, vColor.a * exp(-0.5 * dot(offset, offset)));
   if (alpha < 1.0 / 255.0) discard;
   result = vec4(vColor.rgb * alpha, alpha);
 }`;
