@@ -108,7 +108,7 @@ def test_bare_interpreter_is_checked(tmp_path):
     """Catches a check that itself needs a package: this interpreter has none."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = str(venv_python(tmp_path / "venv"))
-    with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*matplotlib; install"):
+    with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*matplotlib, av; install"):
         check_python(python)
 
 
