@@ -10,7 +10,7 @@ TURNTABLE_S = 6.0
 """Duration of a turntable, unless the motion is longer."""
 UP = (0.0, 1.0, 0.0)
 """Captures are y-up."""
-MAX_GAP = np.radians(100)
+MAX_GAP_RAD = np.radians(100)
 """Radians without a camera from which on a side counts as unseen."""
 
 
@@ -35,11 +35,11 @@ def covered_angles(
 ) -> tuple[float, float]:
     """The angles about the vertical axis through `center` (3,), in radians from `start`, that the cameras cover.
 
-    Of what no camera saw, training has nothing to show. A full turn where they leave no gap of MAX_GAP.
+    Of what no camera saw, training has nothing to show. A full turn where they leave no gap of MAX_GAP_RAD.
     """
     seen = np.sort(np.append(azimuths(cameras, start, center, up), 0.0))
     gaps = np.diff(np.append(seen, seen[0] + 2 * np.pi))
-    if gaps.max() < MAX_GAP:
+    if gaps.max() < MAX_GAP_RAD:
         return -np.pi, np.pi
     widest = int(gaps.argmax())
     low, high = seen[(widest + 1) % len(seen)], seen[widest]

@@ -61,17 +61,17 @@ class TrainingSettings:
     selection      which triangles a frame trains
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
-    unbound_scale_limit  the limit of unbound splats, a multiple of the distance between hull points
+    distance_weight, distance_limit   the same for the distance from the triangle's origin
+    unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between hull points
     unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points that few cameras
                    see fade, unless nothing else explains what these cameras see
-    distance_weight, distance_limit   the same for the distance from the triangle's origin
     ema_share      share of the latest step in each splat's exponential moving average, which the avatar is made of;
                    1: no averaging
     stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a splat farther than the
                    limit from its triangle's origin is put back to this share of the limit; 0: onto the origin, as in
                    the paper
-                   All limits are multiples of sqrt(2·triangle area) for "stga", of the triangle's own unit of length
-                   for "gaussian_avatars"
+                   All limits but `unbound_scale_limit` are multiples of sqrt(2·triangle area) for "stga", of the
+                   triangle's own unit of length for "gaussian_avatars"
     sh_degree, sh_steps   highest SH degree, and the shares of the budget at which the degree rises by one
     hull_points    add hull points for what the mesh does not cover
     density_interval  iterations between density control, 0 never; it works during `density_span` of the budget

@@ -63,7 +63,9 @@ def test_children_stand_on_either_side_along_the_longest_axis() -> None:
     listed = [3, 17, 30, 8]
     state = busy_state(listed)
     parents = state.splats()
-    children = control(state).splats().rows(np.arange(COUNT - 4, COUNT + 4))
+    state.unseen_share[:] = torch.arange(COUNT) / COUNT
+    controlled = control(state)
+    children = controlled.splats().rows(np.arange(COUNT - 4, COUNT + 4))
     for n, row in enumerate(listed):
         pair = children.rows(np.array([n, n + 4]))
         assert (pair.face == parents.face[row]).all()
@@ -79,6 +81,7 @@ def test_children_stand_on_either_side_along_the_longest_axis() -> None:
         assert (shrunk[:, longest] > 0.2).all()
         np.testing.assert_array_equal(np.delete(shrunk, longest, axis=1), 0)
         np.testing.assert_array_equal(pair.sh, parents.sh[[row, row]])
+        assert (controlled.unseen_share[[COUNT - 4 + n, COUNT + n]] == state.unseen_share[row]).all()
 
 
 @pytest.mark.parametrize("opacity", [0.2, 0.5, 0.9, 0.99])

@@ -41,6 +41,22 @@ def test_regions_of_a_view(toy: Capture) -> None:
     assert not moving.target.flags.writeable
 
 
+def test_interior_leaves_out_the_matte_s_border(toy: Capture, tmp_path: Path) -> None:
+    """Catches an avatar that is chosen by the matte's border or the background, which differ from view to view."""
+    view, size = toy.views["val"][0], 400
+    camera = replace(view.camera, width=size, height=size)
+    mask = np.zeros((size, size), np.uint8)
+    mask[100:300, 100:300] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    Image.fromarray(np.repeat(mask[..., None], 3, 2)).save(tmp_path / "image.png")
+    view = replace(view, camera=camera, image=tmp_path / "image.png", mask=tmp_path / "mask.png")
+    interior = read_evaluation_view(toy, view).interior
+    assert interior is not None
+    rows, columns = np.nonzero(interior)
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (103, 296, 103, 296)  # 0.75 % of 400 pixels
+    assert interior.sum() > 0.99 * 194**2
+
+
 def test_only_the_nearest_triangle_is_seen(toy: Capture) -> None:
     """Catches pixels of triangles on the far side of the head, which no camera sees."""
     view = toy.views["val"][0]
@@ -61,3 +77,4 @@ def test_a_view_without_mask_has_no_head(toy: Capture, tmp_path: Path) -> None:
     Image.fromarray(factory.picture(0, 0)).save(path)
     view = replace(toy.views["val"][0], image=path, mask=None)
     assert "mask" not in read_evaluation_view(toy, view).regions
+    assert read_evaluation_view(toy, view).interior is None

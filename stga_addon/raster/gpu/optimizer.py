@@ -117,11 +117,11 @@ def scale_limit(
     if wanted[i] == UNMARKED or not (square[0] > 0.0):
         return
     factor = weight / wp.sqrt(square[0])
-    screen_gradient = wp.vec3()
+    v_log_scale = wp.vec3()
     for c in range(3):
         scale = wp.exp(log_scale[i][c])
-        screen_gradient[c] = factor * _over(scale, limits[int(unbound[i]), face[i]]) * scale
-    gradient[i] = gradient[i] + screen_gradient
+        v_log_scale[c] = factor * _over(scale, limits[int(unbound[i]), face[i]]) * scale
+    gradient[i] = gradient[i] + v_log_scale
 
 
 @wp.kernel
