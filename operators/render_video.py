@@ -94,7 +94,11 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         default=0.0,
     )
     seconds: bpy.props.FloatProperty(
-        name="Seconds", description="Duration of the turntable", default=TURNTABLE_S, min=0.1, soft_max=60.0
+        name="Seconds",
+        description="Least duration of the turntable; longer motion is played whole",
+        default=TURNTABLE_S,
+        min=0.1,
+        soft_max=60.0,
     )
     filename_ext = ""
     filter_glob: bpy.props.StringProperty(default="*.mp4", options={"HIDDEN"})
