@@ -160,8 +160,9 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             monitor.redraw()
             if more:
                 return {"RUNNING_MODAL"}
+            result = self._render(context)
             context.window_manager.event_timer_remove(self._timer)
-            return self._render(context)
+            return result
         except StgaError as error:
             self.cancel(context)
             self.report({"ERROR"}, str(error))
