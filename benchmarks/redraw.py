@@ -80,9 +80,12 @@ def measure(count: int, view: View, repeats: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=20)
+    repeats = parser.parse_args().repeats
+    if repeats < 1:
+        parser.error(f"--repeats must be at least 1, got {repeats}")
     view = View(look_at((0.1, 0.1, 0.6), (0, 0, 0), 1600, 1000, 1500))
     for count in (65_536, 200_000):
-        measure(count, view, parser.parse_args().repeats)
+        measure(count, view, repeats)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene.objects import Warn
-from ..stga_addon.scene.render.camera import render_camera
+from ..stga_addon.scene.render.camera_path import scene_camera
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second
@@ -55,16 +55,11 @@ def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
 
 def _scene_camera(context: Any, to_head: np.ndarray) -> dict[str, Camera]:
     """The scene's camera as the head sees it; none where the scene has no perspective camera."""
-    render = context.scene.render
-    share = render.resolution_percentage / 100
-    width, height = round(render.resolution_x * share), round(render.resolution_y * share)
-    depsgraph = context.evaluated_depsgraph_get()
-    camera = context.scene.camera and context.scene.camera.evaluated_get(depsgraph)
     try:
-        found = render_camera(camera, depsgraph, width, height, (0, 0, width, height))
+        found = scene_camera(context.evaluated_depsgraph_get())
     except StgaError:
         return {}
     pose = to_head @ found.camera_to_world_gl
     pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
-    seen = camera_from_gl(pose, width, height, found.fl_x, found.fl_y, found.cx, found.cy)
-    return {bpy.path.display_name(camera.name, has_ext=False): seen}
+    seen = camera_from_gl(pose, found.width, found.height, found.fl_x, found.fl_y, found.cx, found.cy)
+    return {bpy.path.display_name(context.scene.camera.name, has_ext=False): seen}

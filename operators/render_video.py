@@ -22,6 +22,7 @@ from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
 from ..stga_addon.scene.render.engine import srgb_background
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from ..stga_addon.scene.timeline import frames_per_second
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerState, inspect_worker, request_cancel
 from . import ids, monitor
@@ -93,7 +94,11 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         default=0.0,
     )
     seconds: bpy.props.FloatProperty(
-        name="Seconds", description="Duration of the turntable", default=TURNTABLE_S, min=0.1, soft_max=60.0
+        name="Seconds",
+        description="Least duration of the turntable; longer motion is played whole",
+        default=TURNTABLE_S,
+        min=0.1,
+        soft_max=60.0,
     )
     filename_ext = ""
     filter_glob: bpy.props.StringProperty(default="*.mp4", options={"HIDDEN"})
@@ -127,7 +132,8 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         if self.format == "png" and output.suffix.lower() == ".mp4":
             output = output.with_suffix("")
         self._python = training_python(context)
-        self._recording = _Recording(context, output, self._frames(context), self._cameras(context))
+        frames = self._frames(context)
+        self._recording = _Recording(context, output, frames, self._cameras(context, len(frames)))
         if bpy.app.background:
             return self._record_and_render(context)
         self._timer = context.window_manager.event_timer_add(RECORDING_INTERVAL_S, window=context.window)
@@ -154,8 +160,9 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             monitor.redraw()
             if more:
                 return {"RUNNING_MODAL"}
+            result = self._render(context)
             context.window_manager.event_timer_remove(self._timer)
-            return self._render(context)
+            return result
         except StgaError as error:
             self.cancel(context)
             self.report({"ERROR"}, str(error))
@@ -172,15 +179,14 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         frames = list(range(scene.frame_start, scene.frame_end + 1))
         if self.path == "scene":
             return frames
-        return to_and_fro(frames, max(len(frames), round(self.seconds * _fps(scene)), 1))
+        return to_and_fro(frames, max(len(frames), round(self.seconds * frames_per_second(scene)), 1))
 
-    def _cameras(self, context: Any) -> Sequence[Camera] | None:
-        """One camera per frame, None for the scene's own at each frame."""
+    def _cameras(self, context: Any, count: int) -> Sequence[Camera] | None:
+        """One camera per frame of `count`, None for the scene's own at each frame."""
         if self.path == "scene":
             return None
         settings = scene_settings(context)
         subject = settings.head if is_head(settings.head) else settings.splats
-        count = len(self._frames(context))
         return turntable_cameras(subject, context.evaluated_depsgraph_get(), count, self.angle)
 
     def _render(self, context: Any, wait: bool = False) -> set[str]:
@@ -253,7 +259,7 @@ class _Recording:
         self._shown = context.scene.frame_current, context.scene.frame_subframe
         self._cache, self._layers = SplatCache(), dict[int, list[PosedSplats]]()
         folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
-        job = VideoJob(output, len(frames), _fps(context.scene), srgb_background(context.scene))
+        job = VideoJob(output, len(frames), frames_per_second(context.scene), srgb_background(context.scene))
         self._recorder = Recorder(folder, job)
         self.video = Video(output, folder, len(frames))
         last = _videos.get(context.scene.session_uid)
@@ -299,10 +305,6 @@ class _Recording:
         frame, subframe = self._shown
         with suppress(ReferenceError):  # another file was opened
             self._scene.frame_set(frame, subframe=subframe)
-
-
-def _fps(scene: Any) -> float:
-    return float(scene.render.fps / scene.render.fps_base)
 
 
 def _wait(video: Video, process: "subprocess.Popen[bytes]") -> None:

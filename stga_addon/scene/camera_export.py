@@ -10,7 +10,7 @@ from ..capture.camera import Camera
 from ..errors import StgaError
 from ..files import write_json
 from . import tags
-from .render.camera import render_camera
+from .render.camera import image_size, render_camera
 
 
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
@@ -30,9 +30,7 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
 def _camera(camera: Any, depsgraph: Any) -> Camera:
     if np.linalg.det(np.array(camera.matrix_world.to_3x3())) < 0:
         raise StgaError(f"{camera.name}: is mirrored by a negative scale; apply the scale")
-    render = depsgraph.scene.render
-    share = render.resolution_percentage / 100
-    size = camera.get(tags.IMAGE_SIZE) or (int(render.resolution_x * share), int(render.resolution_y * share))
+    size = camera.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
     width, height = (int(pixels) for pixels in size)
     return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
 

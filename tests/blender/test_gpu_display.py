@@ -108,10 +108,15 @@ def test_cache_follows_new_splats_and_shapes():
 
 
 def test_nothing_is_drawn_by_nodes():
-    """Catches points drawn over the GPU's picture in viewports, and images of other engines that lack the splats."""
-    show_world_splats(random_splats(1, 10), "scan")
-    kinds = {instance.object.type for instance in bpy.context.evaluated_depsgraph_get().object_instances}
-    assert "POINTCLOUD" not in kinds
+    """Catches points that viewports draw over the GPU's picture."""
+    shown = show_world_splats(random_splats(1, 10), "scan")
+
+    def kinds() -> set[str]:
+        return {instance.object.type for instance in bpy.context.evaluated_depsgraph_get().object_instances}
+
+    assert "POINTCLOUD" not in kinds()
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
+    assert "POINTCLOUD" in kinds()
 
 
 def test_an_error_ends_the_display(monkeypatch, capsys):

@@ -126,3 +126,23 @@ def test_picture_equals_the_rasterizers(name: str) -> None:
 
     run_with_gpu(draw)
     check(found[0], layers, camera, exact=name == "orthographic")
+
+
+@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+def test_clip_planes() -> None:
+    """Catches splats outside a viewport's clipping region, and planes taken for those of another space."""
+    camera, of = cases()["sh 0"][1], avatar(0)
+    planes = np.array([[1.0, 0.2, 0.0, 0.0], [0.0, 1.0, 0.0, 0.02]])
+    world = to_world(of.splats, of.frames(of.neutral))
+    inside = (np.c_[world.xyz, np.ones(len(world))] @ planes.T >= 0).all(1)
+    found: list[ComposedImage] = []
+
+    def draw() -> None:
+        renderer = SplatRenderer()
+        renderer.draw([SceneLayer(world, WORLD, np.eye(4))], View(camera, clip_planes=planes))
+        found.append(renderer.read())
+
+    run_with_gpu(draw)
+    expected = compose([SceneLayer(world.rows(inside), WORLD, np.eye(4)).posed()], camera)
+    assert 0.2 < inside.mean() < 0.8
+    assert psnr_db(found[0].rgb, expected.rgb) >= MIN_PSNR_DB

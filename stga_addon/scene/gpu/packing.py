@@ -17,7 +17,7 @@ from ..layers import SceneLayer, random_percentage
 NEAR_M = 0.01
 """Splats nearer to the camera than this are dropped, as by the rasterizer."""
 CLIP_PLANES = 6
-VIEW_TEXELS = 3 + CLIP_PLANES
+VIEW_TEXELS = 2 + CLIP_PLANES
 LAYER_TEXELS = 5
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
@@ -162,7 +162,7 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
     planes = np.zeros((0, 4)) if view.clip_planes is None else view.clip_planes @ np.linalg.inv(camera.world_to_camera)
     texels[0] = camera.fl_x, camera.fl_y, camera.cx, camera.cy
     texels[1] = camera.width, camera.height, len(planes), 0
-    texels[3 : 3 + len(planes)] = planes
+    texels[2 : 2 + len(planes)] = planes
     for layer, first, row in zip(layers, static.rows, texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4), strict=True):
         settings = layer.settings
         row[0] = first

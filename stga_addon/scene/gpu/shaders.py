@@ -6,7 +6,7 @@ Textures of `packing.py`, each 2048 texels wide and read by texel index:
     axes     per splat: three axes times standard deviations; beside them opacity, random percentage, layer
     colors   per splat: spherical harmonics, then strain colors
     frames   three rows of the triangles' maps to camera space (all triangles' first rows, then second, …), then strain
-    table    the view: focal lengths and principal point; width, height, number of clip planes; –; 6 clip planes;
+    table    the view: focal lengths and principal point; width, height, number of clip planes; 6 clip planes;
              per layer: first color, first splat, colors per splat, degree; antialiased, strained, size, opacity
              threshold; three rows of the matrix to directions, with percentage, show selection, selected only
 """
@@ -93,7 +93,7 @@ void main()
   vec3 p = vec3(dot(r0, local), dot(r1, local), dot(r2, local));
   vec4 lens = texelFetch(table, at(0), 0), image = texelFetch(table, at(1), 0);
   for (int plane = 0; plane < CLIP_PLANES; plane++) {
-    if (plane < int(image.z) && dot(texelFetch(table, at(3 + plane), 0), vec4(p, 1.0)) < 0.0) {
+    if (plane < int(image.z) && dot(texelFetch(table, at(2 + plane), 0), vec4(p, 1.0)) < 0.0) {
       return;
     }
   }

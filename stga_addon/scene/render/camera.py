@@ -12,6 +12,12 @@ ORTHOGRAPHIC_DISTANCE = 1000.0
 """An orthographic view is rendered in perspective from this many times its own width away."""
 
 
+def image_size(render: Any) -> tuple[int, int]:
+    """Width and height in pixels of final images by a scene's render settings."""
+    share = render.resolution_percentage / 100
+    return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
+
+
 def render_camera(camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int]) -> Camera:
     """The scene's camera for a final image of width × height pixels.
 

@@ -8,7 +8,7 @@ from ...capture.camera import Camera, camera_from_gl
 from ...capture.camera_path import covered_angles, turntable
 from .. import tags
 from ..arrays import evaluated_vertices, mesh_vertices
-from .camera import render_camera
+from .camera import image_size, render_camera
 
 UP = (0.0, 0.0, 1.0)
 """Blender's scenes are z-up."""
@@ -17,9 +17,7 @@ UP = (0.0, 0.0, 1.0)
 def scene_camera(depsgraph: Any) -> Camera:
     """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is perspective."""
     scene = depsgraph.scene
-    render = scene.render
-    scale = render.resolution_percentage / 100
-    width, height = max(1, int(render.resolution_x * scale)), max(1, int(render.resolution_y * scale))
+    width, height = image_size(scene.render)
     camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
     return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
 

@@ -193,8 +193,7 @@ class Viewport:
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._gpu.draw(self._layers, view)
-        behind = None if color is None else tuple(linear_to_srgb(np.clip(np.array(color), 0, 1)).tolist())
-        self._gpu.composite((x, y), to_depth, behind)
+        self._gpu.composite((x, y), to_depth, srgb_background(depsgraph.scene))
 
 
 def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:
