@@ -58,7 +58,7 @@ def test_range_step_and_offset(tmp_path):
     ],
 )
 def test_recordings_out_of_step(tmp_path, counts, frames, message):
-    """Catches frames of different moments paired without a word."""
+    """Catches frames of different moments silently paired."""
     write_folders(tmp_path, counts)
     with pytest.raises(StgaError, match=message):
         open_footage(tmp_path, frames=frames)

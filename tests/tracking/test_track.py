@@ -102,7 +102,7 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
 
 @pytest.mark.parametrize("offset", ["cam0", "cam0=soon", "=", "cam0=1.5"])
 def test_offsets_that_are_none(recorded, capsys, offset):
-    """Catches an offset that is left out without a word."""
+    """Catches an offset that is silently ignored."""
     with pytest.raises(SystemExit, match="2"):
         command(recorded[0], "--offset", offset)
     assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
