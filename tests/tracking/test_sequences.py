@@ -218,6 +218,14 @@ def test_two_cameras_without_calibration(tmp_path):
         open_footage(tmp_path / "empty")
 
 
+def test_folders_named_as_calibrations(tmp_path):
+    """Catches a traceback where a folder's name ends as an export's does."""
+    write_image(tmp_path / "a/1.png", 90)
+    (tmp_path / "old.xml").mkdir()
+    (tmp_path / "old.csv").mkdir()
+    assert not open_footage(tmp_path).calibrated
+
+
 def test_distorted_frames_are_undistorted(tmp_path):
     """Catches frames handed out as recorded beside a pinhole camera that does not show them."""
     pytest.importorskip("cv2")
