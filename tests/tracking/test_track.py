@@ -108,6 +108,20 @@ def test_offsets_that_are_none(recorded, capsys, offset):
     assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
 
 
+def test_landmark_files_and_a_detector(recorded, capsys):
+    """Catches a detector that is silently ignored beside landmark files."""
+    with pytest.raises(SystemExit, match="2"):
+        command(recorded[0], "--detector", "face_landmarker.task")
+    assert "--detector: not allowed with argument --landmarks" in capsys.readouterr().err
+
+
+def test_offsets_of_listed_frames(recorded, capsys):
+    """Catches an offset that is silently ignored where the calibration lists frames by timestep."""
+    assert command(recorded[0], "--offset", "cam1=3") == 2
+    assert "transforms.json: lists images, which offsets do not apply to; expected none" in capsys.readouterr().err
+    assert not (recorded[0] / "out").exists()
+
+
 def test_a_linear_model_gives_a_mesh_capture(recorded, head):
     """Catches a layout that only FLAME's own files open in."""
     folder, _ = recorded
