@@ -15,12 +15,14 @@ from stga_addon.files import read_json, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import calibrate, nearest_points
 from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
 from stga_addon.tracking.mesh_image import rasterize, shaded_image
 from stga_addon.tracking.track import track
 
 from .test_fit import frame_at, places_on
+from .test_sequences import write_folders
 
 SIZE, LANDMARKS = 64, 120
 
@@ -226,6 +228,19 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
     camera = footage.cameras[0]
     np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+
+
+def test_landmarks_of_another_offset_are_not_used_again(tmp_path, head, monkeypatch):
+    """Catches landmarks of a run that was out of step taken for those of the corrected offset."""
+    write_folders(tmp_path / "footage", (6, 8))
+    write_flame(head.model, tmp_path / "head.npz")
+    places = places_on(head, LANDMARKS)
+    monkeypatch.setattr("stga_addon.tracking.track.make_detector", lambda task: Counting([]))
+    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
+    for offset, message in ((1, "shows no face"), (1, "shows no face"), (2, "holds landmarks of other footage")):
+        footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset}))
+        with pytest.raises(StgaError, match=message):
+            track(footage, tmp_path / "head.npz", tmp_path / "out")
 
 
 def test_two_faces_are_reported_with_camera_and_frame(recorded):
