@@ -71,6 +71,8 @@ def track(
     """
     if any((out / name).exists() for name in (*SPLIT_FILES, "transforms.json")):
         raise StgaError(f"{out}: already holds a capture; give another --out")
+    if out.resolve() == footage.root:
+        raise StgaError(f"{out}: is the folder of the footage; give another --out")
     head = read_head_model(head_file)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
@@ -150,18 +152,18 @@ def _begin(out: Path, footage: Footage, head_file: Path, task: Path | None) -> N
     path = out / LANDMARKS_FOLDER / "footage.json"
     source = {
         "footage": str(footage.root),
-        "cameras": {camera.name: _first_image(camera) for camera in footage.cameras},
+        "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
         "head_model": str(head_file.resolve()),
         "detector": None if task is None else str(task.resolve()),
     }
     if path.exists() and read_json(path) != source:
-        raise StgaError(f"{out}: holds landmarks of other footage, frames or detector; give another --out, or delete it")
+        raise StgaError(f"{out}: holds landmarks of other footage or detector; give another --out, or delete it")
     write_json(path, source)
 
 
-def _first_image(camera: FootageCamera) -> list[Any]:
-    """What changes where an offset or an undistortion does: the first frame, and the pinhole that it is resampled to."""
+def _recording(camera: FootageCamera) -> list[Any]:
+    """The first frame and how it is undistorted; it changes with offset, lens and focal length."""
     first, pinhole = camera.source(camera.timesteps[0]), camera.camera
     if camera.undistortion is None:
         return [first]

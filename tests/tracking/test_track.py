@@ -230,6 +230,13 @@ def test_detection_resumes_camera_by_camera(recorded):
     np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
 
 
+def test_the_capture_is_not_written_into_the_footage(tmp_path):
+    """Catches images of the footage that those of the capture replace."""
+    write_folders(tmp_path)
+    with pytest.raises(StgaError, match="is the folder of the footage; give another --out"):
+        track(open_footage(tmp_path), tmp_path / "head.npz", tmp_path)
+
+
 def test_landmarks_of_another_offset_are_not_used_again(tmp_path, head, monkeypatch):
     """Catches landmarks of a run that was out of step taken for those of the corrected offset."""
     write_folders(tmp_path / "footage", (6, 8))
