@@ -18,6 +18,7 @@ import numpy as np
 
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
+from stga_addon.flame.teeth import TEETH_VERTICES
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
@@ -72,7 +73,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         local = found.mesh(timestep) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         local = (local / result.scale - known.world_to_camera[:3, 3]) @ known.world_to_camera[:3, :3]
         distance = 1000 * nearest_points(true.mesh(timestep), true.faces, local[face])[1]
-        same = len(found.faces) == len(true.faces) or len(true.mesh(timestep)) - len(local) == 120
+        same = len(found.faces) == len(true.faces) or len(true.mesh(timestep)) - len(local) == TEETH_VERTICES
         shift = 1000 * np.linalg.norm(local[face] - true.mesh(timestep)[face], axis=1).mean() if same else np.nan
         print(f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |")
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")

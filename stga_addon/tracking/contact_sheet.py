@@ -106,19 +106,10 @@ def _tile(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.nda
     """The head in the image, beside it the same with the mesh; below, the caption."""
     left, top, right, bottom = _head_box(camera, vertices)
     scale = min(PICTURE[0] / (right - left), PICTURE[1] / (bottom - top))
-    size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
-    picture = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC, box=(left, top, right, bottom))
     cropped = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
-    x, y = size[0] / cropped.width, size[1] / cropped.height
-    small = replace(
-        cropped,
-        width=size[0],
-        height=size[1],
-        fl_x=camera.fl_x * x,
-        fl_y=camera.fl_y * y,
-        cx=cropped.cx * x,
-        cy=cropped.cy * y,
-    )
+    small = cropped.scaled(scale)
+    size, box = (small.width, small.height), (left, top, right, bottom)
+    picture = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC, box=box)
     tile = Image.new("RGB", _tile_size(), BACKGROUND)
     tile.paste(picture, (0, 0))
     tile.paste(Image.fromarray(_with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0))

@@ -168,7 +168,8 @@ def _distinct(faces: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of the bounding boxes of points (N, 2)."""
+    """Intersection over union of the bounding boxes of points (N, 2); 1 for boxes without area."""
     low, high = np.maximum(a.min(0), b.min(0)), np.minimum(a.max(0), b.max(0))
     common = np.maximum(high - low, 0).prod()
-    return float(common / (np.ptp(a, axis=0).prod() + np.ptp(b, axis=0).prod() - common))
+    union = np.ptp(a, axis=0).prod() + np.ptp(b, axis=0).prod() - common
+    return float(common / union) if union else 1.0

@@ -13,7 +13,7 @@ from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
 from .fit import HeadFit, TimestepLandmarks, fit_head
-from .footage.model import Footage
+from .footage.model import Footage, FootageCamera
 from .head_model import read_head_model
 from .landmarks import (
     PLACES_FILE,
@@ -71,6 +71,8 @@ def track(
     """
     if any((out / name).exists() for name in (*SPLIT_FILES, "transforms.json")):
         raise StgaError(f"{out}: already holds a capture; give another --out")
+    if out.resolve() == footage.root:
+        raise StgaError(f"{out}: is the folder of the footage; give another --out")
     head = read_head_model(head_file)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
@@ -79,7 +81,7 @@ def track(
         detector = make_detector(task)
         report("Head model", 0, 1)
         places, reliable = calibrate(head.model, detector)
-        _begin(out, footage, head_file)
+        _begin(out, footage, head_file, task)
         write_places(out / LANDMARKS_FOLDER / PLACES_FILE, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
     seen = sorted(timesteps_with_landmarks(found) & set(footage.timesteps))
@@ -145,18 +147,27 @@ def reprojection_errors(
     return errors
 
 
-def _begin(out: Path, footage: Footage, head_file: Path) -> None:
+def _begin(out: Path, footage: Footage, head_file: Path, task: Path | None) -> None:
     """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
     path = out / LANDMARKS_FOLDER / "footage.json"
     source = {
         "footage": str(footage.root),
-        "cameras": [camera.name for camera in footage.cameras],
+        "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
         "head_model": str(head_file.resolve()),
+        "detector": None if task is None else str(task.resolve()),
     }
     if path.exists() and read_json(path) != source:
-        raise StgaError(f"{out}: holds landmarks of other footage or frames; give another --out, or delete it")
+        raise StgaError(f"{out}: holds landmarks of other footage or detector; give another --out, or delete it")
     write_json(path, source)
+
+
+def _recording(camera: FootageCamera) -> list[Any]:
+    """The first frame and how it is undistorted; it changes with offset, lens and focal length."""
+    first, pinhole = camera.source(camera.timesteps[0]), camera.camera
+    if camera.undistortion is None:
+        return [first]
+    return [first, repr(camera.undistortion.lens), pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy]
 
 
 def _check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:

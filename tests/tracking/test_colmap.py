@@ -94,7 +94,7 @@ def test_damaged_models_are_named(tmp_path, file, old, new, message):
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
 def test_binary_files_cut_short(tmp_path, file):
-    """Catches an error of the decoder, or a model that is read in part without a word."""
+    """Catches an error of the decoder, or a model that is silently read in part."""
     reconstruction().write_binary(str(tmp_path))
     data = (tmp_path / file).read_bytes()
     huge = data[:-8] + b"\xff" * 8  # the last number of points, where it is one

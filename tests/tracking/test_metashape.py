@@ -92,7 +92,7 @@ def test_projections_are_metashapes(tmp_path, kind, angle_of):
 
 
 def test_labels_are_image_names_or_paths(tmp_path):
-    """Catches labels with a suffix, without, and of another computer; and a camera left out in silence."""
+    """Catches labels with a suffix, without, and of another computer; and a camera silently left out."""
     pytest.importorskip("cv2")
     labels = ["left", "middle.png", "D:\\shoot\\day 1\\right.png"]
     write_export(tmp_path / "cameras.xml", rig(), labels)

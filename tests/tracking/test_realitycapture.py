@@ -145,7 +145,7 @@ def test_damaged_csv_is_named(tmp_path, line, message):
 
 
 def test_two_calibrations(tmp_path):
-    """Catches one of two exports chosen without a word."""
+    """Catches one of two exports silently chosen."""
     for name in ("first.csv", "second.csv"):
         (tmp_path / name).write_text(f"{HEADER}\na.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0\n", encoding="utf-8")
     write_image(tmp_path / "a.png")

@@ -58,7 +58,7 @@ def test_range_step_and_offset(tmp_path):
     ],
 )
 def test_recordings_out_of_step(tmp_path, counts, frames, message):
-    """Catches frames of different moments paired without a word."""
+    """Catches frames of different moments silently paired."""
     write_folders(tmp_path, counts)
     with pytest.raises(StgaError, match=message):
         open_footage(tmp_path, frames=frames)
@@ -216,6 +216,14 @@ def test_two_cameras_without_calibration(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
         open_footage(tmp_path / "empty")
+
+
+def test_folders_named_as_calibrations(tmp_path):
+    """Catches a traceback where a folder's name ends as an export's does."""
+    write_image(tmp_path / "a/1.png", 90)
+    (tmp_path / "old.xml").mkdir()
+    (tmp_path / "old.csv").mkdir()
+    assert not open_footage(tmp_path).calibrated
 
 
 def test_distorted_frames_are_undistorted(tmp_path):

@@ -15,12 +15,14 @@ from stga_addon.files import read_json, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import calibrate, nearest_points
 from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
 from stga_addon.tracking.mesh_image import rasterize, shaded_image
 from stga_addon.tracking.track import track
 
 from .test_fit import frame_at, places_on
+from .test_sequences import write_folders
 
 SIZE, LANDMARKS = 64, 120
 
@@ -102,10 +104,24 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
 
 @pytest.mark.parametrize("offset", ["cam0", "cam0=soon", "=", "cam0=1.5"])
 def test_offsets_that_are_none(recorded, capsys, offset):
-    """Catches an offset that is left out without a word."""
+    """Catches an offset that is silently ignored."""
     with pytest.raises(SystemExit, match="2"):
         command(recorded[0], "--offset", offset)
     assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
+
+
+def test_landmark_files_and_a_detector(recorded, capsys):
+    """Catches a detector that is silently ignored beside landmark files."""
+    with pytest.raises(SystemExit, match="2"):
+        command(recorded[0], "--detector", "face_landmarker.task")
+    assert "--detector: not allowed with argument --landmarks" in capsys.readouterr().err
+
+
+def test_offsets_of_listed_frames(recorded, capsys):
+    """Catches an offset that is silently ignored where the calibration lists frames by timestep."""
+    assert command(recorded[0], "--offset", "cam1=3") == 2
+    assert "transforms.json: lists images, which offsets do not apply to; expected none" in capsys.readouterr().err
+    assert not (recorded[0] / "out").exists()
 
 
 def test_a_linear_model_gives_a_mesh_capture(recorded, head):
@@ -212,6 +228,26 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
     camera = footage.cameras[0]
     np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+
+
+def test_the_capture_is_not_written_into_the_footage(tmp_path):
+    """Catches images of the footage that those of the capture replace."""
+    write_folders(tmp_path)
+    with pytest.raises(StgaError, match="is the folder of the footage; give another --out"):
+        track(open_footage(tmp_path), tmp_path / "head.npz", tmp_path)
+
+
+def test_landmarks_of_another_offset_are_not_used_again(tmp_path, head, monkeypatch):
+    """Catches landmarks of a run that was out of step taken for those of the corrected offset."""
+    write_folders(tmp_path / "footage", (6, 8))
+    write_flame(head.model, tmp_path / "head.npz")
+    places = places_on(head, LANDMARKS)
+    monkeypatch.setattr("stga_addon.tracking.track.make_detector", lambda task: Counting([]))
+    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
+    for offset, message in ((1, "shows no face"), (1, "shows no face"), (2, "holds landmarks of other footage")):
+        footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset}))
+        with pytest.raises(StgaError, match=message):
+            track(footage, tmp_path / "head.npz", tmp_path / "out")
 
 
 def test_two_faces_are_reported_with_camera_and_frame(recorded):

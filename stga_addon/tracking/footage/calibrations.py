@@ -29,8 +29,8 @@ def find_calibration(root: Path) -> Path | None:
     colmap = find_colmap(root)
     if colmap is not None:
         return colmap
-    xml = [path for path in sorted(root.glob("*.xml")) if _is_metashape(path)]
-    tables = [path for path in sorted(root.glob("*.csv")) if is_realitycapture_csv(path)]
+    xml = [path for path in sorted(root.glob("*.xml")) if isfile(path) and _is_metashape(path)]
+    tables = [path for path in sorted(root.glob("*.csv")) if isfile(path) and is_realitycapture_csv(path)]
     if len(xml + tables) > 1:
         raise StgaError(f"{root}: {(xml + tables)[0].name} and {(xml + tables)[1].name} are calibrations; choose one")
     folders = [folder for folder in (root, root / "images") if any(folder.glob("*.xmp"))]

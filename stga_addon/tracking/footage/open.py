@@ -50,10 +50,13 @@ def open_footage(
     if focal is not None:
         raise StgaError(f"{calibration}: has focal lengths; expected none besides")
     shots, warnings = read_calibration(calibration, principal_point, partial(_image_size, sources))
-    if any(shot.timestep is not None for shot in shots):
+    timed = any(shot.timestep is not None for shot in shots)
+    names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
+    if frames.offsets and not any(names):
+        raise StgaError(f"{calibration}: lists images, which offsets do not apply to; expected none")
+    if timed:
         found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
         return _footage(root, found, warnings=warnings)
-    names = sequence_names(sources, (shot.label for shot in shots))
     if any(names):
         rig = _by_name(shots, names, root)
         sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
