@@ -256,6 +256,8 @@ def test_export_refuses_what_does_not_fit(
     assert "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web" in message
     message = refused(capsys, "export", trained, "--format", "usd", "--timestep", 1, *out)
     assert "--timestep cannot be combined with --format usd" in message
+    message = refused(capsys, "export", trained, "--format", "ply", "--motion-only", *out)
+    assert "--motion-only cannot be combined with --format ply, only with web" in message
     message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)
     assert "has no timestep from 7 to 9" in message
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
