@@ -236,10 +236,10 @@ def test_export_a_range_as_usd(trained: Path, tmp_path: Path, capsys: pytest.Cap
     assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [1, 3]
 
 
-@pytest.mark.parametrize(("format", "magic"), [("gltf", b"glTF"), ("spz", b"\x1f\x8b")])
-def test_export_one_frame(trained: Path, tmp_path: Path, format: str, magic: bytes) -> None:
+@pytest.mark.parametrize(("format", "suffix", "magic"), [("gltf", ".glb", b"glTF"), ("spz", ".spz", b"\x1f\x8b")])
+def test_export_one_frame(trained: Path, tmp_path: Path, format: str, suffix: str, magic: bytes) -> None:
     """Catches a format that the command cannot write, or writes for another frame than asked for."""
-    files = [tmp_path / "neutral", tmp_path / "frame"]
+    files = [tmp_path / f"neutral{suffix}", tmp_path / f"frame{suffix}"]
     for out, chosen in zip(files, ([], ["--timestep", "3"]), strict=True):
         assert main(["export", str(trained), "--format", format, "--out", str(out), *chosen]) == 0
     neutral, frame = (out.read_bytes() for out in files)
