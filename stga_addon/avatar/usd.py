@@ -16,8 +16,8 @@ EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 
 
-def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool = False) -> int:
-    """Write numbered world-space splats as the time samples of one prim, atomically; returns how many there were.
+def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool = False) -> None:
+    """Write numbered world-space splats as the time samples of one prim, atomically.
 
     path          .usdc, or .usdz, a package of the same
     frames        at least one pair of a time code and splats, time codes ascending
@@ -32,14 +32,14 @@ def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, movi
     usd = _import_usd(path)
     with replacing(path) as partial:
         if path.suffix.lower() == ".usdc":
-            return _write_layer(usd, partial, frames, fps, moving_color)
+            _write_layer(usd, partial, frames, fps, moving_color)
+            return
         layer = partial.with_name(f".layer{partial.name}")
         try:
-            count = _write_layer(usd, layer, frames, fps, moving_color)
+            _write_layer(usd, layer, frames, fps, moving_color)
             writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter  # there before USD 26
             with writer.CreateNew(str(partial)) as archive:
                 archive.AddFile(str(layer), f"{path.stem}.usdc")
-            return count
         finally:
             layer.unlink(missing_ok=True)
 
@@ -62,7 +62,7 @@ def _import_usd(path: Path) -> Any:
     return pxr
 
 
-def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool) -> int:
+def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool) -> None:
     layer = usd.Sdf.Layer.New(usd.Sdf.FileFormat.FindById("usdc"), str(file))
     stage = usd.Usd.Stage.Open(layer)
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -70,7 +70,6 @@ def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
     prim = None
-    count = 0
     for number, world in frames:
         if prim is None:
             prim = _define(usd, stage, world, moving_color)
@@ -78,8 +77,6 @@ def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps
         _write_sample(usd, prim, number, world, moving_color)
         stage.SetEndTimeCode(number)
         layer.Save()
-        count += 1
-    return count
 
 
 def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:

@@ -11,7 +11,7 @@ from ..format import format_bytes
 from ..jobs.delegate import OpenHead
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
 from .export_web import export_web
-from .inputs import open_avatar
+from .inputs import open_avatar, required_capture, timesteps_between
 
 NAME, HELP = "export", "write an avatar in another format"
 
@@ -48,6 +48,8 @@ def run(options: Namespace) -> None:
             raise StgaError(
                 f"--{option} cannot be combined with --format {options.format}, only with {', '.join(names)}"
             )
+    if options.motion_only and options.format != "web":
+        raise StgaError(f"--motion-only cannot be combined with --format {options.format}, only with web")
     if options.format == "web":
         export_web(avatar, capture, options)
         return
@@ -65,7 +67,7 @@ def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> Mes
     if timestep is None:
         yield 0, avatar.neutral
         return
-    capture = _required(capture)
+    capture = required_capture(capture)
     if timestep not in capture.timesteps:
         raise StgaError(f"{capture.root}: has no timestep {timestep}")
     yield timestep, capture.mesh(timestep)
@@ -75,18 +77,9 @@ def _range(avatar: Avatar, capture: Capture | None, options: Namespace) -> Meshe
     """The meshes of --frames, with a progress bar; says how much room they take, and refuses what the disk lacks."""
     from tqdm import tqdm
 
-    capture = _required(capture)
-    first, last = options.frames or (capture.timesteps[0], capture.timesteps[-1])
-    timesteps = [timestep for timestep in capture.timesteps if first <= timestep <= last]
-    if not timesteps:
-        raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
+    capture = required_capture(capture)
+    timesteps = timesteps_between(capture, options.frames)
     size = range_bytes(avatar, options.format, len(timesteps))
     check_free_space(options.out, size)
     print(f"{len(timesteps)} frames of {len(avatar.splats)} splats: about {format_bytes(size)}")
     return ((timestep, capture.mesh(timestep)) for timestep in tqdm(timesteps, desc="Exporting", unit="frame"))
-
-
-def _required(capture: Capture | None) -> Capture:
-    if capture is None:
-        raise StgaError("frames other than the neutral mesh need a capture; give --capture")
-    return capture

@@ -12,22 +12,20 @@ from ..avatar.playback import MAX_VIEWS, Playback
 from ..avatar.web.write import RIG_NOTICE
 from ..capture.camera import Camera
 from ..capture.model import Capture
-from ..errors import StgaError
 from ..selection import SelectionOptions, select_capture
+from .inputs import required_capture, timesteps_between
 
 SPLITS = ("val", "train", "test")
 
 
 def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> None:
     """Write the page of --out with the capture's timesteps (--frames), or the neutral mesh without a capture."""
-    if capture is None:
+    if capture is None and options.frames is None:
         playback = Playback(title=_title(options), fps=options.fps, motion_only=True)
         export_avatar(options.out, avatar, "web", [(0, avatar.neutral)], playback=playback)
         return
-    first, last = options.frames or (capture.timesteps[0], capture.timesteps[-1])
-    timesteps = tuple(timestep for timestep in capture.timesteps if first <= timestep <= last)
-    if not timesteps:
-        raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
+    capture = required_capture(capture)
+    timesteps = timesteps_between(capture, options.frames)
     playback = Playback(
         title=_title(options),
         fps=options.fps,

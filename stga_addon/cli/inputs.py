@@ -38,6 +38,27 @@ def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | Non
     return avatar, capture if options.head is None else options.head.played(capture)
 
 
+def required_capture(capture: Capture | None) -> Capture:
+    """Raise StgaError where `open_avatar` found no capture."""
+    if capture is None:
+        raise StgaError("frames other than the neutral mesh need a capture; give --capture")
+    return capture
+
+
+def timesteps_between(capture: Capture, span: tuple[int, int] | None) -> tuple[int, ...]:
+    """The capture's timesteps from the first to the last of `span`, inclusive; None: all of them.
+
+    Raises StgaError where there is none.
+    """
+    if span is None:
+        return tuple(capture.timesteps)
+    first, last = span
+    timesteps = tuple(timestep for timestep in capture.timesteps if first <= timestep <= last)
+    if not timesteps:
+        raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
+    return timesteps
+
+
 def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
     """The capture of a run, or another one whose meshes are to drive its avatar; with the run's refined tracking."""
     from ..training.optimize.tracking import with_refined_tracking

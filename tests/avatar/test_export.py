@@ -44,3 +44,11 @@ def test_missing_source(format, avatar, tmp_path):
     with pytest.raises(StgaError, match=r"FLAME parameters|no posed mesh"):
         export_avatar(tmp_path / "out", avatar, format)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("format", ["gltf", "spz"])
+def test_other_suffixes_are_refused(format, avatar, tmp_path):
+    """Catches binary glTF under the name of its text form, and a file under a name that no viewer opens."""
+    with pytest.raises(StgaError, match=r"a\.gltf: expected a name that ends in \.(glb|spz)"):
+        export_avatar(tmp_path / "a.gltf", avatar, format, [(0, avatar.neutral)])
+    assert list(tmp_path.iterdir()) == []

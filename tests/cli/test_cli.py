@@ -236,10 +236,10 @@ def test_export_a_range_as_usd(trained: Path, tmp_path: Path, capsys: pytest.Cap
     assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [1, 3]
 
 
-@pytest.mark.parametrize(("format", "magic"), [("gltf", b"glTF"), ("spz", b"\x1f\x8b")])
-def test_export_one_frame(trained: Path, tmp_path: Path, format: str, magic: bytes) -> None:
+@pytest.mark.parametrize(("format", "suffix", "magic"), [("gltf", ".glb", b"glTF"), ("spz", ".spz", b"\x1f\x8b")])
+def test_export_one_frame(trained: Path, tmp_path: Path, format: str, suffix: str, magic: bytes) -> None:
     """Catches a format that the command cannot write, or writes for another frame than asked for."""
-    files = [tmp_path / "neutral", tmp_path / "frame"]
+    files = [tmp_path / f"neutral{suffix}", tmp_path / f"frame{suffix}"]
     for out, chosen in zip(files, ([], ["--timestep", "3"]), strict=True):
         assert main(["export", str(trained), "--format", format, "--out", str(out), *chosen]) == 0
     neutral, frame = (out.read_bytes() for out in files)
@@ -256,6 +256,8 @@ def test_export_refuses_what_does_not_fit(
     assert "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web" in message
     message = refused(capsys, "export", trained, "--format", "usd", "--timestep", 1, *out)
     assert "--timestep cannot be combined with --format usd" in message
+    message = refused(capsys, "export", trained, "--format", "ply", "--motion-only", *out)
+    assert "--motion-only cannot be combined with --format ply, only with web" in message
     message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)
     assert "has no timestep from 7 to 9" in message
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))

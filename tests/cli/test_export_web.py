@@ -59,7 +59,11 @@ def test_an_avatar_alone_is_a_still(avatar_file, tmp_path):
 
 
 def test_mistakes_are_one_sentence(avatar_file, tmp_path, capsys):
-    """Catches a traceback, or a page under a name that no browser opens."""
+    """Catches a traceback, a page under a name that no browser opens, and a range of frames that is ignored."""
     assert main(["export", str(avatar_file), "--format", "web", "--out", str(tmp_path / "a.txt")]) == 2
     assert ".html" in capsys.readouterr().err
     assert not (tmp_path / "a.txt").exists()
+    words = ["--frames", "1:2", "--out", str(tmp_path / "a.html")]
+    assert main(["export", str(avatar_file), "--format", "web", *words]) == 2
+    assert "give --capture" in capsys.readouterr().err
+    assert not (tmp_path / "a.html").exists()

@@ -9,7 +9,7 @@ from ...capture.camera import Camera
 from ..embedding import face_frames
 from ..file import Avatar
 from ..playback import Playback
-from ..splats import Splats
+from ..splats import Splats, unit_quaternions
 from .container import FixedPoint, pack
 from .rig import WebRig
 
@@ -96,7 +96,7 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
         "rotation": FixedPoint(smaller, ROTATION_STEP),
         "rotation_largest": largest,
         "log_scale": FixedPoint(splats.log_scale, LOG_SCALE_STEP),
-        "opacity": FixedPoint(1 / (1 + np.exp(-splats.opacity.astype(np.float64))), OPACITY_STEP),
+        "opacity": FixedPoint(splats.opacities(), OPACITY_STEP),
         "color": FixedPoint(splats.sh[:, 0], COLOR_STEP),
     }
     if splats.sh.shape[1] > 1:
@@ -109,9 +109,7 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
 def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in order, of the unit
     quaternion whose largest part is positive. A zero quaternion counts as the identity."""
-    q = rotation.astype(np.float64)
-    size = np.linalg.norm(q, axis=1, keepdims=True)
-    q = np.where(size > 0, q / np.where(size > 0, size, 1), [1.0, 0.0, 0.0, 0.0])
+    q = unit_quaternions(rotation)
     largest = np.abs(q).argmax(1)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
     others = np.array([[k for k in range(4) if k != left_out] for left_out in range(4)])[largest]

@@ -1,4 +1,4 @@
-"""The web page of an avatar: player, styles and data in one HTML file that asks for nothing else."""
+"""The web page of an avatar: player, styles and data in one HTML file without external requests."""
 
 import base64
 import html

@@ -46,8 +46,8 @@ def write_web(
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
     if path.suffix.lower() == ".stga":
-        _write(path, data)
         _write(path.with_name(SCRIPT_NAME), element_script().encode("utf-8"))
+        _write(path, data)  # last: where the player cannot be written, no data without one
         return [path, path.with_name(SCRIPT_NAME)]
     _write(path, page(playback.title, RIG_NOTICE if with_flame else "", data).encode("utf-8"))
     return [path]

@@ -86,6 +86,14 @@ def test_other_suffixes_are_refused(head, tmp_path):
         write_web(tmp_path / "a.htm", head.avatar, Playback(), list(head.meshes))
 
 
+def test_no_data_without_its_player(head, tmp_path):
+    """Catches a data file left behind by an export that fails at the player beside it."""
+    (tmp_path / SCRIPT_NAME).mkdir()
+    with pytest.raises(StgaError, match=SCRIPT_NAME):
+        write_web(tmp_path / "a.stga", head.avatar, Playback(), list(head.meshes))
+    assert not (tmp_path / "a.stga").exists()
+
+
 def test_every_module_is_in_the_page():
     """Catches a module of the player that is not joined into the page, or an import that is left in it."""
     assert {path.name for path in PLAYER.glob("*.js")} == {*MODULES, "page.js"}

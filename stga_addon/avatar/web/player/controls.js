@@ -41,12 +41,12 @@ export function addControls(element, player, changed) {
   );
 }
 
-export function orbitBy(player, dx, dy) {
+function orbitBy(player, dx, dy) {
   const { up } = player.data.header;
   player.camera = orbited(player.camera, player.pivot, up, -dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
 }
 
-export function zoomBy(player, factor) {
+function zoomBy(player, factor) {
   player.camera = dollied(player.camera, player.pivot, factor);
 }
 

@@ -93,7 +93,7 @@ function decoded(name, entry, block, count) {
 }
 
 /** Throw a DataError unless header and arrays fit each other and hold usable values. */
-export function checkData(header, arrays) {
+function checkData(header, arrays) {
   const splats = size(arrays, 'xyz', 0);
   const vertices = size(arrays, 'base', 0);
   const faces = size(arrays, 'faces', 0);

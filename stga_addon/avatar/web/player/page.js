@@ -20,7 +20,7 @@ const avatar = document.querySelector('stga-avatar');
 const byId = (id) => document.getElementById(id);
 const sliders = []; // { update } of each
 
-function icon(button, pressed) {
+function setPressed(button, pressed) {
   button.setAttribute('aria-pressed', String(pressed));
 }
 
@@ -34,7 +34,7 @@ function fillTrack(input) {
 function updateTransport() {
   const last = avatar.frameCount - 1;
   const frame = Math.min(Math.round(avatar.frame), last);
-  icon(byId('play'), avatar.playing);
+  setPressed(byId('play'), avatar.playing);
   byId('play').title = avatar.playing ? 'Pause (Space)' : 'Play (Space)';
   byId('scrub').value = Math.min(avatar.frame, last);
   byId('number').textContent = `${frame + 1} / ${last + 1}`;
@@ -48,7 +48,7 @@ function toggle() {
 
 function toggleLoop() {
   avatar.loop = !avatar.loop;
-  icon(byId('loop'), avatar.loop);
+  setPressed(byId('loop'), avatar.loop);
 }
 
 function step(by) {
@@ -104,7 +104,7 @@ function applyBackground() {
     .join('')}`;
   avatar.background = background ?? THEME_BACKGROUND[theme] ?? trained;
   for (const swatch of document.querySelectorAll('button.swatch'))
-    icon(swatch, (swatch.dataset.color || null) === background);
+    setPressed(swatch, (swatch.dataset.color || null) === background);
 }
 
 function addBackgrounds() {
@@ -279,7 +279,7 @@ function showFacts() {
   const splats = avatar.splatCount.toLocaleString('en');
   const rate = avatar.frameCount > 1 ? ` · ${Number(avatar.info.fps.toFixed(2))} fps` : '';
   byId('facts').innerHTML =
-    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms a frame</span>`;
+    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms of JavaScript a frame</span>`;
 }
 
 function start() {

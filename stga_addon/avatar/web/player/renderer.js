@@ -161,7 +161,7 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_sca
 }
 
 /** The unit quaternion whose parts but the largest, which is positive, are `smaller`. */
-export function wholeQuaternion(smaller, largest) {
+function wholeQuaternion(smaller, largest) {
   const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
   const whole = Array.from(smaller);
   whole.splice(largest, 0, rest);

@@ -17,7 +17,7 @@ p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 
   font: 16px/1.5 system-ui, sans-serif; }
 [hidden] { display: none; }`;
 
-export class StgaAvatar extends HTMLElement {
+class StgaAvatar extends HTMLElement {
   static observedAttributes = ['src', 'loop', 'speed', 'background'];
 
   #player = null;
