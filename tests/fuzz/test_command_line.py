@@ -330,16 +330,15 @@ def render(rng: random.Random, case: Path) -> list[str]:
 
 def export(rng: random.Random, case: Path) -> list[str]:
     arguments = [some_path(rng, case, "run", "tracked", "run/avatar.npz", "tracked/avatar.npz", "unfinished")]
-    arguments += [
-        "--format",
-        rng.choice(["ply", "ply", "ply-sequence", "gaussian-avatars", "usd", "gltf", "spz", "obj"]),
-    ]
+    format = rng.choice(["ply", "ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj"])
+    arguments += ["--format", format]
     arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
     arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
     arguments += option(rng, 0.3, "--timestep", "1", *NUMBERS)
     arguments += option(rng, 0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS)
     arguments += option(rng, 0.2, "--fps", "25", *NUMBERS)
-    return [*arguments, *output(rng, case, "exported")]
+    suffix = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "spz": ".spz"}.get(format, "")
+    return [*arguments, *output(rng, case, "exported" + suffix)]
 
 
 def select(rng: random.Random, case: Path) -> list[str]:
