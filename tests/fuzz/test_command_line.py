@@ -370,6 +370,19 @@ def demo(rng: random.Random, case: Path) -> list[str]:
     return [*option(rng, 0.5, "--budget", *NUMBERS), *option(rng, 0.5, "--out", some_path(rng, case))]
 
 
+def track(rng: random.Random, case: Path) -> list[str]:
+    arguments = [
+        some_path(rng, case, "mesh", "flame", "mesh/images"),
+        "--model",
+        some_path(rng, case, "flame/model.npz"),
+    ]
+    for name in ("--landmarks", "--cameras", "--detector"):
+        arguments += option(rng, 0.3, name, some_path(rng, case, "mesh", "mesh/transforms.json"))
+    for name in ("--start", "--stop", "--step", "--focal"):
+        arguments += option(rng, 0.2, name, "1", *NUMBERS)
+    return [*arguments, *option(rng, 0.2, "--offset", "0=1", *TEXTS), *output(rng, case, "new")]
+
+
 def environment(rng: random.Random, case: Path) -> list[str]:
     action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
     return ["--folder", some_path(rng, case, "new"), *action]
@@ -382,6 +395,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "render": (3, render),
     "eval": (2, evaluate),
     "train": (1, train),
+    "track": (1, track),
     "job": (0.5, lambda rng, case: [some_path(rng, case, "job", "run")]),
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
