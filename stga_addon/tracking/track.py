@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os.path import realpath
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def track(
     """
     if any((out / name).exists() for name in (*SPLIT_FILES, "transforms.json")):
         raise StgaError(f"{out}: already holds a capture; give another --out")
-    if out.resolve() == footage.root:
+    if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
     head = read_head_model(head_file)
     if landmarks is not None:
@@ -155,7 +156,7 @@ def _begin(out: Path, footage: Footage, head_file: Path, task: Path | None) -> N
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
         "head_model": str(head_file.resolve()),
-        "detector": None if task is None else str(task.resolve()),
+        "detector": None if task is None else realpath(task),
     }
     if path.exists() and read_json(path) != source:
         raise StgaError(f"{out}: holds landmarks of other footage or detector; give another --out, or delete it")

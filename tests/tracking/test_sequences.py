@@ -237,3 +237,11 @@ def test_distorted_frames_are_undistorted(tmp_path):
     assert camera.image(0).shape == (HEIGHT, WIDTH, 3)
     assert camera.mask(0).shape == (HEIGHT, WIDTH)
     assert camera.file(0) is None
+
+
+def test_a_loop_of_links_is_no_footage(tmp_path) -> None:
+    """Catches the RuntimeError by which resolving such a path ends."""
+    path = tmp_path / "loop"
+    path.symlink_to(path)
+    with pytest.raises(StgaError, match="is neither a folder nor a video"):
+        open_footage(path)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from os.path import isdir, isfile
+from os.path import isdir, isfile, realpath
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +65,7 @@ def open_footage(
 
 
 def _sources(path: Path) -> tuple[Sources, Path]:
-    root = path.resolve()
+    root = Path(realpath(path))  # Path.resolve raises RuntimeError for a loop of links
     if isdir(path):
         return find_sources(root), root
     if isfile(path) and path.suffix.lower() in video.SUFFIXES:
