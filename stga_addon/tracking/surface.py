@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
+from ..flame.forward import axis_angle_matrices
 from .fit import (
     HeadFit,
     TimestepLandmarks,
@@ -26,20 +27,27 @@ from .write_capture import posed_mesh
 
 IDENTITY_SWEEPS = (Sweep(0.010, 0.001, 0.0015), Sweep(0.004, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001))
 TAKE_SWEEP = Sweep(0.004, 0.0005, 0.001)
-IDENTITY_POINTS, TAKE_POINTS = 2000, 600
+SURFACE_POINTS, MAX_TAKE_POINTS = 2000, 1000
+"""Points over the whole head, and how many of those that are usually found are looked for at every timestep."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
 SURFACE_SIGMA_M = 0.0005
-INDEPENDENT_POINTS = 500
-"""What all points of a surface count as together: patches of neighboring points share most of their pixels."""
+POINT_SHARE = 0.25
+"""Weight of a surface point: patches of neighboring points share most of their pixels."""
 LANDMARK_SHARE = 0.05
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and stay."""
+UNBIASED_LANDMARK_SHARE = 0.25
+"""The same, once what a landmark misses on this person is known."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better evidence."""
+MIN_SEEN_SHARE = 0.5
+"""Share of the timesteps in which a point must be found to be looked for at every timestep."""
+DIRECTIONS = 6
+"""Steps of a direction's coordinates, about 10°: from within one step, a head hides the same of itself."""
 MIN_PART_SHARE = 0.33
 """Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
 OFFSET_DENSITY = 1.5e10
-"""Weight of surface points at IDENTITY_POINTS, in 1/m⁴: the two priors below are relative to it."""
+"""Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
 SMOOTHING_M = 0.005
 """Length over which offsets are smoothed."""
 OFFSET_SIGMA_M = 0.03
@@ -48,6 +56,9 @@ OFFSET_ITERATIONS = 5
 
 Images = Callable[[int], Sequence[tuple[Camera, np.ndarray]]]
 """Timestep -> cameras, in the footage's world, and their images (H, W, 3) uint8."""
+
+Sights = dict[tuple[int, ...], np.ndarray]
+"""Direction from the head, rounded -> (N,) bool: points that are not hidden from there."""
 
 
 @dataclass(frozen=True)
@@ -82,23 +93,26 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
     if not several:
         return fit
     chosen = spread_over(several, SURFACE_TIMESTEPS)
+    visible = {
+        t: by_visibility(own, fit.head, take.places, fit.parameters[t], fit.to_capture)
+        for t, own in take.landmarks.items()
+    }
+    take = replace(take, landmarks=visible)
     steps = len(IDENTITY_SWEEPS) * len(chosen) + len(timesteps)
-    points, offset = surface_points(head, IDENTITY_POINTS), np.zeros_like(head.model.v_template)
+    points, offset = surface_points(head, SURFACE_POINTS), np.zeros_like(head.model.v_template)
     found = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
     for number, sweep in enumerate(IDENTITY_SWEEPS):
         seen: dict[int, SeenSurface] = {}
         for t in chosen:
             report("Surface", number * len(chosen) + len(seen), steps)
-            seen[t] = seen_surface(found, t, points, take.images(t), sweep)
+            seen[t] = seen_surface(found, t, points, take.images(t), sweep, {})
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return fit
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
         if number:
             offset = offset + _offsets(found, points, seen)
             found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
-    return _whole_take(
-        found, take, surface_points(head, TAKE_POINTS), lambda left: report("Surface", steps - left, steps)
-    )
+    return _whole_take(found, fit, take, _often_seen(points, seen), lambda left: report("Surface", steps - left, steps))
 
 
 def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
@@ -124,9 +138,17 @@ def surface_points(head: HeadModel, count: int) -> SurfacePoints:
 
 
 def seen_surface(
-    fit: HeadFit, timestep: int, points: SurfacePoints, images: Sequence[tuple[Camera, np.ndarray]], sweep: Sweep
+    fit: HeadFit,
+    timestep: int,
+    points: SurfacePoints,
+    images: Sequence[tuple[Camera, np.ndarray]],
+    sweep: Sweep,
+    sights: Sights,
 ) -> SeenSurface:
-    """Where the images show the surface near the fitted head, along its normals; weight 0 for what they do not show."""
+    """Where the images show the surface near the fitted head, along its normals; weight 0 for what they do not show.
+
+    `sights` is filled with what is in sight from where, and read for directions that are in it already.
+    """
     faces = fit.head.model.faces
     vertices = posed_mesh(fit, fit.parameters[timestep])
     at, normals = points.on(vertices, faces), points.on(vertex_normals(vertices, faces), faces)
@@ -135,11 +157,15 @@ def seen_surface(
     views = [
         gray_view(camera, image, at.mean(0), sweep.spacing) for camera, (_, image) in zip(cameras, images, strict=True)
     ]
-    cosines = [facing(camera, at, normals) * in_sight(camera, vertices, faces, at) for camera in cameras]
+    turn, cosines = _turn(fit.parameters[timestep]), []
+    for camera in cameras:
+        direction = (camera.position - at.mean(0)) @ turn
+        key = tuple(np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int).tolist())
+        if key not in sights:
+            sights[key] = in_sight(camera, vertices, faces, at)
+        cosines.append(facing(camera, at, normals) * sights[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
-    return SeenSurface(
-        at + offset[:, None] * normals, normals, min(1.0, INDEPENDENT_POINTS / len(points)) * correlation
-    )
+    return SeenSurface(at + offset[:, None] * normals, normals, POINT_SHARE * correlation)
 
 
 def smooth_offsets(
@@ -189,7 +215,7 @@ def _solved(
     base: HeadModel, fit: HeadFit, take: Take, points: SurfacePoints, seen: Mapping[int, SeenSurface]
 ) -> tuple[HeadFit, dict[int, SeenSurface]]:
     """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the new scale."""
-    together = [_joined(_landmarks(fit, t, take), own) for t, own in seen.items()]
+    together = [_joined(_landmarks(fit, t, take), LANDMARK_SHARE, own) for t, own in seen.items()]
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
     identity = solve_identity(base, _both(take.places, points), together, starts)
     world = fit.to_capture
@@ -216,43 +242,68 @@ def _offsets(fit: HeadFit, points: SurfacePoints, seen: Mapping[int, SeenSurface
     return np.asarray(values[:, None] * vertex_normals(model.v_template, model.faces))
 
 
-def _whole_take(fit: HeadFit, take: Take, points: SurfacePoints, report: Callable[[int], None]) -> HeadFit:
-    """Expression and pose of every timestep, from landmarks and then from the surface beside them."""
-    timesteps, world = sorted(take.landmarks), fit.to_capture
-    at = take.places.on(fit.head.model.v_template, fit.head.model.faces)
-    landmarks = [
-        observed_landmarks(triangulated(take.landmarks[t], take.reliable, at, world.scale), world, take.reliable)
-        for t in timesteps
-    ]
-    start = np.zeros((len(timesteps), fit.head.model.n_expression + RIGID_SIZE))
-    start[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in landmarks]
+def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface]) -> SurfacePoints:
+    often = np.flatnonzero(np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE)
+    rows = often[:: 1 + len(often) // MAX_TAKE_POINTS]
+    return SurfacePoints(points.face[rows], points.barycentric[rows])
+
+
+def _whole_take(
+    fit: HeadFit, first: HeadFit, take: Take, points: SurfacePoints, report: Callable[[int], None]
+) -> HeadFit:
+    """Expression and pose of every timestep, from landmarks and then from the surface beside them.
+
+    What a landmark misses at the timesteps of `fit`, it misses in all: it is taken off.
+    """
+    timesteps, model = sorted(take.landmarks), fit.head.model
+    bias = _landmark_bias(fit, take)
+    landmarks = []
+    for t in timesteps:
+        own = _landmarks(fit, t, take)
+        landmarks.append(replace(own, position=own.position - bias @ _turn(first.parameters[t]).T))
+    start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
+    start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
-    together = []
-    for number, t in enumerate(timesteps):
+    together, sights = [], Sights()
+    for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
-        seen = seen_surface(rough, t, points, take.images(t), TAKE_SWEEP)
-        together.append(_joined(_landmarks(rough, t, take), seen))
+        seen = seen_surface(rough, t, points, take.images(t), TAKE_SWEEP, sights)
+        together.append(_joined(own, UNBIASED_LANDMARK_SHARE, seen))
     solved = solve_take(fit.head, _both(take.places, points), together, start)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 
 
+def _landmark_bias(fit: HeadFit, take: Take) -> np.ndarray:
+    """(N, 3) in the turned head's axes: median distance of the landmarks from their places over the timesteps."""
+    missed = [
+        (_landmarks(fit, t, take).position - take.places.on(posed_mesh(fit, values), fit.head.model.faces))
+        @ _turn(values)
+        for t, values in fit.parameters.items()
+    ]
+    return np.asarray(np.median(missed, axis=0))
+
+
+def _turn(parameters: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of the head."""
+    return np.asarray(axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0])
+
+
 def _landmarks(fit: HeadFit, timestep: int, take: Take) -> Observation:
-    """The timestep's landmarks, of each camera by the angle at which it sees them, at the weight of LANDMARK_SHARE."""
     world, at = fit.to_capture, take.places.on(fit.head.model.v_template, fit.head.model.faces)
-    visible = by_visibility(take.landmarks[timestep], fit.head, take.places, fit.parameters[timestep], world)
-    found = observed_landmarks(triangulated(visible, take.reliable, at, world.scale), world, take.reliable)
-    return replace(found, weight=LANDMARK_SHARE * found.weight)
+    return observed_landmarks(
+        triangulated(take.landmarks[timestep], take.reliable, at, world.scale), world, take.reliable
+    )
 
 
-def _joined(landmarks: Observation, surface: SeenSurface) -> Observation:
-    """Both as one observation; the surface's position counts along its normal, in units of SURFACE_SIGMA_M."""
+def _joined(landmarks: Observation, share: float, surface: SeenSurface) -> Observation:
+    """Both as one observation, landmarks at a share of their weight; the surface counts along its normal."""
     root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * surface.normal[:, :, None] * surface.normal[:, None, :]
     return Observation(
         np.concatenate([landmarks.position, surface.position]),
         np.concatenate([landmarks.root, root]),
-        np.concatenate([landmarks.weight, surface.weight]),
+        np.concatenate([share * landmarks.weight, surface.weight]),
     )
 
 
