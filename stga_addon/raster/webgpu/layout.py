@@ -5,8 +5,8 @@ N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs
 
 | table          | words per row    | content                                                                          |
 |----------------|------------------|----------------------------------------------------------------------------------|
-| splats         | 11 + 3K + 3S f32 | the fields of `cpu.layout.Parameters` in that order; also gradients and moments   |
-| frames         | 12 + columns f32 | a triangle's origin (3), matrix (3, 3) by rows, strain, in camera space           |
+| splats         | 11 + 3K + 3S f32 | the fields of `cpu.layout.Parameters` in that order; also gradients and moments  |
+| frames         | 12 + columns f32 | a triangle's origin (3), matrix (3, 3) by rows, strain, in camera space          |
 | projected      | PROJECTED f32    | a splat on the screen: the columns of `cpu.layout`                               |
 | rect           | 4 i32            | tile bounds x0, y0, x1, y1 of a splat, as in `cpu.layout.Projection`             |
 | depth_key      | 1 u32            | bits of a splat's depth; HIDDEN where it is not visible                          |
