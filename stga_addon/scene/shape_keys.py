@@ -14,8 +14,8 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     In world space, turned from Blender's axes, in which a head looks along -y: z up becomes y up. Modifiers, values
     and drivers are left out. Raises StgaError for an object without shape keys.
     """
-    keys = thing.data.shape_keys if thing.type == "MESH" else None
-    blocks = list(keys.key_blocks) if keys is not None else []
+    keys: Any = thing.data.shape_keys if thing.type == "MESH" else None
+    blocks = [] if keys is None else list(keys.key_blocks)
     if len(blocks) < 2:
         raise StgaError(f"{thing.name}: has no shape keys; a head model needs a basis and expressions")
     turn = _world_to_y_up() @ np.array(thing.matrix_world)

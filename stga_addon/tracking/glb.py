@@ -39,8 +39,8 @@ def read_glb(path: Path) -> MorphMesh:
     try:
         document, data = _chunks(path.read_bytes())
         _require_readable(path, document)
-        parts = [_placed(document, data, node, matrix) for node, matrix in _mesh_nodes(document)]
-        parts = [part for group in parts for part in group]
+        nodes = _mesh_nodes(document)
+        parts = [part for node, matrix in nodes for part in _placed(document, data, node, matrix)]
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except StgaError:
