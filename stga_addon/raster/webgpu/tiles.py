@@ -90,7 +90,7 @@ def sort_keys(
     targets = [(buffer(f"{name}_keys", room), buffer(f"{name}_numbers", room))]
     targets.append((keys, buffer(f"{name}_numbers 2", room)))
     for n, shift in enumerate(range(0, bits, DIGIT_BITS)):
-        constants = {"SHIFT": shift, "FIRST": n == 0, "OF_PAIRS": of_pairs}
+        constants: dict[str, Any] = {"SHIFT": shift, "FIRST": n == 0, "OF_PAIRS": of_pairs}
         buffers = {
             "view": view, "counts": counts, "keys": keys, "values": values, "sorted_keys": targets[n % 2][0],
             "sorted_values": targets[n % 2][1], "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
