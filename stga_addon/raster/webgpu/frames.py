@@ -66,10 +66,10 @@ class Embedding:
 
 
 def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) float32; neither zero nor infinite but where the float64 is."""
+    """(F,) float32, zero only where the float64 is."""
     area = embedding.face_areas(neutral, faces)
-    limits = np.finfo(np.float32)
-    return np.asarray(np.where(area > 0, np.clip(area, limits.tiny, limits.max), 0), np.float32)
+    area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)
+    return np.asarray(area, np.float32)
 
 
 def _basis_rows(basis: StrainBasis) -> np.ndarray:
