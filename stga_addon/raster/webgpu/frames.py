@@ -83,4 +83,4 @@ def _touching(faces: np.ndarray, vertices: int) -> np.ndarray:
     corners = faces.ravel()
     by_vertex = np.argsort(corners, kind="stable")
     start = np.searchsorted(corners[by_vertex], np.arange(vertices + 1)) + vertices + 1
-    return np.concatenate([start, by_vertex // 3]).astype(np.uint32)
+    return np.asarray(np.concatenate([start, by_vertex // 3]), np.uint32)
