@@ -35,10 +35,12 @@ def shared_data() -> Path:
 
 @pytest.fixture(params=["cpu", "gpu"])
 def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The kernels that a test's `render_differentiable` runs: Numba's, and Warp's on Warp's CPU device."""
+    """The kernels that a test's `render_differentiable` runs: Numba's, and WebGPU's on the first adapter."""
     if request.param == "gpu":
-        pytest.importorskip("warp")
-        from stga_addon.raster.gpu.autograd import render_differentiable
+        from raster import webgpu
+
+        webgpu.device()
+        from stga_addon.raster.webgpu.autograd import render_differentiable
 
         for module in (request.module, sys.modules["raster.test_kernels"]):
             if hasattr(module, "render_differentiable"):

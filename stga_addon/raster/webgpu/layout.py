@@ -51,7 +51,6 @@ VIEW = np.dtype(
         (name, np.uint32)
         for name in (
             "splats",  # N
-            "triangles",  # F
             "coefficients",  # K, stored
             "strain_colors",  # S, stored
             "degree",  # of the spherical harmonics in use
