@@ -22,7 +22,8 @@ N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs
 
 import numpy as np
 
-from ..cpu import blend, layout, project
+from ...avatar import embedding, strain
+from ..cpu import blend, image_loss, layout, optimizer, project
 from ..cpu.layout import Parameters
 
 WORKGROUP = 256
@@ -93,6 +94,13 @@ CONSTANTS: dict[str, int | float] = {
     "OVERFLOWED": OVERFLOWED,
     **{name: float(getattr(blend, name)) for name in ("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE")},
     **{name: float(getattr(project, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
+    **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
+    **{name: getattr(strain, name) for name in ("STRAIN_GAIN", "MAX_STRAIN")},
+    "WINDOW_RADIUS_PX": image_loss.WINDOW_RADIUS_PX,
+    **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
+    "SSIM_C1": float(image_loss.C1),
+    "SSIM_C2": float(image_loss.C2),
+    "MAX_GRADIENT": float(optimizer.MAX_GRADIENT),
 }
 
 
