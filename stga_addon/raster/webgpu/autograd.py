@@ -30,9 +30,7 @@ def render_differentiable(
     given = [tensor for tensor in splats if tensor is not None]
     images = []
     for depth_as_color in (False, True):
-        options = ViewOptions(
-            camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased
-        )
+        options = ViewOptions(camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased)
         images.append(_Blend.apply(options, camera_frames, face, *given))
     (rgb, transmittance), (depth, _) = images
     return rgb, 1 - transmittance, depth[0]
@@ -67,13 +65,14 @@ class _Blend(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         ctx.saved = options, camera_frames, face, splats
-        image, transmittance, _ = _render(*ctx.saved, None)
+        image, transmittance, _ = _render(options, camera_frames, face, splats, None)
         return torch.from_numpy(image), torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
         cotangents = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
-        _, _, gradients = _render(*ctx.saved, cotangents)
+        options, camera_frames, face, splats = ctx.saved
+        _, _, gradients = _render(options, camera_frames, face, splats, cotangents)
         given = [gradient for gradient in gradients if gradient is not None]
         return None, None, None, *(torch.from_numpy(g) for g in given[: len(ctx.needs_input_grad) - 3])
 
@@ -95,6 +94,9 @@ def _render(
                 rasterizer.backward(work, rendering, table, v_images[0], gradients, v_images[1])
         if rasterizer.pairs_fit():
             break
-    pixels, rows = device.read(rendering.pixels, (height, width, 2)), device.read(gradients, (table.count, table.stride))
+    pixels, rows = (
+        device.read(rendering.pixels, (height, width, 2)),
+        device.read(gradients, (table.count, table.stride)),
+    )
     image = device.read(rendering.image, (3, height, width))
     return image, pixels[..., 0].copy(), split_rows(rows, table.coefficients)

@@ -1,5 +1,6 @@
 """Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the splats."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from ...capture.camera import Camera
 from ..cpu.layout import TILE
-from ..cpu.rasterize import BLACK_BACKGROUND, tile_grid
+from ..cpu.rasterize import tile_grid
 from .blend import blend_backward, blend_forward
 from .device import Device, Recording
 from .layout import COUNTS, NEEDED, OVERFLOWED, SH, VIEW
@@ -47,7 +48,7 @@ class ViewOptions:
 
     camera: Camera
     degree: int
-    background: np.ndarray = BLACK_BACKGROUND
+    background: Sequence[float] = (0.0, 0.0, 0.0)
     strains: int = 0
     depth_as_color: bool = False
     antialiased: bool = False
