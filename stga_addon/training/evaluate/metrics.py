@@ -22,7 +22,8 @@ from .evaluation_views import EvaluationView, read_evaluation_view
 class Quality:
     """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None if it was not measured.
 
-    regions  the same per region ("mask", "moving"), over the views that have the region
+    regions  the same per region ("mask", "moving"), over the views that have the region; per group of views
+             ("take_1"), and per region of a group ("moving_take_1")
     detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
                        None for a region
     """
@@ -50,9 +51,12 @@ def evaluate(
     for evaluation_view in evaluation_views:
         image = np.clip(render(evaluation_view.view), 0, 1)
         differences.append(detail_difference(image, evaluation_view.target, evaluation_view.interior))
-        scores[""].append(_scores(image, evaluation_view.target, perceptual))
-        for region, where in evaluation_view.regions.items():
-            scores.setdefault(region, []).append(_scores(image, evaluation_view.target, perceptual, where))
+        parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
+        for region, where in parts.items():
+            found = _scores(image, evaluation_view.target, perceptual, where)
+            scores.setdefault(region, []).append(found)
+            if evaluation_view.group:
+                scores.setdefault("_".join(filter(None, (region, evaluation_view.group))), []).append(found)
     means = {region: _mean(of_views) for region, of_views in scores.items()}
     whole = means.pop("")
     return Quality(whole.psnr, whole.ssim, whole.lpips, means, float(np.mean(differences)) if differences else None)
