@@ -287,7 +287,12 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.evaluation_views:
-            quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
+            quality = evaluate(
+                lambda view: self.trainer.render(view, share),
+                self.evaluation_views,
+                perceptual,
+                matched=bool(self.settings.exposure),
+            )
             self.psnr = quality.psnr
             line.update(quality.as_json())
         self._keep_best(line.get("detail_difference"))
