@@ -105,9 +105,8 @@ def read_run(folder: Path) -> Run:
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
     if values.get("version") not in range(OLDEST_VERSION, VERSION + 1):
-        raise StgaError(
-            f"{path}: has run format version {shorten(values.get('version'))}, this add-on reads {OLDEST_VERSION} to {VERSION}"
-        )
+        found, known = shorten(values.get("version")), f"{OLDEST_VERSION} to {VERSION}"
+        raise StgaError(f"{path}: has run format version {found}, this add-on reads {known}")
     try:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
