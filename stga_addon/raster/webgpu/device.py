@@ -20,12 +20,10 @@ import wgpu
 from wgpu.backends.wgpu_native.extras import set_instance_extras
 
 from ...errors import StgaError
-from .layout import VIEW, WORKGROUP, constants_wgsl, struct_wgsl
+from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
 
-MAX_STORAGE_BUFFERS = 10
-"""Storage buffers that a kernel may bind; WebGPU promises 8, desktop adapters have more."""
-MAX_GROUPS = 65535
-"""Workgroups along one dimension of a dispatch."""
+NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
+"""What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
 BACKENDS = ("Vulkan", "Metal", "DX12")
 """Without OpenGL, which lacks what the kernels need and complains where there is no display."""
 
@@ -44,7 +42,7 @@ def adapters() -> dict[str, Any]:
     found: dict[str, Any] = {}
     every = wgpu.gpu.enumerate_adapters_sync()
     for adapter in sorted(every, key=is_software):
-        if adapter.limits["max-storage-buffers-per-shader-stage"] < MAX_STORAGE_BUFFERS:
+        if any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items()):
             continue
         name = f"{adapter.info['device']} ({adapter.info['backend_type']})"
         same = sum(known == name or known.startswith(f"{name} #") for known in found)
@@ -178,9 +176,13 @@ class Device:
     @staticmethod
     def groups(threads: int) -> tuple[int, int, int]:
         """Workgroups for at least so many threads; `thread_number` in WGSL numbers them."""
-        needed = -(-threads // WORKGROUP)
-        rows = max(1, -(-needed // MAX_GROUPS))
-        return -(-needed // rows), rows, 1
+        return Device.groups_of(-(-threads // WORKGROUP))
+
+    @staticmethod
+    def groups_of(workgroups: int) -> tuple[int, int, int]:
+        """At least so many workgroups, in rows of a length that every adapter allows."""
+        rows = max(1, -(-workgroups // MAX_GROUPS))
+        return -(-workgroups // rows), rows, 1
 
     @contextmanager
     def errors(self) -> Iterator[None]:
@@ -212,15 +214,16 @@ class Recording:
 
     def dispatch(self, kernel: Kernel, groups: Groups, **buffers: Any) -> None:
         """Run a kernel with a buffer for each of its bindings, by name."""
-        if 0 in groups:
+        indirect = not isinstance(groups[0], int)
+        if not indirect and 0 in groups:
             return
         compute = self._compute_pass()
         compute.set_pipeline(kernel.pipeline)
         compute.set_bind_group(0, self._bind(kernel, buffers))
-        if isinstance(groups[0], int):
-            compute.dispatch_workgroups(*groups)
-        else:
+        if indirect:
             compute.dispatch_workgroups_indirect(*groups)
+        else:
+            compute.dispatch_workgroups(*groups)
         self.dispatches += 1
 
     def copy(self, source: Any, target: Any, words: int, at: int = 0, to: int = 0) -> None:
@@ -302,7 +305,12 @@ class Readback:
         return words
 
 
-_RAISED_LIMITS = ("max-storage-buffer-binding-size", "max-buffer-size", "max-storage-buffers-per-shader-stage")
+_RAISED_LIMITS = (
+    "max-storage-buffer-binding-size",
+    "max-buffer-size",
+    "max-storage-buffers-per-shader-stage",
+    "max-compute-workgroup-storage-size",
+)
 _MAX_BIND_GROUPS = 64
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _USAGE = {
