@@ -122,7 +122,7 @@ def test_a_full_disk_while_recording(tmp_path: Path) -> None:
     """Catches a recording whose end never reached the disk and that counts as whole, and a traceback."""
     recorder = Recorder(tmp_path / "job", VideoJob(tmp_path / "out", 1, 25.0, None))
     recorder._stream.close()
-    recorder._stream = Path("/dev/full").open("wb")
+    recorder._stream = Path("/dev/full").open("wb")  # noqa: SIM115
     with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
         recorder.add([layer(0, count=10_000)], CAMERA)
     with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
