@@ -14,7 +14,8 @@ REQUIREMENTS = {
     "av": "av>=14,<19",
 }
 """Imported module -> requirement as pip reads it."""
-GPU_REQUIREMENT = "warp-lang>=1.19,<2"
+GPU_REQUIREMENT = "wgpu>=0.32,<1"
+"""Trains on a GPU; without it, or where it has no driver, the CPU trains."""
 
 
 def package_name(requirement: str) -> str:

@@ -335,5 +335,5 @@ def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "none"))
     (tmp_path / "wheels").mkdir()
     with pytest.raises(RuntimeError, match=r"Installing from the folder of wheels failed: .*No matching distribution"):
-        bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
+        bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), python=sys.executable)
     assert not bpy.ops.stga.cancel_environment.poll()
