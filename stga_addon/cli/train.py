@@ -2,6 +2,7 @@
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from ..capture.model import Capture
@@ -20,6 +21,12 @@ NAME, HELP = "train", "train an avatar from a capture"
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
     parser.add_argument("--out", type=usable_path, required=True, metavar="RUN", help="folder of the run")
+    add_training(parser)
+    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
+
+
+def add_training(parser: ArgumentParser) -> None:
+    """How a new run is trained."""
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
     budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
@@ -38,14 +45,28 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     )
     parser.add_argument("--threshold", type=real_number, metavar="METERS", help="selection threshold")
     add_effects(parser)
-    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
     add_device(parser)
     parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
 
 
 def run(options: Namespace) -> None:
+    from ..report.run_summary import report_run
+
+    avatar, refined = train_avatar(options)
+    for line in report_run(options.out):
+        print(line)
+    print(f"avatar: {avatar}")
+    if refined:
+        print(f"refined meshes: {options.out / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+
+
+def train_avatar(options: Namespace) -> tuple[Path, bool]:
+    """Train as the options say, with a bar; returns the avatar's path and whether tracking was refined.
+
+    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
+    """
     from ..effects.plan import describe_effects, with_effect_plan
-    from ..report.run_summary import CurveUpdater, report_run
+    from ..report.run_summary import CurveUpdater
     from ..training.optimize.device import choose_device
     from ..training.run.loop import train
     from ..training.run.open_run import device_of, open_run
@@ -79,11 +100,7 @@ def run(options: Namespace) -> None:
 
         selection = None if options.head is None else options.head.selection()
         avatar = train(capture, options.out, run, selection, options.resume, report)
-    for line in report_run(options.out):
-        print(line)
-    print(f"avatar: {avatar}")
-    if run.settings.tracking:
-        print(f"refined meshes: {options.out / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+    return avatar, run.settings.tracking
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:
