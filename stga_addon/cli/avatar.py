@@ -18,7 +18,7 @@ from ..format import format_duration
 from ..jobs.delegate import OpenHead
 from .arguments import usable_path
 from .track import add_footage, track_footage
-from .train import add_training, train_avatar
+from .train import add_training, prepare, train_with_bar
 
 NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a report and a .blend file"
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
@@ -40,7 +40,8 @@ def run(options: Namespace) -> None:
     capture, run_folder = options.out / CAPTURE, options.out / RUN
     _track(options, capture)
     tracked = perf_counter()
-    train_avatar(training_options(options, capture, run_folder))
+    training = training_options(options, capture, run_folder)
+    train_with_bar(run_folder, *prepare(training), training.resume)
     trained = perf_counter()
     blend = None if options.no_blend else _write_blend(options.out)
     print()

@@ -18,6 +18,7 @@ COMMANDS = (
     ".avatar",
     ".track",
     ".train",
+    ".refine",
     ".job",
     ".render",
     ".eval",
