@@ -18,6 +18,7 @@ COMMANDS = (
     ".track",
     ".train",
     ".refine",
+    ".extend",
     ".job",
     ".render",
     ".eval",
