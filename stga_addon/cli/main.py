@@ -17,6 +17,7 @@ from .streams import safe_streams
 COMMANDS = (
     ".track",
     ".train",
+    ".refine",
     ".job",
     ".render",
     ".eval",

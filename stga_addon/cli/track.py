@@ -13,7 +13,11 @@ NAME, HELP = "track", "track a head through footage, and write a capture"
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("footage", type=usable_path, metavar="FOOTAGE", help="folder of images or videos, or a video")
     parser.add_argument(
-        "--model", type=usable_path, required=True, metavar="HEAD", help="FLAME (.pkl, .npz) or linear model (.npz)"
+        "--model",
+        type=usable_path,
+        required=True,
+        metavar="HEAD",
+        help="FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb)",
     )
     parser.add_argument("--out", type=usable_path, required=True, metavar="CAPTURE", help="folder of the capture")
     parser.add_argument("--cameras", type=usable_path, metavar="FILE", help="calibration that is not in FOOTAGE")

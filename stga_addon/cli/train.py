@@ -2,7 +2,10 @@
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ..capture.model import Capture
 from ..errors import StgaError
@@ -13,6 +16,9 @@ from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, make_settings
 from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number
 from .inputs import open_named_capture
 from .table import print_table
+
+if TYPE_CHECKING:
+    from ..training.run.folder import Run
 
 NAME, HELP = "train", "train an avatar from a capture"
 
@@ -44,13 +50,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..effects.plan import describe_effects, with_effect_plan
-    from ..report.run_summary import CurveUpdater, report_run
+    from ..effects.plan import with_effect_plan
     from ..training.optimize.device import choose_device
-    from ..training.run.loop import train
     from ..training.run.open_run import device_of, open_run
-    from ..training.run.progress import Progress
-    from ..training.run.progress_bar import ProgressBar
 
     if not options.capture.is_dir():
         raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
@@ -66,24 +68,37 @@ def run(options: Namespace) -> None:
         device, why = choose_device(options.device)
         capture = open_named_capture(options)
         run = with_effect_plan(_new_run(options, capture, device), capture, device)
+    selection = None if options.head is None else options.head.selection()
     print(why)
+    train_run(options.out, run, capture, None if selection is None else dict(selection), options.resume)
+
+
+def train_run(
+    folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
+) -> None:
+    """Train a run into its folder with a progress bar, and print its summary."""
+    from ..effects.plan import describe_effects
+    from ..report.run_summary import CurveUpdater, report_run
+    from ..training.run.loop import train
+    from ..training.run.progress import Progress
+    from ..training.run.progress_bar import ProgressBar
+
     for warning in capture.warnings:
         print(f"warning: {warning}")
     print_table(describe_effects(run.effect_plan))
-    draw = CurveUpdater(options.out)
+    draw = CurveUpdater(folder)
     with ProgressBar() as bar:
 
         def report(progress: Progress) -> bool:
             draw()
             return bar.report(progress)
 
-        selection = None if options.head is None else options.head.selection()
-        avatar = train(capture, options.out, run, selection, options.resume, report)
-    for line in report_run(options.out):
+        avatar = train(capture, folder, run, selection, resume, report)
+    for line in report_run(folder):
         print(line)
     print(f"avatar: {avatar}")
     if run.settings.tracking:
-        print(f"refined meshes: {options.out / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+        print(f"refined meshes: {folder / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:

@@ -52,7 +52,9 @@ def write_curve(folder: Path) -> None:
 def report_run(folder: Path) -> list[str]:
     """Write the curve of a finished run and return the lines of its summary."""
     write_curve(folder)
-    lines = summarize_run(read_metrics(folder), read_run(folder).settings.target_psnr)
+    run, metrics = read_run(folder), read_metrics(folder)
+    continued = run.continuation is not None
+    lines = summarize_continuation(metrics) if continued else summarize_run(metrics, run.settings.target_psnr)
     return lines if (folder / CURVE).exists() else [*lines, f"{CURVE} was not drawn: matplotlib is not installed"]
 
 
@@ -82,6 +84,20 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
     lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}")
+    return lines
+
+
+def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines on the accuracy of the avatar before and after, by region and group of held-out views."""
+    if not metrics:
+        return []
+    first, last = metrics[0], metrics[-1]
+    lines = [f"splats: {first['splats']} before, {last['splats']} after"]
+    for name in first:
+        if name == "psnr" or name.startswith("psnr_"):
+            label = name.removeprefix("psnr").strip("_").replace("_", " ") or "held-out views"
+            before, after = first[name], last.get(name, math.nan)
+            lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")
     return lines
 
 

@@ -1,5 +1,7 @@
 """The WebGPU device of the tests: any adapter, software Vulkan where there is no GPU."""
 
+from functools import cache
+
 import pytest
 
 wgpu = pytest.importorskip("wgpu")
@@ -8,7 +10,12 @@ from stga_addon.raster.webgpu.device import Device, adapters  # noqa: E402
 
 
 def device() -> Device:
-    """A device of the first adapter; skips the test where there is none."""
+    """The first adapter's device, whose kernels stay compiled; skips the test where there is none."""
     if not adapters():
         pytest.skip("no WebGPU adapter (Debian's software Vulkan: mesa-vulkan-drivers)")
+    return _device()
+
+
+@cache
+def _device() -> Device:
     return Device()

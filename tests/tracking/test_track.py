@@ -17,7 +17,7 @@ from stga_addon.tracking.correspondence import calibrate, nearest_points
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
-from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
+from stga_addon.tracking.landmarks import PLACES_FILE, detect_landmarks, landmark_file, read_camera, write_places
 from stga_addon.tracking.mesh_image import rasterize, shaded_image
 from stga_addon.tracking.track import track
 
@@ -228,6 +228,15 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
     camera = footage.cameras[0]
     np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+
+
+def test_cameras_have_landmark_files_of_their_own(tmp_path):
+    """Catches cameras whose landmarks overwrite each other, or the correspondence of the head model."""
+    names = ["walk/1", "walk_1", "walk%2F1", "walk 1", "head_model", "kamera-Ä.2", "a\\b", "a:b"]
+    files = [landmark_file(tmp_path, name) for name in names]
+    assert len({*files, tmp_path / PLACES_FILE}) == len(names) + 1
+    assert files[0].name == "walk%2F1.npz"
+    assert all(file.parent == tmp_path for file in files)
 
 
 def test_the_capture_is_not_written_into_the_footage(tmp_path):

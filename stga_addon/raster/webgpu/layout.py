@@ -13,16 +13,34 @@ N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs
 | slots          | 2 u32            | a splat's first row in pair_gradients, and how many there are                    |
 | pair_gradients | PROJECTED f32    | gradient of a pair with respect to the splat's projected columns; by splat       |
 | wanted         | 1 u32            | 1 for splats that are visible and in focus: only their gradients are written     |
+| touched        | 1 u32            | 1 for the tiles that a splat in focus reaches                                    |
+| rendered       | 1 u32            | 1 for those and the tiles around them, as far as their gradient depends on       |
+| tile_range     | 2 u32            | a tile's first pair and one past its last                                        |
+| pairs          | 2 u32            | splat, with WANTED, and row in pair_gradients; by tile, near to far              |
+| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile   |
 """
+
+import math
 
 import numpy as np
 
-from ..cpu import blend, layout, project
+from ...avatar import embedding, strain
+from ..cpu import blend, image_loss, layout, optimizer, project
 from ..cpu.layout import Parameters
 
 WORKGROUP = 256
 """Threads of a workgroup: a tile's pixels, and the largest size that every adapter has."""
 HIDDEN = 0xFFFFFFFF
+WANTED = 0x80000000
+"""Marks the pairs of wanted splats in `pairs`, beside the splat's number."""
+MAX_GROUPS = 65535
+"""Workgroups along one dimension of a dispatch."""
+DIGIT_BITS = 11
+SORT_BLOCK = 2048
+"""Keys that a workgroup sorts."""
+SORT_GROUPS, PAIR_GROUPS, PAIRS, NEEDED, OVERFLOWED, COUNTS = 0, 3, 6, 7, 8, 9
+"""Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and 1 if they did not
+fit since the host last cleared it."""
 XYZ, ROTATION, LOG_SCALE, OPACITY_LOGIT, SH = 0, 3, 7, 10, 11
 """Columns of a splat; its strain colors begin after the SH coefficients."""
 FRAME_ORIGIN, FRAME_MATRIX, FRAME_STRAIN = 0, 3, 12
@@ -36,7 +54,6 @@ VIEW = np.dtype(
         (name, np.uint32)
         for name in (
             "splats",  # N
-            "triangles",  # F
             "coefficients",  # K, stored
             "strain_colors",  # S, stored
             "degree",  # of the spherical harmonics in use
@@ -68,8 +85,24 @@ CONSTANTS: dict[str, int | float] = {
     "FRAME_MATRIX": FRAME_MATRIX,
     "FRAME_STRAIN": FRAME_STRAIN,
     "HIDDEN": HIDDEN,
+    "WANTED": WANTED,
+    "MAX_GROUPS": MAX_GROUPS,
+    "DIGITS": 1 << DIGIT_BITS,
+    "SORT_BLOCK": SORT_BLOCK,
+    "SORT_GROUPS": SORT_GROUPS,
+    "PAIR_GROUPS": PAIR_GROUPS,
+    "PAIRS": PAIRS,
+    "NEEDED": NEEDED,
+    "OVERFLOWED": OVERFLOWED,
     **{name: float(getattr(blend, name)) for name in ("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE")},
     **{name: float(getattr(project, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
+    **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
+    **{name: getattr(strain, name) for name in ("STRAIN_GAIN", "MAX_STRAIN")},
+    "WINDOW_RADIUS_PX": image_loss.WINDOW_RADIUS_PX,
+    **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
+    "SSIM_C1": float(image_loss.C1),
+    "SSIM_C2": float(image_loss.C2),
+    "MAX_GRADIENT": float(optimizer.MAX_GRADIENT),
 }
 
 
@@ -82,7 +115,8 @@ def splat_stride(splats: Parameters) -> int:
 def splat_rows(splats: Parameters) -> np.ndarray:
     """Numpy arrays of splats as one table (N, stride) float32."""
     parts = [part for part in splats if part is not None]
-    return np.concatenate([np.asarray(part, np.float32).reshape(len(part), -1) for part in parts], axis=1)
+    flat = [np.asarray(part, np.float32).reshape(len(part), math.prod(part.shape[1:])) for part in parts]
+    return np.concatenate(flat, axis=1)
 
 
 def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:

@@ -23,7 +23,8 @@ from .match_exposure import match_exposure
 class Quality:
     """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None if it was not measured.
 
-    regions  the same per region ("mask", "moving"), over the views that have the region
+    regions  the same per region ("mask", "moving"), over the views that have the region; per group of views
+             ("take_1"), and per region of a group ("moving_take_1")
     detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
                        None for a region
     psnr_unmatched     PSNR without matching the exposure of each view; None where it was not matched
@@ -63,9 +64,12 @@ def evaluate(
             unmatched.append(psnr(image, target))
             image = match_exposure(image, target, evaluation_view.regions.get("mask"), evaluation_view.interior)
         differences.append(detail_difference(image, target, evaluation_view.interior))
-        scores[""].append(_scores(image, target, perceptual))
-        for region, where in evaluation_view.regions.items():
-            scores.setdefault(region, []).append(_scores(image, target, perceptual, where))
+        parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
+        for region, where in parts.items():
+            found = _scores(image, target, perceptual, where)
+            scores.setdefault(region, []).append(found)
+            if evaluation_view.group:
+                scores.setdefault("_".join(filter(None, (region, evaluation_view.group))), []).append(found)
     means = {region: _mean(of_views) for region, of_views in scores.items()}
     whole = means.pop("")
     return replace(
