@@ -20,6 +20,8 @@ N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs
 | pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile   |
 """
 
+import math
+
 import numpy as np
 
 from ...avatar import embedding, strain
@@ -52,7 +54,6 @@ VIEW = np.dtype(
         (name, np.uint32)
         for name in (
             "splats",  # N
-            "triangles",  # F
             "coefficients",  # K, stored
             "strain_colors",  # S, stored
             "degree",  # of the spherical harmonics in use
@@ -114,7 +115,8 @@ def splat_stride(splats: Parameters) -> int:
 def splat_rows(splats: Parameters) -> np.ndarray:
     """Numpy arrays of splats as one table (N, stride) float32."""
     parts = [part for part in splats if part is not None]
-    return np.concatenate([np.asarray(part, np.float32).reshape(len(part), -1) for part in parts], axis=1)
+    flat = [np.asarray(part, np.float32).reshape(len(part), math.prod(part.shape[1:])) for part in parts]
+    return np.concatenate(flat, axis=1)
 
 
 def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
