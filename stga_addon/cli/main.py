@@ -19,6 +19,7 @@ COMMANDS = (
     ".track",
     ".train",
     ".refine",
+    ".extend",
     ".job",
     ".render",
     ".eval",
