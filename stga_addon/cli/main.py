@@ -15,6 +15,7 @@ from ..jobs.delegate import FOLDER, OpenHead, read_head
 from .streams import safe_streams
 
 COMMANDS = (
+    ".avatar",
     ".track",
     ".train",
     ".refine",
