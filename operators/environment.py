@@ -12,6 +12,7 @@ from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import (
     PYPI_SIZE_GB,
     SIZE_GB,
+    TRACKING_GB,
     check_arguments,
     find_training_python,
     make_arguments,
@@ -78,6 +79,11 @@ class MakeEnvironment(bpy.types.Operator):
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
     )
+    tracking: bpy.props.BoolProperty(
+        name="Tracking",
+        description="With the landmark detector that tracks heads in footage: MediaPipe. Python 3.11 or 3.12 brings "
+        "its network; newer ones need Google's face_landmarker.task",
+    )
     python: bpy.props.StringProperty(
         name="Python",
         description="Python 3.11 or newer to make the environment from; empty: Blender's own",
@@ -96,10 +102,10 @@ class MakeEnvironment(bpy.types.Operator):
     def draw(self, context: Any) -> None:
         layout = self.layout
         layout.use_property_split = True
-        for name in ("wheels", "python"):
+        for name in ("tracking", "wheels", "python"):
             layout.prop(self, name)
         column = layout.column(align=True)
-        column.label(text=f"Takes about {SIZE_GB:.1f} GB in")
+        column.label(text=f"Takes about {SIZE_GB + self.tracking * TRACKING_GB:.1f} GB in")
         column.label(text=str(environment_folder()))
         if not self.wheels and sys.platform == "linux":
             column.label(text=f"Where pytorch.org cannot be reached: {PYPI_SIZE_GB:.1f} GB")
@@ -117,7 +123,7 @@ class MakeEnvironment(bpy.types.Operator):
             raise StgaError(f"{wheels}: is not a folder; expected one of wheel files")
         folder = environment_folder(create=True)
         base = bpy.path.abspath(self.python) if self.python else sys.executable
-        return _run(self, folder, make_arguments(folder, base, wheels))
+        return _run(self, folder, make_arguments(folder, base, wheels, self.tracking))
 
 
 class TestEnvironment(bpy.types.Operator):

@@ -24,7 +24,13 @@ from ..errors import StgaError
 from ..files import read_json, write_json
 from .environment_use import READY, environment_users
 from .launch import start_python
-from .requirements import GPU_REQUIREMENT, REQUIREMENTS, package_name
+from .requirements import (
+    DETECTOR_REQUIREMENTS,
+    GPU_REQUIREMENT,
+    REQUIREMENTS,
+    TRACKING_REQUIREMENTS,
+    package_name,
+)
 from .status import StatusWriter, log_lines, status_writer
 
 PYTHON_VARIABLE = "STGA_PYTHON"
@@ -34,6 +40,8 @@ ADAPTERS_FILE = "adapters.json"
 MIN_PYTHON = 3, 11
 SIZE_GB, PYPI_SIZE_GB = 1.5, 6.0
 """Measured size of an environment; and with the CUDA build of torch that PyPI has for Linux."""
+TRACKING_GB = 0.3
+"""Measured size of what tracking needs in addition."""
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 """PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which PyPI has for Linux,
 takes gigabytes. Everything else comes from PyPI, or the mirror that pip is configured for."""
@@ -171,7 +179,9 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
         why = next((text for text in failures.values() if not text.startswith("ModuleNotFoundError")), "")
         failed = f" ({why})" if why else ""
         raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that with pip")
-    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"
+    detector = f", mediapipe {versions['mediapipe']}" if "mediapipe" in versions else ""
+    detector = f", mediapipe fails ({failures['mediapipe']})" if "mediapipe" in failures else detector
+    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}{detector}, {report['device']}"
 
 
 def check_in_worker(folder: Path, python: str) -> str:
@@ -191,10 +201,11 @@ def check_arguments(folder: Path, python: str) -> list[str]:
 # Making and removing
 
 
-def make_arguments(folder: Path, python: str, wheels: Path | None) -> list[str]:
+def make_arguments(folder: Path, python: str, wheels: Path | None, tracking: bool = False) -> list[str]:
     """What a worker runs after `python -m` for `make_environment`."""
-    offline = ["--wheels", str(wheels)] if wheels else []
-    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, *offline]
+    more = ["--wheels", str(wheels)] if wheels else []
+    more += ["--tracking"] if tracking else []
+    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, *more]
 
 
 @dataclass(frozen=True)
@@ -206,41 +217,49 @@ class InstallStep:
     optional: bool = False
 
 
-def install_steps(venv: Path, python: str, wheels: Path | None, system: str = sys.platform) -> list[InstallStep]:
+def install_steps(
+    venv: Path, python: str, wheels: Path | None, system: str = sys.platform, tracking: bool = False
+) -> list[InstallStep]:
     """The commands that make an environment; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-    packages = list(REQUIREMENTS.values())
+    packages = [*REQUIREMENTS.values(), *(TRACKING_REQUIREMENTS if tracking else ())]
     too_old = f"sys.version_info < {MIN_PYTHON} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
     first = [
         InstallStep("Checking the Python version", [python, "-c", f"import sys; sys.exit({too_old})"]),
         InstallStep("Creating the virtual environment", [python, "-m", "venv", str(venv)]),
     ]
     if wheels is not None:
-        offline = ["--no-index", "--find-links", str(wheels)]
-        gpu = InstallStep("Installing GPU support", [*pip, *offline, GPU_REQUIREMENT], optional=True)
-        return [*first, InstallStep("Installing from the folder of wheels", [*pip, *offline, *packages]), gpu]
+        pip += ["--no-index", "--find-links", str(wheels)]
     # A wheel or nothing: its source would have to be built.
-    gpu = InstallStep("Installing GPU support", [*pip, "--only-binary", "wgpu", GPU_REQUIREMENT], optional=True)
+    gpu = [*pip, "--only-binary", "wgpu", GPU_REQUIREMENT]
+    last = [InstallStep("Installing GPU support", gpu, optional=True)]
+    if tracking:
+        last.append(InstallStep("Installing the landmark detector", [*pip, "--no-deps", *DETECTOR_REQUIREMENTS]))
+    if wheels is not None:
+        return [*first, InstallStep("Installing from the folder of wheels", [*pip, *packages]), *last]
     torch = [*pip, "--no-deps", "--index-url", TORCH_CPU_INDEX, REQUIREMENTS["torch"]]
     rest = InstallStep("Installing torch and other packages", [*pip, *packages])
     if system != "linux":
-        return [*first, rest, gpu]
-    return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest, gpu]
+        return [*first, rest, *last]
+    return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest, *last]
 
 
-def make_environment(folder: Path, python: str, wheels: Path | None = None) -> str:
+def make_environment(folder: Path, python: str, wheels: Path | None = None, tracking: bool = False) -> str:
     """Make an environment in `folder` from the interpreter `python`; returns the line of `check_python`.
+
+    tracking: with what `stga track` needs, the landmark detector included.
 
     It replaces earlier ones once it has passed the check; those that processes run in stay until the next time.
     Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
     """
     with status_writer(status_folder(folder)) as writer:
         free = shutil.disk_usage(folder).free / 1e9
-        if free < SIZE_GB:
-            raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {SIZE_GB:.1f} GB")
+        needed = SIZE_GB + (TRACKING_GB if tracking else 0)
+        if free < needed:
+            raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {needed:.1f} GB")
         numbers = [_number(venv) for venv in _environments(folder)]
         venv = folder / f"venv-{max(numbers, default=0) + 1}"
-        steps = install_steps(venv, python, wheels)
+        steps = install_steps(venv, python, wheels, sys.platform, tracking)
         try:
             for number, step in enumerate(steps):
                 if not _run(writer, number / (len(steps) + 1), step):
@@ -340,6 +359,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     make.add_argument("folder", type=Path)
     make.add_argument("--python", default=sys.executable)
     make.add_argument("--wheels", type=Path)
+    make.add_argument("--tracking", action="store_true")
     options = vars(top.parse_args(arguments))
     try:
         print({"check": check_in_worker, "make": make_environment}[options.pop("command")](**options))
