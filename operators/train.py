@@ -66,12 +66,17 @@ def device_property() -> Any:
     )
 
 
+def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
+    """The GPUs that the last test of the training environment found, in its order."""
+    return stored_adapters(environment_folder())
+
+
 def adapter_property() -> Any:
     """GPU that trains where the device is one: of the operator, and of the panel that calls it."""
     return bpy.props.StringProperty(
         name="GPU",
         description="Name of the GPU; empty: the first. The list is that of the last test of the training environment",
-        search=lambda self, context, text: stored_adapters(environment_folder()),
+        search=list_adapters,
         search_options={"SUGGESTION"},
     )
 

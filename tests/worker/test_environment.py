@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.worker import environment
 from stga_addon.worker.environment import (
+    ADAPTERS_FILE,
     CHOICE_FILE,
     PYTHON_VARIABLE,
     InstallStep,
@@ -23,6 +25,7 @@ from stga_addon.worker.environment import (
     remove_environment,
     status_folder,
     store_choice,
+    stored_adapters,
     stored_choice,
     venv_python,
 )
@@ -122,6 +125,11 @@ def test_check_in_a_worker(tmp_path):
     seen = inspect_worker(folder, process)
     assert seen.state == WorkerState.FINISHED
     assert seen.status.message.startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert (tmp_path / ADAPTERS_FILE).exists()
+    if find_spec("wgpu") is not None:
+        from stga_addon.raster.webgpu.device import adapters
+
+        assert stored_adapters(tmp_path) == list(adapters())
 
 
 @pytest.fixture
