@@ -99,7 +99,7 @@ def test_results_arrive_late(device: Device) -> None:
     for n, readback in enumerate(readbacks):
         words = device.upload("words", np.full(4, n, np.uint32))
         with device.record() as work:
-            readback.copy_from(work, words)
+            readback.copy_from(work, (words, 3), (words, 1))
         readback.start()
     for n, readback in enumerate(readbacks):
         assert readback.result().tolist() == [n] * 4

@@ -51,7 +51,7 @@ class Case:
         for row in range(3):
             for column in range(3):
                 view[f"to_world_{row}{column}"] = self.frames.to_world[row, column]
-        view["splats"], view["triangles"] = len(self.face), len(self.frames.origin)
+        view["splats"] = len(self.face)
         view["coefficients"], view["strain_colors"] = self.splats.sh.shape[1], self.splats.strain_color.shape[1]
         view["degree"], view["frame_strains"] = self.degree, self.frames.strain.shape[1]
         view["strains"] = min(self.splats.strain_color.shape[1], self.frames.strain.shape[1])

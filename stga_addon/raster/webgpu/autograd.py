@@ -89,7 +89,7 @@ def _render(
         gradients = device.upload("gradients", np.zeros((table.count, table.stride), np.float32))
         v_images = [device.upload(f"v {n}", v) for n, v in enumerate(cotangents or ())]
         with device.record() as work:
-            rendering = rasterizer.forward(work, table, frames, options)
+            rendering = rasterizer.forward(work, table, frames, options, rasterizer.upload_view(table, options))
             if cotangents is not None:
                 rasterizer.backward(work, rendering, table, v_images[0], gradients, v_images[1])
         if rasterizer.pairs_fit():

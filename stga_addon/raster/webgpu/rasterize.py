@@ -48,7 +48,7 @@ class ViewOptions:
 
     camera: Camera
     degree: int
-    background: Sequence[float] = (0.0, 0.0, 0.0)
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
     strains: int = 0
     depth_as_color: bool = False
     antialiased: bool = False
@@ -84,12 +84,13 @@ class Rasterizer:
         self.capacity = INITIAL_PAIR_CAPACITY
 
     def forward(
-        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, focus: Any | None = None
-    ) -> Rendering:
-        """Record a rendering; focus (N,): see `mark_focus`, if `options.focused`."""
+        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any,
+        focus: Any | None = None,
+    ) -> Rendering:  # fmt: skip
+        """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if `options.focused`."""
         size = options.camera.width, options.camera.height
         columns, rows = tile_grid(*size)
-        tiles, view = columns * rows, self._upload_view(splats, options)
+        tiles = columns * rows
         shared = {"view": view, "focus": focus}
         seen = project(work, splats.count, view=view, splats=splats.rows, face=splats.face, frames=frames)
         chosen = choose_tiles(work, splats.count, tiles, rect=seen.rect, **shared)
@@ -134,7 +135,8 @@ class Rasterizer:
         self.capacity = max(self.capacity, needed + needed // 4)
         self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
 
-    def _upload_view(self, splats: SplatTable, options: ViewOptions) -> Any:
+    def upload_view(self, splats: SplatTable, options: ViewOptions) -> Any:
+        """Send the uniform `view` of the next rendering."""
         camera, view = options.camera, np.zeros((), VIEW)
         columns, rows = tile_grid(camera.width, camera.height)
         values = (
