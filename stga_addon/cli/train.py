@@ -26,6 +26,12 @@ NAME, HELP = "train", "train an avatar from a capture"
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
     parser.add_argument("--out", type=usable_path, required=True, metavar="RUN", help="folder of the run")
+    add_training(parser)
+    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
+
+
+def add_training(parser: ArgumentParser) -> None:
+    """How a new run is trained."""
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
     budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
@@ -44,12 +50,20 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     )
     parser.add_argument("--threshold", type=real_number, metavar="METERS", help="selection threshold")
     add_effects(parser)
-    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
     add_device(parser)
     parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
 
 
 def run(options: Namespace) -> None:
+    run, capture, selection = prepare(options)
+    train_run(options.out, run, capture, selection, options.resume)
+
+
+def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] | None]:
+    """The run that the options name, its capture and the open head's selection; prints why which device trains.
+
+    Raises StgaError.
+    """
     from ..effects.plan import with_effect_plan
     from ..training.optimize.device import choose_device
     from ..training.run.open_run import device_of, open_run
@@ -70,15 +84,32 @@ def run(options: Namespace) -> None:
         run = with_effect_plan(_new_run(options, capture, device), capture, device)
     selection = None if options.head is None else options.head.selection()
     print(why)
-    train_run(options.out, run, capture, None if selection is None else dict(selection), options.resume)
+    return run, capture, None if selection is None else dict(selection)
 
 
 def train_run(
     folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
 ) -> None:
     """Train a run into its folder with a progress bar, and print its summary."""
+    from ..report.run_summary import report_run
+
+    avatar = train_with_bar(folder, run, capture, selection, resume)
+    for line in report_run(folder):
+        print(line)
+    print(f"avatar: {avatar}")
+    if run.settings.tracking:
+        print(f"refined meshes: {folder / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+
+
+def train_with_bar(
+    folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
+) -> Path:
+    """Train a run into its folder with a progress bar; returns the avatar's path.
+
+    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
+    """
     from ..effects.plan import describe_effects
-    from ..report.run_summary import CurveUpdater, report_run
+    from ..report.run_summary import CurveUpdater
     from ..training.run.loop import train
     from ..training.run.progress import Progress
     from ..training.run.progress_bar import ProgressBar
@@ -93,12 +124,7 @@ def train_run(
             draw()
             return bar.report(progress)
 
-        avatar = train(capture, folder, run, selection, resume, report)
-    for line in report_run(folder):
-        print(line)
-    print(f"avatar: {avatar}")
-    if run.settings.tracking:
-        print(f"refined meshes: {folder / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+        return train(capture, folder, run, selection, resume, report)
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:

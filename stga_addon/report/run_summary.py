@@ -11,7 +11,7 @@ from typing import Any
 from ..errors import StgaError
 from ..files import replacing
 from ..format import format_duration
-from ..training.evaluate.forecast import checked_forecasts, curve_of, explain_missed_target, plateau_start
+from ..training.evaluate.forecast import DETAIL, checked_forecasts, curve_of, explain_missed_target, flat_since
 from ..training.run.folder import read_run
 from ..training.run.metrics_log import METRICS, read_metrics
 from .charts import run_chart
@@ -65,16 +65,17 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
-        best = min(evaluations, key=lambda line: line.get("detail_difference", math.inf))
+        best = min(evaluations, key=lambda line: line.get(DETAIL, math.inf))
         parts = [f"{best['psnr']:.2f} dB", f"SSIM {best['ssim']:.4f}"]
         named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
+        parts += [f"detail difference {best[DETAIL]:.4f}"] if DETAIL in best else []
         when = format_duration(best["seconds"])
         lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
     if target is not None and curve:
         reached = any(psnr >= target for _, psnr in curve)
         lines.append(f"{target:g} dB was reached" if reached else explain_missed_target(curve, target))
-    plateau = plateau_start(curve)
+    plateau = flat_since(metrics)
     if plateau is not None:
         since = format_duration(plateau)
         lines.append(f"nothing was gained after {since}: more time does not help with these settings")

@@ -84,7 +84,7 @@ class TrainingSettings:
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
                    `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
-    stop_when_flat  stop when more time no longer helps (`forecast.plateau_start`)
+    stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)

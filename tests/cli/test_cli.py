@@ -487,7 +487,7 @@ def commands_of(parser: argparse.ArgumentParser) -> set[str]:
 def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that the parser lost, and an extension without `development` whose parser needs it."""
     shipped = {"train", "refine", "presets", "render", "eval", "select", "export", "info", "job", "environment"}
-    shipped.add("track")
+    shipped |= {"extend", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
     assert commands_of(make_parser()) == shipped
@@ -605,3 +605,19 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "does not continue another run" in refused(capsys, "refine", runs, "--resume")
     assert "neither a region of the capture" in refused(capsys, "refine", runs, "--region", "chin")
     assert not (tmp_path / "anna_4").exists()
+
+
+def test_extend(trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an extended run that cannot be evaluated, rendered or extended again, and one that does not say what it
+    learned and forgot."""
+    runs, take = Path(shutil.copytree(trained, tmp_path / "anna")), Path(shutil.copytree(root, tmp_path / "smile"))
+    assert main(["extend", str(runs), str(take), "--iterations", "6"]) == 0
+    printed = capsys.readouterr().out
+    assert "take 1: " in printed
+    assert "take 2: " in printed
+    out = tmp_path / "anna_2"
+    assert main(["eval", str(out)]) == 0
+    assert main(["refine", str(out), "--region", "mouth", "--iterations", "3"]) == 0
+    assert main(["extend", str(out), "--resume"]) == 0
+    assert "CAPTURE: is missing" in refused(capsys, "extend", runs)
+    assert "is a take of this run already" in refused(capsys, "extend", out, take)

@@ -53,24 +53,32 @@ def write_footage(folder, cameras, timesteps, picture):
     return folder
 
 
-@pytest.fixture
-def recorded(tmp_path, head):
-    """Footage of blank images, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2."""
+def record(folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8)):
+    """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2; returns its meshes.
+
+    picture(mesh, camera) gives the pixels.
+    """
     cameras, places = rig(), places_on(head, LANDMARKS)
-    write_footage(tmp_path / "footage", cameras, 5, lambda *_: np.zeros((SIZE, SIZE, 3), np.uint8))
-    write_flame(head.model, tmp_path / "head.npz")
-    write_places(tmp_path / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     shape = np.zeros(head.model.n_identity)
     meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(5)]
+    write_footage(folder / "footage", cameras, 5, lambda camera, timestep: picture(meshes[timestep], camera))
+    write_flame(head.model, folder / "head.npz")
+    write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     for number, camera in enumerate(cameras):
         points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
         confidence = np.ones(points.shape[:2])
         confidence[2] = 0
         write_npz(
-            tmp_path / f"points/cam{number}.npz",
+            folder / f"points/cam{number}.npz",
             {"timesteps": np.arange(5), "points": points, "confidence": confidence},
         )
-    return tmp_path, meshes
+    return meshes
+
+
+@pytest.fixture
+def recorded(tmp_path, head):
+    """The folder of a take with blank images, and its meshes."""
+    return tmp_path, record(tmp_path, head)
 
 
 def command(folder, *more):

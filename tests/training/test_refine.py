@@ -57,7 +57,7 @@ def opening(toy: Capture) -> Callable[..., Any]:
     from stga_addon.training.run.open_run import OpenedRun
 
     capture = replace(toy, views={"train": toy.views["train"]})
-    return lambda folder, flame=None: OpenedRun(read_run(folder), capture)
+    return lambda folder, flame=None: OpenedRun(read_run(folder), capture, (capture,))
 
 
 def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> Path:

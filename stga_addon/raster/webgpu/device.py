@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import wgpu
@@ -21,6 +21,9 @@ from wgpu.backends.wgpu_native.extras import set_instance_extras
 
 from ...errors import StgaError
 from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
+
+if TYPE_CHECKING:
+    from .timing import KernelTimes
 
 NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
 """What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
@@ -66,7 +69,11 @@ class Kernel:
 
 
 class Device:
-    """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels."""
+    """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels.
+
+    dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
+    kernel_times                times the kernels while it is set
+    """
 
     def __init__(self, name: str | None = None) -> None:
         """Open the adapter called `name` in `adapters()`, the first one by default."""
@@ -80,7 +87,8 @@ class Device:
         with self.errors():
             self.gpu, self._kernels = _open(self.name)
         self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
-        self.submits = 0
+        self.dispatches = self.submits = self.waits = 0
+        self.kernel_times: KernelTimes | None = None
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
 
@@ -128,6 +136,7 @@ class Device:
         count = int(np.prod(shape))
         if not count:
             return np.empty(shape, dtype)
+        self.waits += 1
         with self.errors():
             size = -(-count * np.dtype(dtype).itemsize // 4) * 4
             data = np.frombuffer(self.gpu.queue.read_buffer(buffer, 0, size), dtype)
@@ -229,7 +238,7 @@ class Recording:
         indirect = not isinstance(groups[0], int)
         if not indirect and 0 in groups:
             return
-        compute = self._compute_pass()
+        compute = self._compute_pass(kernel)
         compute.set_pipeline(kernel.pipeline)
         compute.set_bind_group(0, self.device.bind(kernel, buffers))
         if indirect:
@@ -237,6 +246,7 @@ class Recording:
         else:
             compute.dispatch_workgroups(*groups)
         self.dispatches += 1
+        self.device.dispatches += 1
 
     def copy(self, source: Any, target: Any, words: int, at: int = 0, to: int = 0) -> None:
         """Copy words of a buffer to another, from word `at` to word `to`."""
@@ -252,6 +262,8 @@ class Recording:
         """Hand the work to the device and return without waiting for it."""
         with self.device.errors():
             self._end_pass()
+            if self.device.kernel_times is not None:
+                self.device.kernel_times.resolve(self._encoder)
             self.device.gpu.queue.submit([self._encoder.finish()])
             self.device.submits += 1
 
@@ -264,8 +276,12 @@ class Recording:
         if error is None:
             self.submit()
 
-    def _compute_pass(self) -> Any:
-        if self._pass is None:
+    def _compute_pass(self, kernel: Kernel) -> Any:
+        times = self.device.kernel_times
+        if times is not None:
+            self._end_pass()
+            self._pass = self._encoder.begin_compute_pass(timestamp_writes=times.writes(kernel.name))
+        elif self._pass is None:
             self._pass = self._encoder.begin_compute_pass()
         return self._pass
 

@@ -6,10 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from ..settings import TrainingSettings
+from ..settings import CONTINUATIONS, TrainingSettings
 from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .state import TrainState
 
+EXTEND_GLOBAL_INTERVAL = 4
+"""Local iterations of an extension between two that train all splats."""
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
 
@@ -70,13 +72,28 @@ class RefineStrategy:
         return self.region
 
 
+@dataclass
+class ExtendStrategy:
+    """Trains what new takes need, in all frames; every so often all splats.
+
+    region  (F,) bool: what moves in the new takes, or looks different there
+    """
+
+    region: np.ndarray
+
+    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+        is_global = iteration % (EXTEND_GLOBAL_INTERVAL + 1) == EXTEND_GLOBAL_INTERVAL
+        return None if is_global or not self.region.any() else self.region
+
+
 def make_strategy(settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> Strategy:
     """The strategy that the settings name; "gaussian-avatars" differs from "global" in its settings only.
 
-    selection: timestep -> (F,) bool; "refine" trains the union.
+    selection: timestep -> (F,) bool; "refine" and "extend" train the union.
     """
-    if settings.strategy == "refine":
-        return RefineStrategy(np.any(list(selection.values()), axis=0))
+    if settings.strategy in CONTINUATIONS:
+        union = np.any(list(selection.values()), axis=0)
+        return RefineStrategy(union) if settings.strategy == "refine" else ExtendStrategy(union)
     return SelectiveStrategy(settings, selection) if settings.strategy == "selective" else GlobalStrategy()
 
 

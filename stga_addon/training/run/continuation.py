@@ -8,9 +8,12 @@ import torch
 
 from ...avatar.file import read_avatar
 from ...capture.model import Capture, View
+from ...capture.open import open_capture
 from ...capture.region import find_region
+from ...capture.takes import first_timesteps, join_takes, require_same_head
 from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
+from ...selection import select_capture
 from ..evaluate.evaluation_views import (
     MAX_EVALUATION_VIEWS,
     MIN_REGION_PIXELS,
@@ -19,18 +22,25 @@ from ..evaluate.evaluation_views import (
     spread_views,
     visible_pixels,
 )
+from ..evaluate.residuals import triangle_residuals
+from ..optimize.exposure import exposure_correction
 from ..optimize.state import TrainState, new_state
 from ..optimize.tracking import with_refined_tracking
 from ..settings import Rates, TrainingSettings, validate
 from .checkpoint import read_checkpoint
-from .folder import CHECKPOINT, Continuation, Run
-from .identity import file_digest
-from .open_run import open_run
+from .folder import CHECKPOINT, Continuation, Run, Take
+from .identity import file_digest, identity_of
+from .open_run import OpenedRun, open_run
+from .replay import replayed_views
 
 START_SHARE = 0.6
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
+MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
+"""How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
+RESIDUAL_SCALE = 0.5
+"""Size of the images that residuals are measured in: an error that matters is larger than a pixel."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
@@ -49,6 +59,24 @@ class Refinement:
     parent: Path
     region: str
     frames: tuple[int, int] | None = None
+    growth: float = 0.0
+    seconds: float | None = None
+    iterations: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What is asked of a continuation that extends a run by further takes of the same head.
+
+    parent   folder of the run
+    captures folders of the takes
+    growth   most splats that may be added, as a share of those on the triangles that the takes need
+    seconds, iterations   the budget, one of the two
+    """
+
+    parent: Path
+    captures: tuple[Path, ...]
     growth: float = 0.0
     seconds: float | None = None
     iterations: int | None = None
@@ -87,6 +115,69 @@ def prepare_refinement(wanted: Refinement, device: str, flame: Path | None = Non
         continuation=Continuation(wanted.parent.resolve(), file_digest(wanted.parent / "avatar.npz"), *frames),
     )
     return Prepared(run, capture, {capture.timesteps[0]: region})
+
+
+def prepare_extension(wanted: Extension, device: str, flame: Path | None = None) -> Prepared:
+    """Check the takes, and select what they need: the triangles that move, and those that look different than before.
+
+    Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
+    in the run already.
+    """
+    opened = open_run(wanted.parent, flame=flame)
+    run, new = opened.run, [_open_new_take(opened, path) for path in wanted.captures]
+    everything = [*opened.takes, *new]
+    capture = with_refined_tracking(join_takes(everything), wanted.parent)
+    starts = first_timesteps(everything)[len(opened.takes) :]
+    added = [
+        Take(take.root, start, identity_of(take, run.flame, run.principal_point, run.settings))
+        for take, start in zip(new, starts, strict=True)
+    ]
+    continuation = Continuation(
+        wanted.parent.resolve(), file_digest(wanted.parent / "avatar.npz"), starts[0], max(capture.timesteps)
+    )
+    selection = select_for_takes(continuation, capture, run.settings)
+    face = read_avatar(wanted.parent / "avatar.npz").splats.face
+    share = float(np.any(list(selection.values()), axis=0)[face].mean())
+    settings = continued_settings(
+        run.settings, "extend", wanted.growth * share, wanted.seconds, wanted.iterations, wanted.seed
+    )
+    run = replace(
+        run, settings=settings, device=device, identity=None, takes=(*run.takes, *added), continuation=continuation
+    )
+    return Prepared(run, capture, selection)
+
+
+def select_for_takes(continuation: Continuation, capture: Capture, settings: TrainingSettings) -> dict[int, np.ndarray]:
+    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old takes.
+
+    A triangle looks different where the avatar's residual in a few views of the new takes is larger than in a few of
+    the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
+    """
+    views = capture.views["train"]
+    avatar, correct = read_avatar(continuation.parent / "avatar.npz"), exposure_correction(settings)
+    old, new = (
+        triangle_residuals(avatar, capture, replayed_views(capture, members), correct, RESIDUAL_SCALE).mean()
+        for members in (
+            [view for view in views if not continuation.includes(view.timestep)],
+            [view for view in views if continuation.includes(view.timestep)],
+        )
+    )
+    known, now = np.nan_to_num(old), np.nan_to_num(new)
+    differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
+    timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
+    moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
+    return {timestep: faces | differs for timestep, faces in moving.items()}
+
+
+def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
+    run = opened.run
+    take = open_capture(path, run.flame, run.principal_point)
+    require_same_head(opened.capture, take)
+    if not take.views.get("train"):
+        raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
+    if any(take.root == old.root for old in opened.takes):
+        raise StgaError(f"{take.root}: is a take of this run already")
+    return take
 
 
 def starting_state(continuation: Continuation) -> TrainState:

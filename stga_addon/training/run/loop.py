@@ -23,7 +23,7 @@ from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
 from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
-from ..evaluate.forecast import curve_of, forecast, forecast_horizon, plateau_start
+from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
 from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
@@ -272,7 +272,7 @@ class _Loop:
         curve, target = curve_of(self.lines), self.settings.target_psnr
         if self._share() >= 1 or (target is not None and any(psnr >= target for _, psnr in curve)):
             return True
-        return self.settings.stop_when_flat and plateau_start(curve) is not None
+        return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Measure the evaluation views, keep the avatar if it is the sharpest so far, and append a line of metrics."""
@@ -295,7 +295,7 @@ class _Loop:
             )
             self.psnr = quality.psnr
             line.update(quality.as_json())
-        self._keep_best(line.get("detail_difference"))
+        self._keep_best(line.get(DETAIL))
         now = perf_counter()
         line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
         line["peak_memory_mb"] = peak_memory_mb()
@@ -322,10 +322,10 @@ class _Loop:
         curve, left = curve_of(self.lines), self._left_s()
         ahead = forecast_horizon(self.elapsed, left)
         predicted = None if ahead is None else forecast(curve, ahead)
-        self.forecast_text = "" if predicted is None else str(predicted)
+        self.forecast_text = "" if ahead is None else forecast_text(self.lines, ahead)
         if predicted is not None and "psnr" in line:
             line["forecast"] = predicted.as_json()
-        plateau = plateau_start(curve) if left else None
+        plateau = flat_since(self.lines) if left else None
         if plateau is not None:
             self.forecast_text = f"no gain since {format_duration(plateau)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None

@@ -15,10 +15,14 @@ from .identity import Identity, difference, identity_of
 
 @dataclass(frozen=True)
 class OpenedRun:
-    """A run and its capture. `run` has the paths of `capture` and FLAME model that were opened."""
+    """A run and its capture. `run` has the paths of `capture` and FLAME model that were opened.
+
+    takes  the captures that `capture` is joined from
+    """
 
     run: Run
     capture: Capture
+    takes: tuple[Capture, ...]
 
 
 def open_run(
@@ -35,14 +39,15 @@ def open_run(
     flame = run.flame if flame is None else flame.resolve()
     first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
     run = replace(run, capture=first.root, flame=flame)
-    opened = join_takes([first, *(open_take(folder, run, take) for take in run.takes)])
+    takes = (first, *(_open_take(folder, run, take) for take in run.takes))
+    opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
         opened = with_refined_tracking(opened, folder)
-    return OpenedRun(run, opened)
+    return OpenedRun(run, opened, takes)
 
 
-def open_take(folder: Path, run: Run, take: Take) -> Capture:
+def _open_take(folder: Path, run: Run, take: Take) -> Capture:
     """A capture that joined the run. Raises StgaError where it is missing or has changed."""
     capture = open_capture(take.capture, run.flame, run.principal_point)
     changed = difference(take.identity, identity_of(capture, run.flame, run.principal_point, run.settings))
