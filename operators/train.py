@@ -59,9 +59,9 @@ def device_property() -> Any:
         name="Device",
         description="Device that trains. Auto resumes a run on the device that it was trained on",
         items=(
-            ("auto", "Auto", "An NVIDIA GPU if one works, else the CPU"),
+            ("auto", "Auto", "A GPU if it is right and faster than the CPU in a trial, else the CPU"),
             ("cpu", "CPU", "The processor"),
-            ("cuda", "GPU", "An NVIDIA GPU; training fails if none works"),
+            ("gpu", "GPU", "The first graphics adapter; training fails if its results are wrong"),
         ),
     )
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from raster import webgpu
+from raster import gpu_device
 
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture
-from stga_addon.raster.webgpu import rasterize
-from stga_addon.raster.webgpu.device import Device
+from stga_addon.raster.gpu import rasterize
+from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
@@ -54,7 +54,7 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
 
 def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
     """Both implementations with the same splats."""
-    webgpu.device()  # or skip
+    gpu_device.device()  # or skip
     lengths, frames = limit_units(capture, settings.convention), FrameStore(capture, settings.convention, True)
     cpu = CpuBackend(settings, lengths, frames, disturbed(capture, settings))
     return cpu, GpuBackend(Device(), settings, lengths, frames, disturbed(capture, settings))

@@ -1,4 +1,4 @@
-"""Training backend on a GPU, by the WebGPU kernels."""
+"""Training backend on a GPU, by WebGPU kernels."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ import torch
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.cpu.layout import Parameters
-from ...raster.webgpu.device import Device, Readback, Recording
-from ...raster.webgpu.frames import Embedding
-from ...raster.webgpu.image_loss import image_loss, upload_target
-from ...raster.webgpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
-from ...raster.webgpu.optimizer import OptimizerTables, optimize, upload_step
-from ...raster.webgpu.project import mark_focus
-from ...raster.webgpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions
-from ...raster.webgpu.tiles import counts_buffer
+from ...raster.gpu.device import Device, Readback, Recording
+from ...raster.gpu.frames import Embedding
+from ...raster.gpu.image_loss import image_loss, upload_target
+from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
+from ...raster.gpu.optimizer import OptimizerTables, optimize, upload_step
+from ...raster.gpu.project import mark_focus
+from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions
+from ...raster.gpu.tiles import counts_buffer
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, EPSILON
 from .backend import Batch
