@@ -164,6 +164,21 @@ def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest
         np.testing.assert_array_equal(results[1][name], want, err_msg=name)
 
 
+@pytest.mark.parametrize("part", [None, "mouth"])
+def test_an_iteration_is_one_submit(toy: Capture, part: str | None) -> None:
+    """Catches work that waits for the host, or that costs a submit or many dispatches of its own."""
+    settings = settings_of()
+    _, gpu = pair(toy, settings)
+    batch = batch_of(toy, settings, selected=None if part is None else toy.regions[part])
+    gpu.step(batch)
+    device = gpu._device
+    before = device.dispatches, device.submits, device.waits
+    gpu.step(batch)
+    assert device.dispatches - before[0] <= 30
+    assert device.submits - before[1] == 1
+    assert device.waits == before[2]
+
+
 def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
     """Catches density control whose result stays on the host, and a state that is no copy."""
     settings = settings_of()

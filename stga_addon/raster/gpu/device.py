@@ -7,11 +7,13 @@ Work is recorded into one command encoder and submitted at once; nothing waits f
 import logging
 import os
 import re
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from time import sleep
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
 NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
 """What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
+POLL_INTERVAL_S = 2e-4
 BACKENDS = ("Vulkan", "Metal", "DX12")
 """Without OpenGL, which lacks what the kernels need and complains where there is no display."""
 
@@ -310,7 +313,8 @@ class Readback:
     def start(self) -> None:
         """Ask for the words as soon as the submitted work is done."""
         with self._device.errors():
-            self._promise = self._buffer.map_async(wgpu.MapMode.READ)
+            # Without the empty submit that wgpu makes for READ, which `read_buffer` avoids in the same way.
+            self._promise = self._buffer.map_async("READ_NOSYNC")
 
     def result(self) -> np.ndarray:
         """The words, uint32; waits if the work is not done yet."""
@@ -344,7 +348,26 @@ def _open(name: str) -> tuple[Any, dict[tuple, Kernel]]:
         required_features=sorted({"timestamp-query"} & adapter.features),
         required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
     )
+    _poll_without_blocking(device)
     return device, {}
+
+
+def _poll_without_blocking(device: Any) -> None:
+    """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is there.
+
+    By itself it waits inside the driver for all submitted work, and holds a lock that the next submit waits for.
+    """
+    poller = getattr(device, "_poller", None)  # private: a version without it is slower, not wrong
+
+    def poll(_: bool) -> None:
+        device_of_poller = reference()
+        if device_of_poller is not None:
+            device_of_poller._poll(False)
+        sleep(POLL_INTERVAL_S)
+
+    if hasattr(poller, "_poll_func"):
+        reference = weakref.ref(device)
+        poller._poll_func = poll
 
 
 def _source(name: str) -> str:
