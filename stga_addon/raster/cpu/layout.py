@@ -27,7 +27,8 @@ class Parameters(NamedTuple):
     """What is trained of N splats, raw as in `Splats`: numpy arrays, in `autograd` torch tensors.
 
     xyz (N, 3), rotation (N, 4) wxyz, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3); strain_color (N, S, 3), or
-    None where colors do not follow strain. The triangles (N,) int32 that the splats are bound to are passed beside them.
+    None where colors do not follow strain. The triangles (N,) int32 that the splats are bound to are passed beside
+    them.
     """
 
     xyz: Any

@@ -357,17 +357,16 @@ def _poll_without_blocking(device: Any) -> None:
 
     By itself it waits inside the driver for all submitted work, and holds a lock that the next submit waits for.
     """
-    poller = getattr(device, "_poller", None)  # private: a version without it is slower, not wrong
+    reference = weakref.ref(device)
 
     def poll(_: bool) -> None:
-        device_of_poller = reference()
-        if device_of_poller is not None:
-            device_of_poller._poll(False)
+        alive = reference()
+        if alive is not None:
+            alive._poll(False)
         sleep(POLL_INTERVAL_S)
 
-    if hasattr(poller, "_poll_func"):
-        reference = weakref.ref(device)
-        poller._poll_func = poll
+    if hasattr(getattr(device, "_poller", None), "_poll_func"):  # private: a version without it is slower, not wrong
+        device._poller._poll_func = poll
 
 
 def _source(name: str) -> str:
