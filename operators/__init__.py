@@ -19,6 +19,7 @@ from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
 from .pose import PoseHead
+from .preview_images import PreviewImages
 from .render_video import CancelVideo, DismissVideo, RenderVideo
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
@@ -47,6 +48,7 @@ CLASSES = (
     ShowAvatar,
     StandardView,
     MoreBounces,
+    PreviewImages,
     RenderVideo,
     CancelVideo,
     DismissVideo,

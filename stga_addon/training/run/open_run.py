@@ -42,7 +42,7 @@ def open_run(
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
-        from ..optimize.tracking import with_refined_tracking  # which needs torch
+        from ..optimize.tracking import with_refined_tracking  # imports torch, which Blender's own Python lacks
 
         opened = with_refined_tracking(opened, folder)
     return OpenedRun(run, opened, takes)
