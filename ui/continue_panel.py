@@ -6,6 +6,7 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, scene_settings
+from ..stga_addon.scene.display.heat_map import shows_residuals
 from .sidebar import SidebarPanel
 from .train_panel import TrainPanel
 
@@ -28,6 +29,11 @@ class ContinuePanel(SidebarPanel, bpy.types.Panel):
 
 def _draw_refine(layout: Any, settings: Any) -> None:
     column, head = layout.column(), settings.head
+    shown = shows_residuals(head)
+    residuals = column.operator(
+        ids.HEAT_MAP, text="Hide Residuals" if shown else "Show Residuals", icon="BRUSHES_ALL", depress=shown
+    )
+    residuals.show, residuals.of, residuals.directory = not shown, "RESIDUAL", settings.run_folder
     editing = head.mode == "EDIT"
     if not editing:
         column.prop_search(settings, "refine_group", head, "vertex_groups", text="Region")

@@ -98,6 +98,23 @@ def test_mistakes_are_sentences(head, jobs, run, tmp_path):
     assert not run.with_name("run_2").exists()
 
 
+def test_residuals_are_shown_on_the_head(head, run, extension):
+    """Catches a heat map of other triangles than those with the error, and unknown ones that are shown as bad."""
+    residual = np.full(len(head.data.polygons), 0.01, np.float32)
+    residual[7], residual[9] = 0.2, np.nan
+    extension.stga_addon.training.run.residual_file.write_residuals(run, residual)
+    assert bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run)) == {"FINISHED"}
+    shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])
+    assert shown.argmax() == 7
+    assert shown[9] == 0
+    red = np.array([item.color[0] for item in head.data.attributes["stga_heat"].data]).reshape(-1, 3)
+    assert red[7] == pytest.approx(0.9, abs=0.01)
+    assert bpy.ops.stga.heat_map(show=False) == {"FINISHED"}
+    assert not {"stga_residual", "stga_heat"} & set(head.data.attributes.keys())
+    with pytest.raises(RuntimeError, match=r"^Error: .*residuals\.npz"):
+        bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run.parent))
+
+
 @pytest.mark.slow
 def test_refine_and_extend_end_to_end(head, tmp_path):
     """Catches a job that the worker does not understand, and an avatar that is not that of the continued run."""

@@ -22,7 +22,7 @@ from ..evaluate.evaluation_views import (
     spread_views,
     visible_pixels,
 )
-from ..evaluate.residuals import triangle_residuals
+from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
 from ..optimize.state import TrainState, new_state
 from ..optimize.tracking import with_refined_tracking
@@ -40,8 +40,6 @@ DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
 MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
 """How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
-RESIDUAL_SCALE = 0.5
-"""Size of the images that residuals are measured in: an error that matters is larger than a pixel."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
