@@ -24,6 +24,7 @@ from .landmarks import (
     read_landmarks,
     read_places,
     timesteps_with_landmarks,
+    write_landmarks,
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
@@ -111,6 +112,8 @@ def track(
         fit.head.model.faces,
         result.reprojection_px,
     )
+    if landmarks is not None:  # what a correction of the capture starts from
+        write_landmarks(out / LANDMARKS_FOLDER, found, places, reliable)
     write_capture(out, footage, fit, parameters, meshes, report)
     return result
 
