@@ -18,6 +18,7 @@ from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
 from .pose import PoseHead
+from .preview_images import PreviewImages
 from .render_video import CancelVideo, DismissVideo, RenderVideo
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
@@ -44,6 +45,7 @@ CLASSES = (
     ShowAvatar,
     StandardView,
     MoreBounces,
+    PreviewImages,
     RenderVideo,
     CancelVideo,
     DismissVideo,

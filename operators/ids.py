@@ -28,6 +28,8 @@ EXPORT_AVATAR = "stga.export_avatar"
 EXPORT_CAMERAS = "stga.export_cameras"
 STANDARD_VIEW = "stga.standard_view"
 MORE_BOUNCES = "stga.more_bounces"
+PREVIEW_IMAGES = "stga.preview_images"
 
+TAB = "STGA"  # of the 3D viewport's sidebar
 SETTINGS = "stga"  # property group on the scene
 CLI_COMMAND = "stga"
