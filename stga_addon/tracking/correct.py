@@ -15,16 +15,16 @@ from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
 from ..flame.sequence import FRAME_FIELDS, FlameSequence, with_identity
 from .contact_sheet import write_contact_sheet
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.open import open_footage
-from .landmarks import PLACES_FILE, Report, read_landmarks, read_places
-from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints
+from .landmarks import Report, read_landmarks, read_places
+from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, parameters_of
 from .solve import (
     EXPRESSION_ACCELERATION,
     JOINT_ACCELERATION_RAD,
     LANDMARK_SIGMA_M,
     TRANSLATION_ACCELERATION_M,
 )
-from .track import LANDMARKS_FOLDER, REPORT_FILE, SHEET_FILE
 from .write_capture import flame_frame
 
 KEYS_FILE, SOLVED_FILE = "tracking_keys.npz", "tracking_solved.npz"
@@ -150,13 +150,6 @@ def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
     solved = np.stack([parameters_of(sequence.frame(timestep)) for timestep in timesteps])
     write_npz(path, {"timesteps": np.array(timesteps), "parameters": solved})
     return timesteps, solved
-
-
-def parameters_of(frame: FlameFrame) -> np.ndarray:
-    """(E + 18,) expression, pose and translation of a FLAME frame."""
-    return np.concatenate(
-        [frame.expr, frame.rotation, frame.neck_pose, frame.jaw_pose, frame.eyes_pose, frame.translation]
-    )
 
 
 def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:

@@ -11,10 +11,10 @@ import numpy as np
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .detectors import Detector
+from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .posed_points import SurfacePoints
 
-PLACES_FILE = "head_model.npz"
 MIN_BARYCENTRIC = -1e-3
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""

@@ -8,10 +8,10 @@ from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json
 from stga_addon.flame.forward import flame_forward
-from stga_addon.tracking.correct import KEYS_FILE, correct_capture, corrected, parameters_of
+from stga_addon.tracking.correct import KEYS_FILE, correct_capture, corrected
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.posed_points import RIGID_SIZE
+from stga_addon.tracking.posed_points import RIGID_SIZE, parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import flame_frame
