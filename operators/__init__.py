@@ -8,6 +8,7 @@ from . import analyze, ids, monitor, render_video, track
 from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
+from .continue_run import Extend, Refine
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
 from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
@@ -45,6 +46,8 @@ CLASSES = (
     AnalyzeCapture,
     CancelAnalysis,
     Train,
+    Refine,
+    Extend,
     CancelTraining,
     DismissTraining,
     CopyReport,

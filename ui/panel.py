@@ -15,6 +15,7 @@ from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_tran
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
 from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
+from .continue_panel import ContinuePanel
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
 from .next_step import NextStepPanel
@@ -117,6 +118,7 @@ CLASSES = (
     SelectPanel,
     TrainPanel,
     TrainOptionsPanel,
+    ContinuePanel,
     EffectsPanel,
     ShowPanel,
     MotionPanel,

@@ -95,6 +95,29 @@ class SceneSettings(bpy.types.PropertyGroup):
         default="//stga_run",
     )
     minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
+    refine_group: bpy.props.StringProperty(
+        name="Region", description="Vertex group whose triangles are refined; empty: the active one"
+    )
+    refine_all_frames: bpy.props.BoolProperty(
+        name="All Frames", description="Train the region on all frames of the capture", default=True
+    )
+    refine_first: bpy.props.IntProperty(name="First Frame", description="First frame to train on", min=0)
+    refine_last: bpy.props.IntProperty(name="Last Frame", description="Last frame to train on", min=0)
+    refine_seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=20.0, min=0.1)
+    refine_growth: bpy.props.FloatProperty(
+        name="More Splats",
+        description="Splats that may be added, as a share of those in the region",
+        min=0.0,
+        soft_max=2.0,
+        subtype="FACTOR",
+    )
+    take: bpy.props.StringProperty(
+        name="Take",
+        description="Folder of a further capture of the same head",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS,
+    )
+    extend_seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
     strategy: strategy_property()
     preset: preset_property(update=_take_minutes)
     device: device_property()

@@ -32,6 +32,10 @@ class Layout:
     def prop(self, owner, name, **_):
         assert name.startswith("[") or hasattr(owner, name)
 
+    def prop_search(self, owner, name, other, collection, **_):
+        assert hasattr(owner, name)
+        assert hasattr(other, collection)
+
     def progress(self, factor, text):
         self.texts.append(text)
 
