@@ -34,7 +34,7 @@ def _adapters() -> tuple[list[str], str]:
     """
     cpu = f"CPU with {os.cpu_count()} threads"
     try:
-        device = importlib.import_module("..raster.webgpu.device", __package__)
+        device = importlib.import_module("..raster.gpu.device", __package__)
         found = device.adapters()
     except Exception:  # the package is missing, or a driver fails: the CPU trains
         return [], cpu
