@@ -95,6 +95,11 @@ class Device:
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
 
+    @property
+    def bytes(self) -> int:
+        """Size of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
+
     def buffer(self, name: str, words: int, usage: str = "storage") -> Any:
         """A buffer of at least so many 32-bit words; the same memory until more is asked for, then fresh zeros.
 
