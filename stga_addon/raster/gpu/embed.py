@@ -141,7 +141,8 @@ class Embedding:
         convention: str,
         basis: strain.StrainBasis | None = None,
     ) -> None:
-        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where colors follow strain."""
+        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where colors follow strain,
+        within ±MAX_STRAIN: its range concerns what training has not seen."""
         if convention not in embedding.CONVENTIONS:
             raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
         self._buffers, self._area_scales = DeviceBufferPool(device), convention == "stga"
