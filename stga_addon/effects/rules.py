@@ -119,13 +119,12 @@ def background(facts: CaptureFacts) -> Verdict:
 
 
 def hull_points(facts: CaptureFacts) -> Verdict:
-    if facts.cameras == 1:
-        return Verdict(False, "a single camera does not show how far away something beside the mesh is", only=True)
     if np.isnan(facts.uncovered):
         return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
-    return Verdict(
-        facts.uncovered > MIN_UNCOVERED_SHARE, f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
-    )
+    reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
+    if facts.cameras == 1:
+        reason += "; a single camera does not show how far away, so that it becomes a flat layer"
+    return Verdict(facts.uncovered > MIN_UNCOVERED_SHARE, reason)
 
 
 def density(facts: CaptureFacts) -> Verdict:
