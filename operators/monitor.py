@@ -31,8 +31,8 @@ from . import ids
 from .common import is_head
 from .show import show
 
-Curve = tuple[np.ndarray, str]
-"""Pixels of a run's curve and the ranges of its axes."""
+Curve = tuple[np.ndarray, str, str]
+"""Pixels of a run's curve, the ranges of its axes and of the detail difference."""
 
 _states: dict[int, MonitorState] = {}
 """Session id of a scene -> its training."""

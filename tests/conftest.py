@@ -33,14 +33,20 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture(params=["cpu", "gpu"])
+@pytest.fixture(params=["cpu", "warp", "gpu"])
 def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The kernels that a test's `render_differentiable` runs: Numba's, and Warp's on Warp's CPU device."""
-    if request.param == "gpu":
+    """The kernels that a test's `render_differentiable` runs: Numba's, Warp's on its CPU device, and WebGPU's on the
+    first adapter."""
+    if request.param == "warp":
         pytest.importorskip("warp")
-        from stga_addon.raster.gpu.autograd import render_differentiable
+        from stga_addon.raster.gpu import autograd
+    elif request.param == "gpu":
+        from raster import webgpu
 
+        webgpu.device()
+        from stga_addon.raster.webgpu import autograd
+    if request.param != "cpu":
         for module in (request.module, sys.modules["raster.test_kernels"]):
             if hasattr(module, "render_differentiable"):
-                monkeypatch.setattr(module, "render_differentiable", render_differentiable)
+                monkeypatch.setattr(module, "render_differentiable", autograd.render_differentiable)
     return str(request.param)

@@ -12,7 +12,7 @@ import numpy as np
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
-from .embedding import CONVENTIONS, FaceFrames, face_frames
+from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
 from .splats import MAX_SH_DEGREE, Splats
 from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 
@@ -48,7 +48,11 @@ class Avatar:
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
         """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colors follow it."""
-        return face_frames(mesh, self.faces, self.neutral, self.convention, self._strain)
+        return face_frames(mesh, self.faces, self.neutral, self.convention, self._strain, self._areas)
+
+    @cached_property
+    def _areas(self) -> np.ndarray:
+        return face_areas(self.neutral, self.faces)
 
     @cached_property
     def _strain(self) -> StrainBasis | None:

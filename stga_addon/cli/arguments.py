@@ -104,8 +104,8 @@ def frame_rate(text: str) -> float:
 
 
 def frame_span(text: str) -> tuple[int, int]:
-    """ "10:20", both included. Raises argparse.ArgumentTypeError for anything else."""
-    match = re.fullmatch(r"(\d{1,18}):(\d{1,18})", text, re.ASCII)
+    """ "10:20" or "10-20", both included. Raises argparse.ArgumentTypeError for anything else."""
+    match = re.fullmatch(r"(\d{1,18})[:-](\d{1,18})", text, re.ASCII)
     first, last = (int(part) for part in match.groups()) if match else (1, 0)
     if first > last:
         raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 10:20")

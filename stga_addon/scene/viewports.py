@@ -34,10 +34,10 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_location, region.view_distance = center, DISTANCE * radius
 
 
-def frame_demo(head: Any, scene: Any, frames_per_second: int) -> None:
+def frame_alone(head: Any, scene: Any, frames_per_second: int) -> None:
     """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head.
 
-    The world is white, as behind the images of the demo's capture.
+    The world is white, the background of captures without one of their own.
     """
     scene.render.fps = frames_per_second
     scene.world = bpy.data.worlds.new("World")

@@ -35,8 +35,9 @@ class CameraLandmarks:
 
 
 def landmark_file(folder: Path, camera: str) -> Path:
-    """The file of a camera; characters that file names cannot have become `_`."""
-    return folder / (re.sub(r"[^\w.-]", "_", camera) + ".npz")
+    """The file of a camera; characters that not all file systems allow are percent-encoded, as in `walk%2F1.npz`."""
+    name = re.sub(r"[^\w.-]", lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), camera) + ".npz"
+    return folder / (name if name != PLACES_FILE else name.replace("h", "%68", 1))
 
 
 def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report: Report) -> dict[str, CameraLandmarks]:

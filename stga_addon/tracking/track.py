@@ -27,7 +27,7 @@ from .landmarks import (
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
-from .write_capture import SPLIT_FILES, posed_mesh, write_capture
+from .write_capture import is_written, posed_mesh, write_capture
 
 REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER = "tracking.json", "contact_sheet.png", "landmarks"
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
@@ -70,7 +70,7 @@ def track(
     What was detected is kept in OUT/landmarks: called again after an interruption, those cameras are not detected
     again. The capture's world is in meters, y up, with the head near its origin. Raises StgaError.
     """
-    if any((out / name).exists() for name in (*SPLIT_FILES, "transforms.json")):
+    if is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")

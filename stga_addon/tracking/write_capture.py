@@ -40,8 +40,13 @@ def write_capture(
         frames["val" if camera.name == held_out else "train"].append(entry)
         report("Images", number + 1, len(views))
     top = _write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)
-    for name, entries in zip(SPLIT_FILES, frames.values(), strict=True):
+    for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):  # train last: see is_written
         write_json(out / name, {**top, "frames": entries})
+
+
+def is_written(out: Path) -> bool:
+    """Whether a folder holds a whole capture; an interrupted `write_capture` leaves none."""
+    return any((out / name).exists() for name in (SPLIT_FILES[0], "transforms.json"))
 
 
 def posed_mesh(fit: HeadFit, parameters: np.ndarray) -> np.ndarray:

@@ -194,3 +194,15 @@ def test_unexpected_error_stops_until_the_next_start_or_check():
     for restart in (Started(RUN), status(WorkerState.WORKING)):
         restarted, _ = after(restart, status(WorkerState.WORKING), state=state)
         assert (restarted.interval_s, restarted.error) == (CHECK_INTERVAL_S, "")
+
+
+def test_training_that_ends_while_a_preview_is_shown():
+    """Catches checks that end with the worker, so that its last avatar never reaches the scene."""
+    state, _ = after(Started(RUN), status(WorkerState.WORKING, preview=1), status(WorkerState.CANCELLED, preview=1))
+    state, _ = after(AvatarShown(created=False), state=state)
+    assert state.interval_s == CHECK_INTERVAL_S
+    state, effects = after(status(WorkerState.CANCELLED, preview=1), state=state)
+    assert loads(effects) == [AVATAR]
+    state, _ = after(AvatarShown(created=False), state=state)
+    assert state.result_shown
+    assert state.interval_s is None

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 import warp as wp
-from numerics.meshes import DEGENERATE, WHOLE, mesh_of
+from numerics.meshes import bent_ball, collapsed
 
 from raster import test_kernels
 from raster.test_kernels import (
@@ -250,20 +249,6 @@ def test_adam_is_the_other_back_ends_and_keeps_broken_rows() -> None:
     np.testing.assert_array_equal(counts.numpy(), steps)
     for got, want in zip(device, tables, strict=True):
         np.testing.assert_allclose(got.numpy(), want, rtol=2e-6, atol=2e-7)
-
-
-def bent_ball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Posed and neutral vertices (V, 3) of a ball, and its faces."""
-    sphere = trimesh.creation.icosphere(2, 0.1)
-    neutral = np.array(sphere.vertices)
-    noise = np.random.default_rng(6).normal(size=neutral.shape) * 0.003
-    return neutral * [1.1, 0.9, 1] + noise, neutral, np.array(sphere.faces, np.int32)
-
-
-def collapsed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles that become lines and points."""
-    posed, faces = mesh_of([*DEGENERATE.values()])
-    return posed, mesh_of([WHOLE] * len(DEGENERATE))[0], faces
 
 
 @pytest.mark.parametrize("mesh", ["ball", "collapsed", "lines in the neutral mesh", "far away"])

@@ -200,7 +200,9 @@ def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pyte
 
     run_module_write = run_module.write_avatar
     monkeypatch.setattr(
-        run_module, "evaluate", lambda draw, views, perceptual: Quality(30.0, 0.5, detail_difference=next(scores))
+        run_module,
+        "evaluate",
+        lambda *args, **kwargs: Quality(30.0, 0.5, detail_difference=next(scores)),
     )
     monkeypatch.setattr(run_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))

@@ -228,7 +228,7 @@ class GpuBackend:
         screen = rasterizer.backward(rendering, parameters, state.face, v_image, gradients)
         self._add_limit_gradients(rendering.wanted)
         self._adam(rendering.wanted, batch.rates)
-        if uploaded.selected is None:
+        if batch.accumulate:
             rasterizer.launch(
                 optimizer.accumulate_screen_gradient,
                 len(self),
@@ -237,6 +237,7 @@ class GpuBackend:
                 state.screen_gradient,
                 state.gradient_count,
             )
+        if uploaded.selected is None:
             total = rasterizer.buffers.get("loss_sum", 1)
             wp.utils.array_sum(loss.flatten(), out=total)
             wp.copy(self._losses, total, dest_offset=uploaded.slot, count=1)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
@@ -21,8 +22,35 @@ from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_
 from ..settings import DEVICES, TrainingSettings, from_json, to_json
 from .identity import Identity, identity_from_json
 
-FORMAT, VERSION = "stga-run", 2
+FORMAT, VERSION, OLDEST_VERSION = "stga-run", 3, 2
 CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
+
+
+@dataclass(frozen=True)
+class Take:
+    """A capture that joined a run after its first one; `start` is added to its timesteps (`join_takes`)."""
+
+    capture: Path
+    start: int
+    identity: Identity
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """How a run continues another one.
+
+    parent        folder of the run that it starts from
+    avatar        SHA-256 of that run's avatar file
+    first, last   timesteps whose views are trained; views of the others are replayed now and then
+    """
+
+    parent: Path
+    avatar: str
+    first: int
+    last: int
+
+    def includes(self, timestep: int) -> bool:
+        return self.first <= timestep <= self.last
 
 
 @dataclass(frozen=True)
@@ -34,6 +62,8 @@ class Run:
     effect_plan      what was decided about effects
     device           one of `choose_device` that trains
     identity         None before training begins
+    takes            further captures of the same head, whose timesteps follow those of `capture` (`join_takes`)
+    continuation     how the run continues another one; None: it began with new splats
     """
 
     capture: Path
@@ -43,6 +73,8 @@ class Run:
     effect_plan: tuple[EffectDecision, ...] = ()
     device: str = "cpu"
     identity: Identity | None = field(default=None, compare=False)
+    takes: tuple[Take, ...] = ()
+    continuation: Continuation | None = None
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -58,6 +90,8 @@ def write_run(folder: Path, run: Run) -> None:
             "settings": to_json(run.settings),
             "effect_plan": effect_plan_to_json(run.effect_plan),
             "identity": None if run.identity is None else asdict(run.identity),
+            "takes": [{**asdict(take), "capture": str(take.capture)} for take in run.takes],
+            "continuation": _continuation_to_json(run.continuation),
         },
     )
 
@@ -70,8 +104,9 @@ def read_run(folder: Path) -> Run:
     values = read_json(path)
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
-    if values.get("version") != VERSION:
-        raise StgaError(f"{path}: has run format version {shorten(values.get('version'))}, this add-on reads {VERSION}")
+    if values.get("version") not in range(OLDEST_VERSION, VERSION + 1):
+        found, known = shorten(values.get("version")), f"{OLDEST_VERSION} to {VERSION}"
+        raise StgaError(f"{path}: has run format version {found}, this add-on reads {known}")
     try:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
@@ -86,11 +121,34 @@ def read_run(folder: Path) -> Run:
             effect_plan_from_json(values["effect_plan"]),
             device,
             identity_from_json(values["identity"]),
+            tuple(_take_from_json(take) for take in values.get("takes", ())),
+            _continuation_from_json(values.get("continuation")),
         )
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
+
+
+def _take_from_json(values: Any) -> Take:
+    identity = identity_from_json(values["identity"])
+    if identity is None or type(values["start"]) is not int:
+        raise ValueError(f"takes holds {shorten(values)}")
+    return Take(Path(values["capture"]), values["start"], identity)
+
+
+def _continuation_to_json(continuation: Continuation | None) -> dict[str, Any] | None:
+    return None if continuation is None else {**vars(continuation), "parent": str(continuation.parent)}
+
+
+def _continuation_from_json(values: Any) -> Continuation | None:
+    if values is None:
+        return None
+    continuation = Continuation(**{**values, "parent": Path(values["parent"])})
+    span = continuation.first, continuation.last
+    if not isinstance(continuation.avatar, str) or not all(type(n) is int for n in span) or span[0] > span[1]:
+        raise ValueError(f"continuation is {shorten(values)}")
+    return continuation
 
 
 @contextmanager

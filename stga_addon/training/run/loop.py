@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from time import perf_counter
 from typing import Any
 
@@ -16,12 +17,13 @@ from ...avatar.file import Avatar, write_avatar
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture
 from ...errors import StgaError
+from ...files import replacing
 from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
 from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
-from ..evaluate.forecast import curve_of, forecast, forecast_horizon, plateau_start
+from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
 from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
@@ -31,10 +33,12 @@ from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import to_json
 from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
+from .continuation import continued_evaluation_views, starting_state
 from .folder import CHECKPOINT, SELECTION, Run, locked, read_run, write_run
 from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
 from .open_run import check_identity
 from .progress import Progress, Report
+from .replay import continued_order
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
@@ -123,17 +127,24 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
-        self.evaluation_views = [read_evaluation_view(capture, view) for view in choose_evaluation_views(capture)]
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""
         self.report(Progress(message="Placing splats"))
+        continuation, state = self.run.continuation, None
         if selection is None:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
-        self.trainer = Trainer(self.capture, self.settings, selection, device=self.run.device)
+        if continuation is not None:
+            state = starting_state(continuation)
+            self._check(state)
+        self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
             (self.out / stale).unlink(missing_ok=True)
+        if continuation is not None and (continuation.parent / TRACKING).exists():
+            with replacing(self.out / TRACKING) as partial:
+                copyfile(continuation.parent / TRACKING, partial)
+        self._read_evaluation_views()
         write_selection(self.out, selection, self.digest)
         write_run(self.out, self.run)
 
@@ -158,7 +169,18 @@ class _Loop:
         self.evaluations = checkpoint.evaluations
         cut_metrics(self.out, checkpoint.iteration)
         self.lines = read_metrics(self.out)
+        self._read_evaluation_views()
         write_run(self.out, self.run)  # capture, model and device may be others now
+
+    def _read_evaluation_views(self) -> None:
+        if self.run.continuation is None:
+            chosen = choose_evaluation_views(self.capture)
+            self.evaluation_views = [read_evaluation_view(self.capture, view) for view in chosen]
+        else:
+            self.evaluation_views = continued_evaluation_views(self.run, self.capture, self._refined_region())
+
+    def _refined_region(self) -> np.ndarray | None:
+        return self.trainer.strategy.region if self.settings.strategy == "refine" else None
 
     def _check(self, state: TrainState) -> None:
         """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
@@ -177,6 +199,8 @@ class _Loop:
             return  # a finished run was resumed
         self.clock_began = perf_counter() - (self.lines[-1]["wall_s"] if self.lines else 0.0)
         with _interrupt_requests() as interrupts:
+            if self.run.continuation is not None and not self.lines:
+                self._evaluate()  # the avatar before, which the others are compared with
             self._train(interrupts)
             self._evaluate(perceptual=self._finished())  # LPIPS takes long, so a run that is stopped goes without
             self._save()
@@ -203,7 +227,10 @@ class _Loop:
     def _loader(self) -> ViewLoader:
         settings, first = self.settings, self.trainer.iteration
         red, green, blue = (round(255 * c) for c in settings.background)
-        order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
+        if self.run.continuation is None:
+            order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
+        else:
+            order = continued_order(self.run.continuation, self.capture, self._refined_region(), settings.seed, first)
         correct = exposure_correction(settings)
         mesh = self.capture.mesh if self.trainer.tracking is None else None  # refined meshes change with every step
         return ViewLoader(
@@ -245,7 +272,7 @@ class _Loop:
         curve, target = curve_of(self.lines), self.settings.target_psnr
         if self._share() >= 1 or (target is not None and any(psnr >= target for _, psnr in curve)):
             return True
-        return self.settings.stop_when_flat and plateau_start(curve) is not None
+        return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Measure the evaluation views, keep the avatar if it is the sharpest so far, and append a line of metrics."""
@@ -260,10 +287,15 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.evaluation_views:
-            quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
+            quality = evaluate(
+                lambda view: self.trainer.render(view, share),
+                self.evaluation_views,
+                perceptual,
+                matched=bool(self.settings.exposure),
+            )
             self.psnr = quality.psnr
             line.update(quality.as_json())
-        self._keep_best(line.get("detail_difference"))
+        self._keep_best(line.get(DETAIL))
         now = perf_counter()
         line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
         line["peak_memory_mb"] = peak_memory_mb()
@@ -274,9 +306,10 @@ class _Loop:
     def _keep_best(self, detail_difference: float | None) -> None:
         """Write the avatar if it is the sharpest so far; without evaluation views the latest one is kept.
 
-        Not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
+        Not by PSNR, which prefers an early, blurred state to detail that is a pixel off. A continuation keeps the
+        latest one, too: the one before is in the folder of the run that it continues.
         """
-        if detail_difference is not None:
+        if detail_difference is not None and self.run.continuation is None:
             if not detail_difference <= self.best_difference:
                 return
             self.best_difference = detail_difference
@@ -289,10 +322,10 @@ class _Loop:
         curve, left = curve_of(self.lines), self._left_s()
         ahead = forecast_horizon(self.elapsed, left)
         predicted = None if ahead is None else forecast(curve, ahead)
-        self.forecast_text = "" if predicted is None else str(predicted)
+        self.forecast_text = "" if ahead is None else forecast_text(self.lines, ahead)
         if predicted is not None and "psnr" in line:
             line["forecast"] = predicted.as_json()
-        plateau = plateau_start(curve) if left else None
+        plateau = flat_since(self.lines) if left else None
         if plateau is not None:
             self.forecast_text = f"no gain since {format_duration(plateau)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None

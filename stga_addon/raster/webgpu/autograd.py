@@ -1,0 +1,102 @@
+"""Differentiable rendering of torch tensors by the WebGPU kernels: copied to the device and back."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...avatar.embedding import WORLD, FaceFrames
+from ...capture.camera import Camera
+from ..cpu.layout import CameraFrames, Parameters
+from ..cpu.rasterize import frames_in_camera
+from .device import Device
+from .layout import splat_rows, split_rows
+from .rasterize import Rasterizer, SplatTable, ViewOptions
+
+
+def render_differentiable(
+    splats: Parameters,
+    camera: Camera,
+    frames: FaceFrames = WORLD,
+    face: np.ndarray | None = None,
+    degree: int = 3,
+    antialiased: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Differentiable rendering on the first adapter; everything as in `cpu.autograd.render_differentiable`."""
+    face = np.zeros(len(splats.xyz), np.int32) if face is None else face
+    camera_frames = frames_in_camera(frames, camera)
+    strains = camera_frames.strain.shape[1]
+    given = [tensor for tensor in splats if tensor is not None]
+    images = []
+    for depth_as_color in (False, True):
+        options = ViewOptions(camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased)
+        images.append(_Blend.apply(options, camera_frames, face, *given))
+    (rgb, transmittance), (depth, _) = images
+    return rgb, 1 - transmittance, depth[0]
+
+
+def upload_splats(device: Device, splats: Parameters, face: np.ndarray) -> SplatTable:
+    """Numpy arrays of splats as a table on the device."""
+    rows = splat_rows(splats)
+    strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
+    return SplatTable(
+        device.upload("splats", rows), device.upload("face", face.astype(np.uint32)), len(rows), splats.sh.shape[1],
+        strain_colors,
+    )  # fmt: skip
+
+
+def upload_frames(device: Device, frames: CameraFrames) -> Any:
+    """Frames in camera space, computed on the CPU, as a table on the device."""
+    count = len(frames.origin)
+    parts = (frames.origin, frames.matrix.reshape(count, 9), frames.strain)
+    return device.upload("frames", np.concatenate(parts, axis=1, dtype=np.float32))
+
+
+@cache
+def _rasterizer() -> Rasterizer:
+    return Rasterizer(Device())
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
+        ctx.saved = options, camera_frames, face, splats
+        image, transmittance, _ = _render(options, camera_frames, face, splats, None)
+        return torch.from_numpy(image), torch.from_numpy(transmittance)
+
+    @staticmethod
+    def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
+        cotangents = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
+        options, camera_frames, face, splats = ctx.saved
+        _, _, gradients = _render(options, camera_frames, face, splats, cotangents)
+        given = [gradient for gradient in gradients if gradient is not None]
+        return None, None, None, *(torch.from_numpy(g) for g in given[: len(ctx.needs_input_grad) - 3])
+
+
+def _render(
+    options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, splats: Parameters,
+    cotangents: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray, Parameters]:  # fmt: skip
+    """Image and transmittance, and the gradients where there are cotangents of these two."""
+    rasterizer = _rasterizer()
+    device, (height, width) = rasterizer.device, (options.camera.height, options.camera.width)
+    while True:
+        table, frames = upload_splats(device, splats, face), upload_frames(device, camera_frames)
+        gradients = device.upload("gradients", np.zeros((table.count, table.stride), np.float32))
+        v_images = [device.upload(f"v {n}", v) for n, v in enumerate(cotangents or ())]
+        with device.record() as work:
+            rendering = rasterizer.forward(work, table, frames, options)
+            if cotangents is not None:
+                rasterizer.backward(work, rendering, table, v_images[0], gradients, v_images[1])
+        if rasterizer.pairs_fit():
+            break
+    pixels, rows = (
+        device.read(rendering.pixels, (height, width, 2)),
+        device.read(gradients, (table.count, table.stride)),
+    )
+    image = device.read(rendering.image, (3, height, width))
+    return image, pixels[..., 0].copy(), split_rows(rows, table.coefficients)

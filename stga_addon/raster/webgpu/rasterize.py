@@ -1,0 +1,157 @@
+"""Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the splats."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...capture.camera import Camera
+from ..cpu.layout import TILE
+from ..cpu.rasterize import tile_grid
+from .blend import blend_backward, blend_forward
+from .device import Device, Recording
+from .layout import COUNTS, NEEDED, OVERFLOWED, SH, VIEW
+from .project import project, project_backward
+from .tiles import PairLists, Tiles, choose_tiles, counts_buffer, list_pairs
+
+INITIAL_PAIR_CAPACITY = 1 << 18
+"""Pairs that a rasterizer has room for at first: 17 MB."""
+
+
+@dataclass(frozen=True)
+class SplatTable:
+    """N splats on the device.
+
+    rows, face  tables of `layout.py`: (N, stride) and the triangle (N,) of each
+    count, coefficients, strain_colors  N, K and S
+    """
+
+    rows: Any
+    face: Any
+    count: int
+    coefficients: int
+    strain_colors: int
+
+    @property
+    def stride(self) -> int:
+        """Words per row."""
+        return SH + 3 * (self.coefficients + self.strain_colors)
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What a rendering depends on beside splats and frames; see `cpu.rasterize.render_forward`.
+
+    strains: columns of strain in the table of frames; focused: whether there is a focus.
+    """
+
+    camera: Camera
+    degree: int
+    background: Sequence[float] = (0.0, 0.0, 0.0)
+    strains: int = 0
+    depth_as_color: bool = False
+    antialiased: bool = False
+    focused: bool = False
+    reach: int = 0
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """An image and what its backward pass needs, tables of `layout.py`; valid until the device's next one.
+
+    image (3, H, W) over the background; pixels (H, W, 2) with the transmittance; undefined where nothing is rendered.
+    """
+
+    image: Any
+    pixels: Any
+    projected: Any
+    chosen: Tiles
+    lists: PairLists
+    view: Any
+    frames: Any
+    tiles: int
+
+
+class Rasterizer:
+    """Renders on one device, forward and backward, with room for `capacity` pairs.
+
+    Where the pairs do not fit, nothing is rendered and no splat is wanted, now and later, until `make_room`.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.capacity = INITIAL_PAIR_CAPACITY
+
+    def forward(
+        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, focus: Any | None = None
+    ) -> Rendering:
+        """Record a rendering; focus (N,): see `mark_focus`, if `options.focused`."""
+        size = options.camera.width, options.camera.height
+        columns, rows = tile_grid(*size)
+        tiles, view = columns * rows, self._upload_view(splats, options)
+        shared = {"view": view, "focus": focus}
+        seen = project(work, splats.count, view=view, splats=splats.rows, face=splats.face, frames=frames)
+        chosen = choose_tiles(work, splats.count, tiles, rect=seen.rect, **shared)
+        lists = list_pairs(
+            work, splats.count, tiles, self.capacity, depth_key=seen.depth_key, rect=seen.rect, chosen=chosen, **shared
+        )
+        image, pixels = blend_forward(
+            work, size[0] * size[1], tiles, view=view, rendered=chosen.rendered, tile_range=chosen.tile_range,
+            pairs=lists.pairs, projected=seen.projected,
+        )  # fmt: skip
+        return Rendering(image, pixels, seen.projected, chosen, lists, view, frames, tiles)
+
+    def backward(
+        self, work: Recording, rendering: Rendering, splats: SplatTable, v_image: Any, gradients: Any,
+        v_transmittance: Any | None = None,
+    ) -> Any:  # fmt: skip
+        """Record the gradient of a scalar with respect to the splats, from that with respect to the image.
+
+        v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of `gradients`. Returns
+        `screen`, see `project_backward`.
+        """
+        lists, chosen = rendering.lists, rendering.chosen
+        shared = {"view": rendering.view, "projected": rendering.projected}
+        pair_gradients = blend_backward(
+            work, self.capacity, rendering.tiles, v_image=v_image, v_transmittance=v_transmittance,
+            touched=chosen.touched, tile_range=chosen.tile_range, pairs=lists.pairs, pixels=rendering.pixels, **shared,
+        )  # fmt: skip
+        return project_backward(
+            work, splats.count, splats=splats.rows, face=splats.face, frames=rendering.frames, wanted=lists.wanted,
+            slots=lists.slots, pair_gradients=pair_gradients, gradients=gradients, **shared,
+        )  # fmt: skip
+
+    def pairs_fit(self) -> bool:
+        """Wait for the submitted work; whether its pairs fitted. If not, room for them is made."""
+        counts = self.device.read(counts_buffer(self.device), (COUNTS,), np.uint32)
+        if counts[OVERFLOWED]:
+            self.make_room(int(counts[NEEDED]))
+        return not counts[OVERFLOWED]
+
+    def make_room(self, needed: int) -> None:
+        """Hold at least so many pairs from now on, and a quarter to spare, and let renderings begin again."""
+        self.capacity = max(self.capacity, needed + needed // 4)
+        self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
+
+    def _upload_view(self, splats: SplatTable, options: ViewOptions) -> Any:
+        camera, view = options.camera, np.zeros((), VIEW)
+        columns, rows = tile_grid(camera.width, camera.height)
+        values = (
+            *(camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns, rows),
+            *camera.world_to_camera[:3, :3].T.ravel(),
+            *options.background,
+            splats.count,
+            splats.coefficients,
+            splats.strain_colors,
+            options.degree,
+            min(options.strains, splats.strain_colors),
+            options.strains,
+            options.depth_as_color,
+            options.antialiased,
+            options.focused,
+            -(-options.reach // TILE),
+            self.capacity,
+        )
+        view[...] = values
+        return self.device.upload("view", view, "uniform")
