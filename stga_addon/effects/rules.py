@@ -127,6 +127,12 @@ def hull_points(facts: CaptureFacts) -> Verdict:
     return Verdict(facts.uncovered > MIN_UNCOVERED_SHARE, reason)
 
 
+def depth_limits(facts: CaptureFacts) -> Verdict:
+    if facts.cameras > 1:
+        return Verdict(False, f"{facts.cameras} cameras show how far away a splat is")
+    return Verdict(True, "a single camera does not show how far in front of or behind the mesh a splat is")
+
+
 def density(facts: CaptureFacts) -> Verdict:
     pixels = facts.pixels_per_splat(90)
     return Verdict(pixels > MIN_PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
@@ -216,6 +222,12 @@ EFFECTS = (
         hull_points,
         on={"hull_points": True},
         off={"hull_points": False},
+    ),
+    Effect(
+        "depth-limits",
+        "none: splats are smaller and nearer to their triangles",
+        depth_limits,
+        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20},
     ),
     Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
     Effect(

@@ -7,8 +7,8 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from ...capture.images import read_view
+from ...capture.mesh_raster import rasterize
 from ...capture.model import Capture, View
-from ...tracking.mesh_image import rasterize
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
