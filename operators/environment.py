@@ -11,6 +11,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import (
     SIZES_GB,
+    TRACKING_GB,
     check_arguments,
     find_training_python,
     make_arguments,
@@ -86,6 +87,11 @@ class MakeEnvironment(bpy.types.Operator):
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
     )
+    tracking: bpy.props.BoolProperty(
+        name="Tracking",
+        description="With the landmark detector that tracks heads in footage: MediaPipe. Python 3.11 or 3.12 brings "
+        "its network; newer ones need Google's face_landmarker.task",
+    )
     python: bpy.props.StringProperty(
         name="Python",
         description="Python 3.11 or newer to make the environment from; empty: Blender's own",
@@ -104,10 +110,11 @@ class MakeEnvironment(bpy.types.Operator):
     def draw(self, context: Any) -> None:
         layout = self.layout
         layout.use_property_split = True
-        for name in ("device", "wheels", "python"):
+        for name in ("device", "tracking", "wheels", "python"):
             layout.prop(self, name)
         column = layout.column(align=True)
-        column.label(text=f"Takes about {SIZES_GB['cpu']:.1f} GB for the CPU, {SIZES_GB['cuda']:.1f} GB for CUDA, in")
+        cpu, cuda = (SIZES_GB[device] + self.tracking * TRACKING_GB for device in ("cpu", "cuda"))
+        column.label(text=f"Takes about {cpu:.1f} GB for the CPU, {cuda:.1f} GB for CUDA, in")
         column.label(text=str(environment_folder()))
         if not self.wheels and sys.platform == "linux":
             column.label(text=f"Where pytorch.org cannot be reached: {SIZES_GB['pypi']:.1f} GB")
@@ -125,7 +132,7 @@ class MakeEnvironment(bpy.types.Operator):
             raise StgaError(f"{wheels}: is not a folder; expected one of wheel files")
         folder = environment_folder(create=True)
         base = bpy.path.abspath(self.python) if self.python else sys.executable
-        return _run(self, folder, make_arguments(folder, base, self.device, wheels))
+        return _run(self, folder, make_arguments(folder, base, self.device, wheels, self.tracking))
 
 
 class TestEnvironment(bpy.types.Operator):

@@ -66,6 +66,36 @@ def device_property() -> Any:
     )
 
 
+def python_property() -> Any:
+    """Interpreter of an operator that trains."""
+    return bpy.props.StringProperty(
+        name="Python",
+        description="Python interpreter that trains; empty: the training environment of the preferences",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+
+def wait_property() -> Any:
+    """Whether an operator that trains waits for the end."""
+    return bpy.props.BoolProperty(
+        name="Wait",
+        description="Return when training has ended, as always without a window; "
+        "Blender's own Python trains then, if it has the packages",
+        options={"SKIP_SAVE"},
+    )
+
+
+def may_train(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head and nothing is training; says what to do where not."""
+    if not needs_head(operator, context):
+        return False
+    if monitor.training_of(context.scene).snapshot.state.is_alive:
+        operator.poll_message_set("Training is running; cancel it first")
+        return False
+    return True
+
+
 class Train(bpy.types.Operator):
     """Train the avatar on the capture's images, in a process that continues when Blender is closed"""
 
@@ -100,48 +130,20 @@ class Train(bpy.types.Operator):
         description="Continue the run in the folder with the settings and budget that it was started with",
         options={"SKIP_SAVE"},
     )
-    python: bpy.props.StringProperty(
-        name="Python",
-        description="Python interpreter that trains; empty: the training environment of the preferences",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )
-    wait: bpy.props.BoolProperty(
-        name="Wait",
-        description="Return when training has ended, as always without a window; "
-        "Blender's own Python trains then, if it has the packages",
-        options={"SKIP_SAVE"},
-    )
+    python: python_property()
+    wait: wait_property()
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if not needs_head(cls, context):
-            return False
-        if monitor.training_of(context.scene).snapshot.state.is_alive:
-            cls.poll_message_set("Training is running; cancel it first")
-            return False
-        return True
+        return may_train(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
         run = file_path(self.directory, "run folder").resolve()
-        waits = self.wait or bpy.app.background
-        here = waits and not self.python and not missing_packages()
-        python = "" if here else training_python(context, self.python)
+        python = python_of(self, context)
         write_job(run, self._job(head), training_selection(head))
-        if here:
-            monitor.start_training(context.scene, run, None)
-            avatar = _train_here(context, run)
-        else:
-            process = start_worker(job_folder(run), python, worker_arguments(run))
-            monitor.start_training(context.scene, run, process)
-            if not waits:
-                return {"FINISHED"}
-            avatar = _wait(run, process)
-        monitor.finish_training(context.scene)
-        self.report({"INFO"}, f"Trained {avatar}")
-        return {"FINISHED"}
+        return start_job(self, context, run, python)
 
     def _job(self, head: Any) -> TrainingJob:
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
@@ -155,6 +157,29 @@ class Train(bpy.types.Operator):
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
         flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
         return TrainingJob(capture, flame, principal_point, settings, self.device)
+
+
+def python_of(operator: Any, context: Any) -> str | None:
+    """The interpreter that is to train; None: that of Blender. Raises StgaError where there is none."""
+    if (operator.wait or bpy.app.background) and not operator.python and not missing_packages():
+        return None
+    return training_python(context, operator.python)
+
+
+def start_job(operator: Any, context: Any, run: Path, python: str | None) -> set[str]:
+    """Start the job that was written into the run's folder; python: see `python_of`."""
+    if python is None:
+        monitor.start_training(context.scene, run, None)
+        avatar = _train_here(context, run)
+    else:
+        process = start_worker(job_folder(run), python, worker_arguments(run))
+        monitor.start_training(context.scene, run, process)
+        if not (operator.wait or bpy.app.background):
+            return {"FINISHED"}
+        avatar = _wait(run, process)
+    monitor.finish_training(context.scene)
+    operator.report({"INFO"}, f"Trained {avatar}")
+    return {"FINISHED"}
 
 
 class CancelTraining(bpy.types.Operator):

@@ -24,7 +24,13 @@ from ..errors import StgaError
 from ..files import read_json, write_json
 from .environment_use import READY, environment_users
 from .launch import start_python
-from .requirements import GPU_REQUIREMENT, REQUIREMENTS, package_name
+from .requirements import (
+    DETECTOR_REQUIREMENTS,
+    GPU_REQUIREMENT,
+    REQUIREMENTS,
+    TRACKING_REQUIREMENTS,
+    package_name,
+)
 from .status import StatusWriter, log_lines, status_writer
 
 PYTHON_VARIABLE = "STGA_PYTHON"
@@ -35,6 +41,8 @@ MIN_PYTHON = 3, 11
 SIZES_GB = {"cpu": 1.5, "cuda": 2.0, "pypi": 6.0}
 """Measured size of an environment: for the CPU; with the package warp-lang, all that a GPU needs in addition; and with
 the CUDA build of torch that PyPI has for Linux."""
+TRACKING_GB = 0.3
+"""Measured size of what tracking needs in addition."""
 MIN_CUDA_VERSION = 12
 """Of the driver, for warp-lang."""
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
@@ -160,7 +168,9 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
         why = next((text for text in failures.values() if not text.startswith("ModuleNotFoundError")), "")
         failed = f" ({why})" if why else ""
         raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that with pip")
-    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"
+    detector = f", mediapipe {versions['mediapipe']}" if "mediapipe" in versions else ""
+    detector = f", mediapipe fails ({failures['mediapipe']})" if "mediapipe" in failures else detector
+    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}{detector}, {report['device']}"
 
 
 def check_in_worker(folder: Path, python: str) -> str:
@@ -180,10 +190,11 @@ def check_arguments(folder: Path, python: str) -> list[str]:
 # Making and removing
 
 
-def make_arguments(folder: Path, python: str, device: str, wheels: Path | None) -> list[str]:
+def make_arguments(folder: Path, python: str, device: str, wheels: Path | None, tracking: bool = False) -> list[str]:
     """What a worker runs after `python -m` for `make_environment`."""
-    offline = ["--wheels", str(wheels)] if wheels else []
-    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, "--device", device, *offline]
+    more = ["--wheels", str(wheels)] if wheels else []
+    more += ["--tracking"] if tracking else []
+    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, "--device", device, *more]
 
 
 def choose_device(device: str, nvidia_smi: str | None) -> str:
@@ -222,28 +233,36 @@ class InstallStep:
 
 
 def install_steps(
-    venv: Path, python: str, device: str, wheels: Path | None, system: str = sys.platform
+    venv: Path, python: str, device: str, wheels: Path | None, system: str = sys.platform, tracking: bool = False
 ) -> list[InstallStep]:
     """The commands that make an environment; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
     packages = [*REQUIREMENTS.values(), *([GPU_REQUIREMENT] if device == "cuda" else [])]
+    packages += TRACKING_REQUIREMENTS if tracking else ()
     too_old = f"sys.version_info < {MIN_PYTHON} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
     first = [
         InstallStep("Checking the Python version", [python, "-c", f"import sys; sys.exit({too_old})"]),
         InstallStep("Creating the virtual environment", [python, "-m", "venv", str(venv)]),
     ]
     if wheels is not None:
-        offline = ["--no-index", "--find-links", str(wheels)]
-        return [*first, InstallStep("Installing from the folder of wheels", [*pip, *offline, *packages])]
+        pip += ["--no-index", "--find-links", str(wheels)]
+    detector = InstallStep("Installing the landmark detector", [*pip, "--no-deps", *DETECTOR_REQUIREMENTS])
+    last = [detector] if tracking else []
+    if wheels is not None:
+        return [*first, InstallStep("Installing from the folder of wheels", [*pip, *packages]), *last]
     torch = [*pip, "--no-deps", "--index-url", TORCH_CPU_INDEX, REQUIREMENTS["torch"]]
     rest = InstallStep("Installing torch and other packages", [*pip, *packages])
     if system != "linux":
-        return [*first, rest]
-    return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest]
+        return [*first, rest, *last]
+    return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest, *last]
 
 
-def make_environment(folder: Path, python: str, device: str = "auto", wheels: Path | None = None) -> str:
+def make_environment(
+    folder: Path, python: str, device: str = "auto", wheels: Path | None = None, tracking: bool = False
+) -> str:
     """Make an environment in `folder` from the interpreter `python`; returns the line of `check_python`.
+
+    tracking: with what `stga track` needs, the landmark detector included.
 
     It replaces earlier ones once it has passed the check; those that processes run in stay until the next time.
     Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
@@ -251,11 +270,12 @@ def make_environment(folder: Path, python: str, device: str = "auto", wheels: Pa
     with status_writer(status_folder(folder)) as writer:
         device = choose_device(device, nvidia_smi())
         free = shutil.disk_usage(folder).free / 1e9
-        if free < SIZES_GB[device]:
-            raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {SIZES_GB[device]:.1f} GB")
+        needed = SIZES_GB[device] + (TRACKING_GB if tracking else 0)
+        if free < needed:
+            raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {needed:.1f} GB")
         numbers = [_number(venv) for venv in _environments(folder)]
         venv = folder / f"venv-{max(numbers, default=0) + 1}"
-        steps = install_steps(venv, python, device, wheels)
+        steps = install_steps(venv, python, device, wheels, sys.platform, tracking)
         try:
             for number, step in enumerate(steps):
                 if not _run(writer, number / (len(steps) + 1), step):
@@ -356,6 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     make.add_argument("--python", default=sys.executable)
     make.add_argument("--device", choices=DEVICES, default="auto")
     make.add_argument("--wheels", type=Path)
+    make.add_argument("--tracking", action="store_true")
     options = vars(top.parse_args(arguments))
     try:
         print({"check": check_in_worker, "make": make_environment}[options.pop("command")](**options))

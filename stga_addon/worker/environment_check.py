@@ -4,13 +4,14 @@ import importlib
 import json
 import os
 import platform
+from importlib.util import find_spec
 
 from .requirements import REQUIREMENTS
 
 
 def main() -> None:
     versions, failures = {}, {}
-    for name in REQUIREMENTS:
+    for name in (*REQUIREMENTS, *(["mediapipe"] if find_spec("mediapipe") else [])):
         try:
             versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
         except Exception as error:  # a library that fails to load raises what it likes

@@ -32,6 +32,13 @@ from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 from .captures import closure  # noqa: E402
 
 OPERATORS = (
+    "track_footage",
+    "cancel_tracking",
+    "dismiss_tracking",
+    "view_footage",
+    "mark_key",
+    "solve_again",
+    "export_head_model",
     "import_capture",
     "import_motion",
     "import_meshes",

@@ -14,10 +14,11 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import calibrate, nearest_points
+from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
-from stga_addon.tracking.landmarks import PLACES_FILE, detect_landmarks, landmark_file, read_camera, write_places
+from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
 from stga_addon.tracking.mesh_image import rasterize, shaded_image
 from stga_addon.tracking.track import track
 

@@ -16,13 +16,14 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
-from stga_addon.training.run.continuation import Extension, prepare_extension
+from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.open_run import open_run
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import continued_order
+from stga_addon.training.run.request import Extension
 
 from .test_run import assert_same_state
 from .toys import quick_settings

@@ -16,12 +16,13 @@ from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import TrainState, tensors_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import Refinement, late_rates, prepare_refinement
+from stga_addon.training.run.continuation import late_rates, prepare_refinement
 from stga_addon.training.run.folder import Continuation, Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import continued_order, distinct_timesteps, replayed_views, views_of_region
+from stga_addon.training.run.request import Refinement
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates
 

@@ -8,6 +8,7 @@ tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
 metrics.jsonl   one line per evaluation
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -128,6 +129,18 @@ def read_run(folder: Path) -> Run:
         raise StgaError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
+
+
+def next_folder(run: Path) -> Path:
+    """The first of RUN_2, RUN_3, … that does not exist; after RUN_2 comes RUN_3."""
+    run = run.resolve()
+    match = re.fullmatch(r"(.+?)_(\d{1,6})", run.name, re.ASCII)
+    name, number = (match[1], int(match[2])) if match else (run.name, 1)
+    while True:
+        number += 1
+        folder = run.with_name(f"{name}_{number}")
+        if not folder.exists():
+            return folder
 
 
 def _take_from_json(values: Any) -> Take:

@@ -8,7 +8,6 @@ from ...capture.open import open_capture
 from ...capture.takes import join_takes
 from ...errors import StgaError
 from ..optimize.device import choose_device
-from ..optimize.tracking import with_refined_tracking
 from .folder import Run, Take, read_run
 from .identity import Identity, difference, identity_of
 
@@ -43,6 +42,8 @@ def open_run(
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
+        from ..optimize.tracking import with_refined_tracking  # imports torch, which Blender's own Python lacks
+
         opened = with_refined_tracking(opened, folder)
     return OpenedRun(run, opened, takes)
 
