@@ -10,14 +10,16 @@ const UPRIGHT_COSINE = 0.8;
 export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
 
 export class FaceFrames {
-  /** faces (3·F), neutral (3·V) meters, convention of the embedding, and whether colors follow strain. */
-  constructor(faces, neutral, convention, withStrain) {
+  /** Arrays of the data file, and the convention of the embedding; strain is computed where colors follow it. */
+  constructor(arrays, convention) {
+    const faces = arrays.faces.values;
+    const neutral = arrays.neutral.values;
     this.faces = faces;
     this.count = faces.length / 3;
     this.isStga = convention === 'stga';
     this.world = new Float64Array(12 * this.count); // rotation · scale and origin, rows of a 3×4 matrix
     this.neutralArea = neutralAreas(faces, neutral);
-    this.strain = withStrain ? new Strain(faces, neutral) : null;
+    this.strain = arrays.strain_color ? new Strain(faces, neutral, arrays.strain_range?.values) : null;
   }
 
   /** Follow the posed vertices (3·V). */

@@ -8,10 +8,11 @@ const MAX_STRAIN = 2;
 const MIN_SQUARED_NORMAL = 1e-24;
 
 export class Strain {
-  /** faces (3·F), neutral (3·V) meters. */
-  constructor(faces, neutral) {
+  /** faces (3·F), neutral (3·V) meters, range (6·F: lowest three, highest three) of strain; ±MAX_STRAIN without one. */
+  constructor(faces, neutral, range) {
     this.faces = faces;
     const count = faces.length / 3;
+    this.range = range ?? new Float32Array(6 * count).map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
     this.values = new Float32Array(3 * count);
     this.gram = new Float64Array(3 * count); // u·u, u·v, v·v of the neutral edges from corner 0
     this.toTensor = new Float32Array(18 * count); // change of gram → tensor xx, yy, zz, xy, yz, zx
@@ -82,7 +83,7 @@ export class Strain {
 
   /** Strain of every triangle from the tensors of its vertices. */
   gather() {
-    const { faces, toPlane, atVertex, values } = this;
+    const { faces, toPlane, atVertex, range, values } = this;
     for (let f = 0; f < faces.length; f += 3) {
       const i = 6 * faces[f];
       const j = 6 * faces[f + 1];
@@ -96,15 +97,12 @@ export class Strain {
         across += toPlane[t + 6] * part;
         shear += toPlane[t + 12] * part;
       }
-      values[f] = clipped(STRAIN_GAIN * along);
-      values[f + 1] = clipped(STRAIN_GAIN * across);
-      values[f + 2] = clipped(STRAIN_GAIN * shear);
+      const at = 2 * f;
+      values[f] = Math.min(range[at + 3], Math.max(range[at], STRAIN_GAIN * along));
+      values[f + 1] = Math.min(range[at + 4], Math.max(range[at + 1], STRAIN_GAIN * across));
+      values[f + 2] = Math.min(range[at + 5], Math.max(range[at + 2], STRAIN_GAIN * shear));
     }
   }
-}
-
-function clipped(value) {
-  return Math.min(MAX_STRAIN, Math.max(-MAX_STRAIN, value));
 }
 
 /** Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx. */
