@@ -1,4 +1,4 @@
-"""The sidebar tab: Capture → Select → Train → Show → Motion."""
+"""The sidebar tab: Track → Capture → Select → Train → Show → Motion."""
 
 from typing import Any
 
@@ -15,6 +15,7 @@ from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_tran
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
 from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
+from .continue_panel import ContinuePanel
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
 from .next_step import NextStepPanel
@@ -22,6 +23,7 @@ from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
 from .sidebar import SidebarPanel
 from .text import draw_text
+from .track_panel import TrackCheckPanel, TrackOptionsPanel, TrackPanel
 from .train_panel import TrainOptionsPanel, TrainPanel
 
 DISPLAY_INPUTS = (
@@ -108,11 +110,15 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
 
 CLASSES = (
     NextStepPanel,
+    TrackPanel,
+    TrackOptionsPanel,
+    TrackCheckPanel,
     CapturePanel,
     SelectedFrames,
     SelectPanel,
     TrainPanel,
     TrainOptionsPanel,
+    ContinuePanel,
     EffectsPanel,
     ShowPanel,
     MotionPanel,

@@ -1,6 +1,5 @@
 """What the commands that continue a finished run have in common."""
 
-import re
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ def continuation_folder(options: Namespace) -> tuple[Path, str]:
 
     Raises StgaError where the folder holds a run already.
     """
-    from ..training.run.folder import read_run
+    from ..training.run.folder import next_folder, read_run
     from ..training.run.open_run import device_of
 
     folder = options.out or next_folder(options.run_folder)
@@ -61,15 +60,3 @@ def resume_continuation(options: Namespace) -> None:
     device, why = device_of(opened.run, options.device)
     print(why)
     train_run(options.run_folder, replace(opened.run, device=device), opened.capture, None, resume=True)
-
-
-def next_folder(run: Path) -> Path:
-    """The first of RUN_2, RUN_3, … that does not exist; after RUN_2 comes RUN_3."""
-    run = run.resolve()
-    match = re.fullmatch(r"(.+?)_(\d{1,6})", run.name, re.ASCII)
-    name, number = (match[1], int(match[2])) if match else (run.name, 1)
-    while True:
-        number += 1
-        folder = run.with_name(f"{name}_{number}")
-        if not folder.exists():
-            return folder

@@ -27,7 +27,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..training.run.continuation import Extension, prepare_extension
+    from ..training.run.continuation import prepare_extension
+    from ..training.run.request import Extension
 
     if options.resume:
         resume_continuation(options)
@@ -37,6 +38,7 @@ def run(options: Namespace) -> None:
     folder, device = continuation_folder(options)
     wanted = Extension(options.run_folder, tuple(options.takes), options.growth, **budget_of(options, DEFAULT_SECONDS))
     prepared = prepare_extension(wanted, device, options.flame)
+    assert prepared.selection is not None
     share = np.any(list(prepared.selection.values()), axis=0).mean()
     print(f"takes: {1 + len(prepared.run.takes)}; the new ones need {share:.0%} of the triangles")
     train_run(folder, prepared.run, prepared.capture, prepared.selection, resume=False)

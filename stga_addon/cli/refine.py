@@ -26,7 +26,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..training.run.continuation import Refinement, prepare_refinement
+    from ..training.run.continuation import prepare_refinement
+    from ..training.run.request import Refinement
 
     if options.resume:
         resume_continuation(options)

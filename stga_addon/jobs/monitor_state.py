@@ -240,4 +240,6 @@ def _loading_ended(state: MonitorState, error: str, effects: tuple[Effect, ...])
     was_result = state.loading is not None and state.loading.name == AVATAR
     state = replace(state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result)
     stored = (StoreTraining(state.run, True),) if was_result else ()
+    if was_result and not error and PushUndo() not in effects:
+        effects = (*effects, PushUndo())  # undo brings back what was shown before the training
     return state, (*stored, *effects, Redraw())

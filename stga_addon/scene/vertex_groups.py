@@ -94,6 +94,25 @@ def read_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
     return dict(zip(names, _read_faces(head, [head.vertex_groups[name].index for name in names]), strict=True))
 
 
+def read_triangle_weights(head: Any, name: str) -> np.ndarray:
+    """(F,) float32 weight of each triangle in a vertex group: the least of its corners'."""
+    head.update_from_editmode()
+    index, weights = head.vertex_groups[name].index, np.zeros(len(head.data.vertices), np.float32)
+    for vertex in head.data.vertices:
+        for member in vertex.groups:
+            if member.group == index:
+                weights[vertex.index] = member.weight
+    return np.asarray(weights[mesh_triangles(head.data)].min(1))
+
+
+def selected_triangles(head: Any) -> np.ndarray:
+    """(F,) bool: the triangles that are selected in Edit Mode."""
+    head.update_from_editmode()
+    selected = np.zeros(len(head.data.polygons), bool)
+    head.data.polygons.foreach_get("select", selected)
+    return selected
+
+
 def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
     """(F,) bool of one timestep's selection group; None where it has none."""
     group = head.vertex_groups.get(tags.group_name(timestep))

@@ -284,7 +284,7 @@ def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.C
 
 WITHOUT_TORCH = """
 import sys
-sys.modules.update(dict.fromkeys(("torch", "numba", "warp")))  # importing one of them fails
+sys.modules.update(dict.fromkeys(("torch", "numba", "wgpu")))  # importing one of them fails
 from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -495,7 +495,7 @@ def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 WITH_NUMPY_ALONE = """
 import sys
-missing = ("torch", "numba", "warp", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
+missing = ("torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
 sys.modules.update(dict.fromkeys(missing))  # importing one of them fails
 from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))

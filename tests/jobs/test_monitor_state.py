@@ -87,13 +87,13 @@ def test_no_preview_unless_wanted():
 
 @pytest.mark.parametrize("end", [WorkerState.FINISHED, WorkerState.CANCELLED])
 def test_result_is_shown_once(end):
-    """Catches a result that is not shown, or shown again at every check."""
+    """Catches a result that is not shown, or shown again at every check, or that undo cannot take back."""
     state, effects = after(Started(RUN), status(end))
     assert StoreAvatar(AVATAR) in effects
     assert loads(effects) == [AVATAR]
     assert state.interval_s == CHECK_INTERVAL_S
     state, effects = after(AvatarShown(created=False), state=state)
-    assert effects == [StoreTraining(RUN, True), Redraw()]
+    assert effects == [StoreTraining(RUN, True), PushUndo(), Redraw()]
     assert state.interval_s is None
     assert after(status(end), state=state) == (state, [])
 

@@ -16,13 +16,14 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
-from stga_addon.training.run.continuation import Extension, prepare_extension
+from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.open_run import open_run
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import continued_order
+from stga_addon.training.run.request import Extension
 
 from .test_run import assert_same_state
 from .toys import quick_settings
@@ -96,7 +97,7 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
     front = capture.neutral[capture.faces].mean(1)[:, 2] > 0.03
     selected = prepared.selection[4]
     assert selected[front & (height > 0.055)].mean() > 0.8
-    assert not selected[front & (height < 0)].any()
+    assert selected[front & (height < 0)].mean() < 0.1
 
 
 def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:

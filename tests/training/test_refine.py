@@ -16,12 +16,13 @@ from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import TrainState, tensors_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import Refinement, late_rates, prepare_refinement
+from stga_addon.training.run.continuation import late_rates, prepare_refinement
 from stga_addon.training.run.folder import Continuation, Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import continued_order, distinct_timesteps, replayed_views, views_of_region
+from stga_addon.training.run.request import Refinement
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates
 
@@ -36,7 +37,7 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with strain color, density control and hull points; its avatar is that of the last iteration."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
-        "global", iterations=30, strain_color=True, lattice=1, density_interval=10, density_span=(0.0, 1.0),
+        "global", iterations=12, strain_color=True, lattice=1, density_interval=10, density_span=(0.0, 1.0),
         stray_reset_interval=4, stray_limit=0.3, hull_points=True,
     )  # fmt: skip
     without_held_out = replace(toy, views={"train": toy.views["train"]})

@@ -14,6 +14,8 @@ from ...raster.cpu.layout import CameraFrames, Parameters
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..optimize.exposure import Correction
 
+RESIDUAL_SCALE = 0.5
+"""Size of the images in which the residuals of a run are measured: an error that matters is larger than a pixel."""
 MIN_WEIGHT_PX = 2.0
 """Pixels that a triangle's splats must cover together for its residual to be known."""
 

@@ -22,7 +22,7 @@ from ..evaluate.evaluation_views import (
     spread_views,
     visible_pixels,
 )
-from ..evaluate.residuals import triangle_residuals
+from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
 from ..optimize.state import TrainState, new_state
 from ..optimize.tracking import with_refined_tracking
@@ -32,6 +32,7 @@ from .folder import CHECKPOINT, Continuation, Run, Take
 from .identity import file_digest, identity_of
 from .open_run import OpenedRun, open_run
 from .replay import replayed_views
+from .request import Extension, Refinement, Request
 
 START_SHARE = 0.6
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
@@ -39,57 +40,24 @@ DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
 MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
 """How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
-RESIDUAL_SCALE = 0.5
-"""Size of the images that residuals are measured in: an error that matters is larger than a pixel."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
 
 @dataclass(frozen=True)
-class Refinement:
-    """What is asked of a continuation that refines a region.
-
-    parent   folder of the run
-    region   name of a region, or region file (`find_region`)
-    frames   timesteps from first to last whose images show what is wrong; None: all
-    growth   most splats that may be added, as a share of the region's
-    seconds, iterations   the budget, one of the two
-    """
-
-    parent: Path
-    region: str
-    frames: tuple[int, int] | None = None
-    growth: float = 0.0
-    seconds: float | None = None
-    iterations: int | None = None
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class Extension:
-    """What is asked of a continuation that extends a run by further takes of the same head.
-
-    parent   folder of the run
-    captures folders of the takes
-    growth   most splats that may be added, as a share of those on the triangles that the takes need
-    seconds, iterations   the budget, one of the two
-    """
-
-    parent: Path
-    captures: tuple[Path, ...]
-    growth: float = 0.0
-    seconds: float | None = None
-    iterations: int | None = None
-    seed: int = 0
-
-
-@dataclass(frozen=True)
 class Prepared:
-    """A continuation that can be trained: the run, its capture of all takes, and timestep -> triangles to train."""
+    """A run that can be trained: its capture of all takes, and timestep -> triangles to train, where they are given."""
 
     run: Run
     capture: Capture
-    selection: dict[int, np.ndarray]
+    selection: dict[int, np.ndarray] | None
+
+
+def prepare(wanted: Request, device: str, flame: Path | None = None) -> Prepared:
+    """Check what is asked for, and decide what is trained. Raises StgaError."""
+    if isinstance(wanted, Refinement):
+        return prepare_refinement(wanted, device, flame)
+    return prepare_extension(wanted, device, flame)
 
 
 def prepare_refinement(wanted: Refinement, device: str, flame: Path | None = None) -> Prepared:

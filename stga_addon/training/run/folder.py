@@ -8,6 +8,7 @@ tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
 metrics.jsonl   one line per evaluation
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -19,10 +20,12 @@ from ...errors import StgaError, shorten
 from ...files import read_json, remove_leftovers, write_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
-from ..settings import DEVICES, TrainingSettings, from_json, to_json
+from ..settings import TrainingSettings, from_json, is_device, to_json
 from .identity import Identity, identity_from_json
 
 FORMAT, VERSION, OLDEST_VERSION = "stga-run", 3, 2
+OLD_DEVICES = ("cuda", "cuda:0", "warp-cpu")
+"""What runs of earlier versions call a GPU."""
 CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
 
 
@@ -111,7 +114,9 @@ def read_run(folder: Path) -> Run:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
             raise ValueError(f"principal_point is {shorten(principal_point)}")
-        if not isinstance(device, str) or device.partition(":")[0] not in DEVICES:
+        if device in OLD_DEVICES:
+            device = "gpu"
+        if not is_device(device):
             raise ValueError(f"device is {shorten(device)}")
         return Run(
             Path(values["capture"]),
@@ -128,6 +133,18 @@ def read_run(folder: Path) -> Run:
         raise StgaError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
+
+
+def next_folder(run: Path) -> Path:
+    """The first of RUN_2, RUN_3, … that does not exist; after RUN_2 comes RUN_3."""
+    run = run.resolve()
+    match = re.fullmatch(r"(.+?)_(\d{1,6})", run.name, re.ASCII)
+    name, number = (match[1], int(match[2])) if match else (run.name, 1)
+    while True:
+        number += 1
+        folder = run.with_name(f"{name}_{number}")
+        if not folder.exists():
+            return folder
 
 
 def _take_from_json(values: Any) -> Take:

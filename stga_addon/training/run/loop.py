@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar.file import Avatar, write_avatar
+from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture
 from ...errors import StgaError
@@ -22,13 +22,14 @@ from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view, spread_views
 from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
+from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
-from ..optimize.tracking import write_tracking
+from ..optimize.tracking import with_refined_tracking, write_tracking
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import to_json
@@ -39,11 +40,15 @@ from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
 from .open_run import check_identity
 from .progress import Progress, Report
 from .replay import continued_order
+from .residual_file import write_residuals
+from .strain_range import trained_strain_range
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 EVALUATIONS = 10
 """Evaluations over a budget in iterations, at fixed shares of it so that the run is reproducible."""
+RESIDUAL_VIEWS = 24
+"""Views in which the residuals of a finished run are measured."""
 EVALUATION_SHARE = 0.04
 """Largest share of the training time that evaluations add to a budget in seconds, without the last one."""
 MAX_EVALUATIONS = 40
@@ -127,6 +132,7 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
+        self.measured_strain: list[np.ndarray | None] = []
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""
@@ -204,6 +210,8 @@ class _Loop:
             self._train(interrupts)
             self._evaluate(perceptual=self._finished())  # LPIPS takes long, so a run that is stopped goes without
             self._save()
+            if self._finished():
+                self._measure_residuals()
         self.report(self._progress("Interrupted" if interrupts else "Finished"))
         if interrupts:
             raise KeyboardInterrupt
@@ -303,6 +311,20 @@ class _Loop:
         self._forecast(line)
         append_metrics(self.out, line)
 
+    def _measure_residuals(self) -> None:
+        """Write the error of the avatar on each triangle, over a few views of all frames and cameras."""
+        self.report(self._progress("Measuring residuals"))
+        views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
+        mean = triangle_residuals(
+            read_avatar(self.out / "avatar.npz"), self._refined_capture(), spread_views(views, RESIDUAL_VIEWS),
+            exposure_correction(self.settings), RESIDUAL_SCALE,
+        ).mean()  # fmt: skip
+        write_residuals(self.out, mean)
+
+    def _refined_capture(self) -> Capture:
+        """The capture with the meshes that the avatar in the folder was trained on."""
+        return self.capture if self.trainer.tracking is None else with_refined_tracking(self.capture, self.out)
+
     def _keep_best(self, detail_difference: float | None) -> None:
         """Write the avatar if it is the sharpest so far; without evaluation views the latest one is kept.
 
@@ -344,7 +366,17 @@ class _Loop:
             self.settings.background,
             self.settings.antialiased,
             self.run.principal_point,
+            self._strain_range(),
         )
+
+    def _strain_range(self) -> np.ndarray | None:
+        """Measured once, or whenever refined tracking may have moved the meshes."""
+        if not self.settings.strain_color:
+            return None
+        if not self.measured_strain or self.trainer.tracking is not None:
+            mesh = self.trainer.frames.mesh if self.trainer.tracking is not None else self.capture.mesh
+            self.measured_strain = [trained_strain_range(self.capture, mesh, self.run.continuation)]
+        return self.measured_strain[0]
 
     def _save(self) -> None:
         trainer = self.trainer

@@ -7,6 +7,7 @@ import pytest
 
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.playback import Playback
+from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.avatar.web.data_file import data_file
 from stga_addon.avatar.web.rig import WebRig, flame_rig
 from stga_addon.capture.camera import Camera, look_at
@@ -70,8 +71,9 @@ def make_head(convention: str = "stga", sh_degree: int = 3, antialiased: bool = 
         strain_color = rng.normal(0, 0.1, (SPLATS, 3, 3)).astype(np.float32)
         object.__setattr__(splats, "strain_color", strain_color)
     neutral = neutral_mesh(sequence).astype(np.float32)
-    avatar = Avatar(splats, convention, neutral, model.faces, antialiased=antialiased)
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
+    limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral)) if strain else None
+    avatar = Avatar(splats, convention, neutral, model.faces, antialiased=antialiased, strain_range=limits)
     camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
     return Head(avatar, sequence, meshes, camera)
 

@@ -10,14 +10,15 @@ const MIN_SQUARED_NORMAL = 1e-24;
 export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
 
 export class FaceFrames {
-  /** faces (3·F), neutral (3·V) meters, convention of the embedding, and whether colors follow strain. */
-  constructor(faces, neutral, convention, withStrain) {
+  /** Arrays of the data file, and the convention of the embedding; strain is computed where colors follow it. */
+  constructor(arrays, convention) {
+    const [faces, neutral] = [arrays.faces.values, arrays.neutral.values];
     this.faces = faces;
     this.count = faces.length / 3;
     this.convention = convention;
     this.world = new Float64Array(12 * this.count); // rotation · scale and origin, rows of a 3×4 matrix
     this.neutralArea = neutralAreas(faces, neutral);
-    this.strain = withStrain ? new Strain(faces, neutral) : null;
+    this.strain = arrays.strain_color ? new Strain(faces, neutral, arrays.strain_range?.values) : null;
   }
 
   /** Follow the posed vertices (3·V). */
@@ -151,10 +152,14 @@ function scaleBy(v, factor) {
   for (let k = 0; k < 3; k++) v[k] *= factor;
 }
 
-/** Green's strain of the triangles against the neutral mesh, averaged over neighbors: three components, clipped. */
+/**
+ * Green's strain of the triangles against the neutral mesh, averaged over neighbors: three components, clipped to the
+ * triangle's range (lowest three, highest three), or to ±MAX_STRAIN.
+ */
 class Strain {
-  constructor(faces, neutral) {
+  constructor(faces, neutral, range) {
     this.faces = faces;
+    this.range = range ?? null;
     const count = faces.length / 3;
     this.values = new Float32Array(3 * count);
     this.gram = new Float64Array(3 * count);
@@ -193,7 +198,7 @@ class Strain {
 
   update(vertices) {
     this.spread(vertices);
-    const { faces, atVertex, toPlane, touching, values } = this;
+    const { faces, atVertex, toPlane, touching, range, values } = this;
     const tensor = new Float64Array(6);
     for (let f = 0; f < values.length / 3; f++) {
       tensor.fill(0);
@@ -204,7 +209,9 @@ class Strain {
       for (let row = 0; row < 3; row++) {
         let sum = 0;
         for (let k = 0; k < 6; k++) sum += toPlane[18 * f + 6 * row + k] * tensor[k];
-        values[3 * f + row] = Math.min(MAX_STRAIN, Math.max(-MAX_STRAIN, STRAIN_GAIN * sum));
+        const lowest = range ? range[6 * f + row] : -MAX_STRAIN;
+        const highest = range ? range[6 * f + 3 + row] : MAX_STRAIN;
+        values[3 * f + row] = Math.min(highest, Math.max(lowest, STRAIN_GAIN * sum));
       }
     }
   }
