@@ -36,6 +36,8 @@ extension: .venv/ready
 .venv/ready: pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --editable '.[dev]'
+	# Without dependencies: most are for other tasks than landmarks, and its OpenCV needs a display's libraries.
+	$(BIN)/pip install --quiet --no-deps "mediapipe==0.10.21; python_version < '3.13'"
 	touch $@
 
 clean:

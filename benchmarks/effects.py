@@ -120,7 +120,9 @@ def trained(
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
         shown = with_refined_tracking(capture, Path(folder))
-    psnr = {split: evaluate_avatar(avatar, shown, split).psnr for split in ("val", "test") if shown.views.get(split)}
+    splits = [split for split in ("val", "test") if shown.views.get(split)]
+    # Exposure matched for all variants, so that those with and without the effect `exposure` compare.
+    psnr = {split: evaluate_avatar(avatar, shown, split, matched=True).psnr for split in splits}
     return psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
 
 

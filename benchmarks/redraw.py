@@ -2,9 +2,9 @@
 
     python benchmarks/redraw.py [--repeats 20]
 
-A head of 9,976 triangles that moves (playback: its triangles' frames are computed again) and one that rests while the
-view moves, with 65,536 and 200,000 splats. Medians in milliseconds. Needs no GPU: uploading the results takes it
-another 0.1 to 1 ms, which `tests/gui` shows. Run it on an idle machine.
+A head of 9,976 triangles that moves (playback: its triangles' frames are computed again, and strain where colors follow
+it) and one that rests while the view moves, with 65,536 and 200,000 splats. Medians in milliseconds. Needs no GPU:
+uploading the results takes it another 0.1 to 1 ms, which `tests/gui` shows. Run it on an idle machine.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import numpy as np
 
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
+from stga_addon.avatar.strain import STRAIN_COMPONENTS
 from stga_addon.capture.camera import look_at
 from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames, table
 from stga_addon.scene.layers import SceneLayer
@@ -35,7 +36,7 @@ def head_mesh() -> tuple[np.ndarray, np.ndarray]:
     return 0.1 * np.stack([p.ravel() for p in points], 1), faces.astype(np.int32)
 
 
-def head_avatar(count: int) -> Avatar:
+def head_avatar(count: int, has_strain: bool = False) -> Avatar:
     vertices, faces = head_mesh()
     rng = np.random.default_rng(0)
     splats = Splats(
@@ -46,6 +47,7 @@ def head_avatar(count: int) -> Avatar:
         sh=np.zeros((count, 1, 3), np.float32),
         face=rng.integers(0, len(faces), count).astype(np.int32),
         unbound=np.zeros(count, bool),
+        strain_color=np.zeros((count, STRAIN_COMPONENTS if has_strain else 0, 3), np.float32),
     )
     return Avatar(splats, "stga", vertices.astype(np.float32), faces)
 
@@ -60,7 +62,7 @@ def median_ms(work: Callable[[], object], repeats: int) -> float:
 
 
 def measure(count: int, view: View, repeats: int) -> None:
-    avatar = head_avatar(count)
+    avatar, strained = head_avatar(count), head_avatar(count, has_strain=True)
     layer = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
     static, block = StaticSplats([layer]), frame_block(layer.frames)
 
@@ -68,12 +70,17 @@ def measure(count: int, view: View, repeats: int) -> None:
         drawing_order(static, posed_frames([layer], [block], view), view)
         table(static, [layer], view)
 
-    def playback() -> None:
-        posed = SceneLayer(avatar.splats, avatar.frames(avatar.neutral), np.eye(4))
+    def playback(of: Avatar) -> None:
+        posed = SceneLayer(of.splats, of.frames(of.neutral), np.eye(4))
         drawing_order(static, posed_frames([posed], [frame_block(posed.frames)], view), view)
         table(static, [posed], view)
 
-    for name, work in (("moving view", moving_view), ("playback", playback)):
+    cases = {
+        "moving view": moving_view,
+        "playback": lambda: playback(avatar),
+        "playback, colors follow strain": lambda: playback(strained),
+    }
+    for name, work in cases.items():
         print(f"{count} splats, {name}: {median_ms(work, repeats):.2f} ms")
 
 

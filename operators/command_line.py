@@ -17,6 +17,7 @@ from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
+from ..stga_addon.training.effect_plan import TRACKING
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids
@@ -43,6 +44,8 @@ def _run(arguments: list[str]) -> int:
             _prepare_environment_command(options)
         if command in IN_BLENDER or not missing_packages():
             return main(arguments, head)
+        if command == "avatar":
+            return _make_avatar(arguments, options)
         return _delegate(arguments, head, played=command == "render")
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
@@ -90,6 +93,25 @@ def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> in
             environment[FOLDER] = folder
         with start_python(python, ["stga_addon", *arguments], environment) as process:
             return process.wait()
+
+
+def _make_avatar(arguments: list[str], options: Any) -> int:
+    """Track and train in the training environment, which has no bpy, and write the .blend file here."""
+    from ..stga_addon.cli.avatar import RUN, write_blend
+
+    code = _delegate([*arguments, "--no-blend"], None, played=False)
+    if code or options.no_blend:
+        return code
+    refined = options.out / RUN / TRACKING
+
+    def apply_refined(head: Any) -> None:
+        scene_settings(bpy.context).head = head
+        if refined.exists():  # PyTorch, which reads it into a capture, is not here
+            start = head[tags.TIMESTEPS][0]
+            bpy.ops.stga.apply_motion(filepath=str(refined.resolve()), own_offsets=True, start=start)
+
+    print(f"blender: {write_blend(options.out, lambda capture: capture, apply_refined)}")
+    return 0
 
 
 def _played(head: Any, capture: Capture) -> Capture:

@@ -24,6 +24,7 @@ from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
+from ..stga_addon.scene.viewports import open_sidebar
 from ..stga_addon.training.effect_plan import TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker
@@ -31,8 +32,8 @@ from . import ids
 from .common import is_head
 from .show import show
 
-Curve = tuple[np.ndarray, str]
-"""Pixels of a run's curve and the ranges of its axes."""
+Curve = tuple[np.ndarray, str, str]
+"""Pixels of a run's curve, the ranges of its axes and of the detail difference."""
 
 _states: dict[int, MonitorState] = {}
 """Session id of a scene -> its training."""
@@ -338,9 +339,23 @@ def _adopt(scene: Any) -> None:
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
     if settings.head is None and len(heads) == 1:
         settings.head = heads[0]
+        if has_timer():
+            bpy.app.timers.register(_Sidebar(), first_interval=CHECK_INTERVAL_S)
         if settings.splats is None and len(shown) == 1:
             settings.splats = shown[0]
             settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
+
+
+class _Sidebar:
+    """Opens the sidebar at the add-on's tab, from a timer, for a few seconds at most."""
+
+    def __init__(self) -> None:
+        self._attempts = 10
+
+    def __call__(self) -> float | None:
+        self._attempts -= 1
+        screens = [window.screen for window in bpy.context.window_manager.windows]
+        return None if open_sidebar(ids.TAB, screens) or not self._attempts else CHECK_INTERVAL_S
 
 
 def register() -> None:

@@ -141,13 +141,13 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         return {"RUNNING_MODAL"}
 
     def _record_and_render(self, context: Any) -> set[str]:
+        """Without a window: nothing is left but the video."""
         try:
             while self._recording.record_next():
                 pass
-        except StgaError:
+            return self._render(context, wait=True)
+        finally:
             self._recording.discard()
-            raise
-        return self._render(context, wait=True)
 
     def modal(self, context: Any, event: Any) -> set[str]:
         if event.type == "ESC" or not self._recording.is_wanted():
@@ -167,6 +167,9 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             self.cancel(context)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        except Exception:
+            self.cancel(context)
+            raise
 
     def cancel(self, context: Any) -> None:
         """End the recording, also when Blender quits or loads another file meanwhile."""
@@ -258,9 +261,8 @@ class _Recording:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
         self._cache, self._layers = SplatCache(), dict[int, list[PosedSplats]]()
-        folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
         job = VideoJob(output, len(frames), frames_per_second(context.scene), srgb_background(context.scene))
-        self._recorder = Recorder(folder, job)
+        folder, self._recorder = _start_recording(job)
         self.video = Video(output, folder, len(frames))
         last = _videos.get(context.scene.session_uid)
         if last is not None:
@@ -288,23 +290,38 @@ class _Recording:
         return self.video.is_recording
 
     def finish(self) -> Video:
-        """End the recording; the job is ready for its worker."""
+        """End the recording; the job is ready for its worker. Raises StgaError on a full disk."""
         self._restore()
+        self._recorder.close()
         return self.video
 
     def discard(self) -> None:
         """End the recording and remove its files."""
         self._restore()
+        with suppress(StgaError):  # a full disk
+            self._recorder.close()
         remove_video_job(self.video.folder)
         for scene, video in list(_videos.items()):
             if video is self.video:
                 del _videos[scene]
 
     def _restore(self) -> None:
-        self._recorder.close()
         frame, subframe = self._shown
         with suppress(ReferenceError):  # another file was opened
             self._scene.frame_set(frame, subframe=subframe)
+
+
+def _start_recording(job: VideoJob) -> tuple[Path, Recorder]:
+    """A temporary folder for the job, and what records into it. Raises StgaError, and leaves no folder then."""
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
+    except OSError as error:
+        raise StgaError(f"{tempfile.gettempdir()}: cannot be written ({error.strerror or error})") from error
+    try:
+        return folder, Recorder(folder, job)
+    except StgaError:
+        remove_video_job(folder)
+        raise
 
 
 def _wait(video: Video, process: "subprocess.Popen[bytes]") -> None:
@@ -315,5 +332,8 @@ def _wait(video: Video, process: "subprocess.Popen[bytes]") -> None:
 
 
 def unregister() -> None:
-    """Forget the videos; their workers go on."""
+    """Forget the videos, and remove the jobs of those that are finished; other workers go on."""
+    for video in _videos.values():
+        with suppress(StgaError):  # its worker is running
+            remove_video_job(video.folder)
     _videos.clear()

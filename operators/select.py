@@ -9,12 +9,17 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import has_heat_map, hide_heat_map, show_heat_map
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.display.heat_map import RESIDUAL, has_heat_map, hide_heat_map, show_heat_map, shows_residuals
 from ..stga_addon.scene.vertex_groups import read_regions, read_selection, splats_per_face, write_selection
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
+from ..stga_addon.training.run.residual_file import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
 from . import ids
-from .common import capture_of, head_of, needs_head, needs_own_head, reporting, scene_settings
+from .common import capture_of, file_path, head_of, needs_head, needs_own_head, reporting, scene_settings
+
+LARGEST_RESIDUAL_QUANTILE = 0.98
+"""Triangles with residuals from here up are shown alike, so that a few at the border do not make all others blue."""
 
 
 class Select(bpy.types.Operator):
@@ -62,7 +67,7 @@ class Select(bpy.types.Operator):
         write_selection(head, selection)
         head[tags.KEY_REGIONS] = "\n".join(names)
         _count(context, head)
-        if has_heat_map(head):
+        if has_heat_map(head) and not shows_residuals(head):
             show_heat_map(head, _shares(head))
         moving = [faces.mean() for faces in selection.values() if faces.any()]
         share = 100 * sum(moving) / len(moving) if moving else 0.0
@@ -114,7 +119,8 @@ class CountSelected(bpy.types.Operator):
 
 
 class HeatMap(bpy.types.Operator):
-    """Color the head by how often each triangle is selected, in the viewport and in renders"""
+    """Color the head's triangles, in the viewport and in renders: by how often each is selected, or by the error of
+    the trained avatar there"""
 
     bl_idname = ids.HEAT_MAP
     bl_label = "Heat Map"
@@ -122,6 +128,21 @@ class HeatMap(bpy.types.Operator):
 
     show: bpy.props.BoolProperty(
         name="Show", description="Off: restore the head's own colors", default=True, options={"SKIP_SAVE"}
+    )
+    of: bpy.props.EnumProperty(
+        name="Of",
+        description="What the colors show",
+        items=(
+            ("SELECTION", "Selection", "How often each triangle is selected"),
+            ("RESIDUAL", "Residual", "Mean error of the run's avatar on each triangle over all views: where to refine"),
+        ),
+        options={"SKIP_SAVE"},
+    )
+    directory: bpy.props.StringProperty(
+        name="Run Folder",
+        description="Folder of the run whose residuals are shown",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
 
     @classmethod
@@ -131,14 +152,12 @@ class HeatMap(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         head, splats = head_of(context), scene_settings(context).splats
-        if self.show:
-            share = _shares(head)
-            if not share.any():
-                raise StgaError(f"{head.name}: no frame selects a triangle yet; select moving triangles first")
-            show_heat_map(head, share)
-            self.report({"INFO"}, f"The most selected triangle is selected in {share.max():.0%} of the frames")
-        else:
+        if not self.show:
             hide_heat_map(head)
+        elif self.of == "RESIDUAL":
+            self._show_residuals(head)
+        else:
+            self._show_shares(head)
         in_view = context.view_layer.objects
         if splats is not None and in_view.get(splats.name) is splats and in_view.get(head.name) is head:
             # Only one of the two: each covers the other.
@@ -146,6 +165,20 @@ class HeatMap(bpy.types.Operator):
             head.hide_set(not self.show)
         _color_viewports(context, "VERTEX" if self.show else "MATERIAL")
         return {"FINISHED"}
+
+    def _show_shares(self, head: Any) -> None:
+        share = _shares(head)
+        if not share.any():
+            raise StgaError(f"{head.name}: no frame selects a triangle yet; select moving triangles first")
+        show_heat_map(head, share)
+        self.report({"INFO"}, f"The most selected triangle is selected in {share.max():.0%} of the frames")
+
+    def _show_residuals(self, head: Any) -> None:
+        folder = file_path(self.directory, "run folder")
+        residual = np.nan_to_num(read_residuals(folder, len(head.data.polygons)))
+        largest = float(np.quantile(residual[residual > 0], LARGEST_RESIDUAL_QUANTILE)) if residual.any() else 1.0
+        show_heat_map(head, residual, RESIDUAL, largest)
+        self.report({"INFO"}, f"Red: a mean error of {100 * largest:.1f} % of full brightness or more")
 
 
 def possible_regions(head: Any) -> list[str]:

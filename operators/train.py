@@ -21,12 +21,12 @@ from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effect_plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
-from ..stga_addon.worker.environment import missing_packages
+from ..stga_addon.worker.environment import missing_packages, stored_adapters
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import failure_report, inspect_worker, request_cancel
 from . import ids, monitor
 from .common import file_path, head_of, needs_head, reporting
-from .environment import training_python
+from .environment import environment_folder, training_python
 
 
 def strategy_property() -> Any:
@@ -59,11 +59,56 @@ def device_property() -> Any:
         name="Device",
         description="Device that trains. Auto resumes a run on the device that it was trained on",
         items=(
-            ("auto", "Auto", "An NVIDIA GPU if one works, else the CPU"),
+            ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
             ("cpu", "CPU", "The processor"),
-            ("cuda", "GPU", "An NVIDIA GPU; training fails if none works"),
+            ("gpu", "GPU", "A GPU; training fails if none works"),
         ),
     )
+
+
+def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
+    """The GPUs that the last test of the training environment found, in its order."""
+    return stored_adapters(environment_folder())
+
+
+def adapter_property() -> Any:
+    """GPU that trains where the device is one: of the operator, and of the panel that calls it."""
+    return bpy.props.StringProperty(
+        name="GPU",
+        description="Name of the GPU; empty: the first. The list is that of the last test of the training environment",
+        search=list_adapters,
+        search_options={"SUGGESTION"},
+    )
+
+
+def python_property() -> Any:
+    """Interpreter of an operator that trains."""
+    return bpy.props.StringProperty(
+        name="Python",
+        description="Python interpreter that trains; empty: the training environment of the preferences",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+
+def wait_property() -> Any:
+    """Whether an operator that trains waits for the end."""
+    return bpy.props.BoolProperty(
+        name="Wait",
+        description="Return when training has ended, as always without a window; "
+        "Blender's own Python trains then, if it has the packages",
+        options={"SKIP_SAVE"},
+    )
+
+
+def may_train(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head and nothing is training; says what to do where not."""
+    if not needs_head(operator, context):
+        return False
+    if monitor.training_of(context.scene).snapshot.state.is_alive:
+        operator.poll_message_set("Training is running; cancel it first")
+        return False
+    return True
 
 
 class Train(bpy.types.Operator):
@@ -89,6 +134,7 @@ class Train(bpy.types.Operator):
     strategy: strategy_property()
     preset: preset_property()
     device: device_property()
+    adapter: adapter_property()
     seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
@@ -100,48 +146,20 @@ class Train(bpy.types.Operator):
         description="Continue the run in the folder with the settings and budget that it was started with",
         options={"SKIP_SAVE"},
     )
-    python: bpy.props.StringProperty(
-        name="Python",
-        description="Python interpreter that trains; empty: the training environment of the preferences",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )
-    wait: bpy.props.BoolProperty(
-        name="Wait",
-        description="Return when training has ended, as always without a window; "
-        "Blender's own Python trains then, if it has the packages",
-        options={"SKIP_SAVE"},
-    )
+    python: python_property()
+    wait: wait_property()
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if not needs_head(cls, context):
-            return False
-        if monitor.training_of(context.scene).snapshot.state.is_alive:
-            cls.poll_message_set("Training is running; cancel it first")
-            return False
-        return True
+        return may_train(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
         run = file_path(self.directory, "run folder").resolve()
-        waits = self.wait or bpy.app.background
-        here = waits and not self.python and not missing_packages()
-        python = "" if here else training_python(context, self.python)
+        python = python_of(self, context)
         write_job(run, self._job(head), training_selection(head))
-        if here:
-            monitor.start_training(context.scene, run, None)
-            avatar = _train_here(context, run)
-        else:
-            process = start_worker(job_folder(run), python, worker_arguments(run))
-            monitor.start_training(context.scene, run, process)
-            if not waits:
-                return {"FINISHED"}
-            avatar = _wait(run, process)
-        monitor.finish_training(context.scene)
-        self.report({"INFO"}, f"Trained {avatar}")
-        return {"FINISHED"}
+        return start_job(self, context, run, python)
 
     def _job(self, head: Any) -> TrainingJob:
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
@@ -154,7 +172,31 @@ class Train(bpy.types.Operator):
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
         flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
-        return TrainingJob(capture, flame, principal_point, settings, self.device)
+        device = f"gpu:{self.adapter}" if self.device == "gpu" and self.adapter else self.device
+        return TrainingJob(capture, flame, principal_point, settings, device)
+
+
+def python_of(operator: Any, context: Any) -> str | None:
+    """The interpreter that is to train; None: that of Blender. Raises StgaError where there is none."""
+    if (operator.wait or bpy.app.background) and not operator.python and not missing_packages():
+        return None
+    return training_python(context, operator.python)
+
+
+def start_job(operator: Any, context: Any, run: Path, python: str | None) -> set[str]:
+    """Start the job that was written into the run's folder; python: see `python_of`."""
+    if python is None:
+        monitor.start_training(context.scene, run, None)
+        avatar = _train_here(context, run)
+    else:
+        process = start_worker(job_folder(run), python, worker_arguments(run))
+        monitor.start_training(context.scene, run, process)
+        if not (operator.wait or bpy.app.background):
+            return {"FINISHED"}
+        avatar = _wait(run, process)
+    monitor.finish_training(context.scene)
+    operator.report({"INFO"}, f"Trained {avatar}")
+    return {"FINISHED"}
 
 
 class CancelTraining(bpy.types.Operator):

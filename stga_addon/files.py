@@ -56,6 +56,21 @@ def replacing(path: Path) -> Iterator[Path]:
             partial.unlink()
 
 
+def check_writable(path: Path) -> None:
+    """Raise the StgaError of `replacing` where it would not let the file be written; leaves no folder or file behind.
+
+    For work that ends in a file after minutes.
+    """
+    folder = next((parent for parent in path.parents if os.path.lexists(parent)), path.parent)
+    beside = path if folder == path.parent else folder / path.name
+    with suppress(_Checked), replacing(beside):
+        raise _Checked
+
+
+class _Checked(Exception):
+    pass
+
+
 def _create(partial: Path) -> None:
     """Create the file and its folder. Raises OSError, also for a name that no file can have."""
     try:

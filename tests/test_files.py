@@ -13,7 +13,7 @@ import pytest
 
 from stga_addon import files
 from stga_addon.errors import StgaError
-from stga_addon.files import read_json, read_npz, replacing, write_json, write_npz
+from stga_addon.files import check_writable, read_json, read_npz, replacing, write_json, write_npz
 
 
 def write_half(path: Path) -> None:
@@ -48,6 +48,19 @@ def test_unwritable_paths(tmp_path: Path, name: str) -> None:
     with pytest.raises(StgaError, match=rf"{tmp_path / name}: cannot be written"):
         write_json(tmp_path / name, {})
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+def test_a_path_is_checked_without_a_trace(tmp_path: Path) -> None:
+    """Catches a path that is refused only after minutes of work, and folders or files that the check leaves."""
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "new/inner/video.mp4", tmp_path / "video.mp4", tmp_path / "file"):
+        check_writable(path)
+    for path in (tmp_path / "file/video.mp4", tmp_path / "file/inner/video.mp4", tmp_path / "folder"):
+        with pytest.raises(StgaError, match="cannot be written"):
+            check_writable(path)
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+    assert (tmp_path / "file").read_text() == "x"
 
 
 def test_json_round_trip(tmp_path: Path) -> None:

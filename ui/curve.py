@@ -28,7 +28,8 @@ def draw_curve(layout: Any, folder: Path) -> None:
         _fill_preview(str(folder), curve[0])
     column = layout.column(align=True)
     column.template_icon(_previews[str(folder)].icon_id, scale=SCALE)
-    column.label(text=curve[1])
+    for text in filter(None, curve[1:]):
+        column.label(text=text)
 
 
 def _fill_preview(name: str, pixels: np.ndarray) -> None:

@@ -28,7 +28,11 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
         layout, settings = self.layout, scene_settings(context)
         training = monitor.training_of(context.scene).snapshot.state.is_alive
         if not is_head(settings.head) and settings.splats is None:
-            draw_text(layout, context, "Import a capture: the tracked head, its cameras and their images")
+            draw_text(
+                layout,
+                context,
+                "Import a capture: the tracked head, its cameras and their images. Or track your own footage below",
+            )
             layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)

@@ -1,4 +1,4 @@
-"""The sidebar tab: Capture → Select → Train → Show → Motion."""
+"""The sidebar tab: Track → Capture → Select → Train → Show → Motion."""
 
 from typing import Any
 
@@ -10,11 +10,12 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.display_modes import AS_TRAINED
+from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
 from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
 from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
+from .continue_panel import ContinuePanel
 from .effects import EffectsPanel
 from .motion import ExpressionPanel, IdentityPanel, MotionPanel
 from .next_step import NextStepPanel
@@ -22,6 +23,7 @@ from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
 from .sidebar import SidebarPanel
 from .text import draw_text
+from .track_panel import TrackCheckPanel, TrackOptionsPanel, TrackPanel
 from .train_panel import TrainOptionsPanel, TrainPanel
 
 DISPLAY_INPUTS = (
@@ -92,8 +94,11 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         if bounces:
             layout.label(text=bounces, icon="ERROR")
             layout.operator(ids.MORE_BOUNCES)
-        if display_mode(splats) == AS_TRAINED:
+        mode = display_mode(splats)
+        if mode == AS_TRAINED:
+            layout.operator(ids.PREVIEW_IMAGES, icon="SHADING_RENDERED")
             return
+        draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
         if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
             layout.label(text="Solid mode shows no splat colors", icon="INFO")
             preview = layout.operator("wm.context_set_enum", text="Use Material Preview")
@@ -105,11 +110,15 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
 
 CLASSES = (
     NextStepPanel,
+    TrackPanel,
+    TrackOptionsPanel,
+    TrackCheckPanel,
     CapturePanel,
     SelectedFrames,
     SelectPanel,
     TrainPanel,
     TrainOptionsPanel,
+    ContinuePanel,
     EffectsPanel,
     ShowPanel,
     MotionPanel,

@@ -8,7 +8,7 @@ from ..operators import ids
 from ..operators.common import is_head, scene_settings
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import has_heat_map
+from ..stga_addon.scene.display.heat_map import has_heat_map, shows_residuals
 from .sidebar import SidebarPanel
 
 
@@ -43,7 +43,7 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
         if any(tags.group_timestep(group.name) is not None for group in settings.head.vertex_groups):
             row = layout.row(align=True)
             row.operator(ids.COUNT_SELECTED, icon="FILE_REFRESH")
-            shown = has_heat_map(settings.head)
+            shown = has_heat_map(settings.head) and not shows_residuals(settings.head)
             text = "Hide Heat Map" if shown else "Show Heat Map"
             row.operator(ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown).show = not shown
         else:

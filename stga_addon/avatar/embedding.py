@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,35 +47,40 @@ def face_frames(
     neutral: np.ndarray,
     convention: str = "stga",
     strain: StrainBasis | None = None,
+    neutral_areas: np.ndarray | None = None,
 ) -> FaceFrames:
     """Local frame of every triangle of a posed mesh.
 
     vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
-    basis where colors follow strain.
+    basis where colors follow strain. neutral_areas (F,): `face_areas` of the neutral mesh, where they are known.
     "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit meters of the neutral mesh
     (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
     unit the triangle (GaussianAvatars' released code).
     A triangle without area (see MIN_AREA_RATIO) keeps a proper rotation and a finite scale.
     """
-    p0, p1, p2 = corners = _corners(vertices, faces)
+    triangles = _triangles(vertices, faces)
+    to_p1, to_p2, _ = triangles.edges
     if convention == "stga":
         # p0 - origin without computing the origin, whose rounding would not vanish where the corners coincide.
-        first, normal = _orthonormal(((p0 - p1) + (p0 - p2)) / 3, corners)
+        first, normal = _orthonormal((to_p1 + to_p2) / -3, triangles)
         axes = first, _cross(normal, first), normal
-        before = face_areas(neutral, faces)
+        before = face_areas(neutral, faces) if neutral_areas is None else neutral_areas
         # A triangle without area in the neutral mesh has no meaningful ratio: its scale is 1.
-        scale = np.where(before > 0, np.sqrt(_length(_normal(corners)) / 2 / np.maximum(before, MIN_DIVISOR)), 1.0)
+        scale = np.where(before > 0, np.sqrt(triangles.twice_area / 2 / np.maximum(before, MIN_DIVISOR)), 1.0)
     elif convention == "gaussian_avatars":
-        edge, side = _length(p1 - p0), _length(p2 - p0)
-        first, normal = _orthonormal(p1 - p0, corners)
+        edge, side = _length(to_p1), _length(to_p2)
+        first, normal = _orthonormal(to_p1, triangles)
         axes = first, normal, _cross(first, normal)
-        no_edge = edge <= MIN_AREA_RATIO * np.sqrt(_longest_squared(corners))
-        scale = (edge + np.where(no_edge, side, _length(_normal(corners)) / np.where(no_edge, 1.0, edge))) / 2
+        no_edge = edge <= MIN_AREA_RATIO * np.sqrt(triangles.longest_squared)
+        scale = (edge + np.where(no_edge, side, triangles.twice_area / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     deformed = np.zeros((len(faces), 0), np.float32) if strain is None else face_strain(strain, vertices)
-    origin = np.ascontiguousarray(((p0 + p1 + p2) / 3).T)
-    rotation = np.ascontiguousarray(np.stack(axes).transpose(2, 1, 0))
+    p0, p1, p2 = triangles.corners
+    origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
+    for column, axis in enumerate(axes):
+        for row in range(3):
+            rotation[:, row, column] = axis[row]
     return FaceFrames(origin, rotation, scale, deformed)
 
 
@@ -95,7 +101,7 @@ def frame_backward(
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _longest_squared(corners.transpose(1, 2, 0)), MIN_DIVISOR)
+    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _longest_squared(_edges(corners.transpose(1, 2, 0))), MIN_DIVISOR)
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
     # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left, over twice the area.
     slope_x, slope_y = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area, (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
@@ -111,9 +117,9 @@ def frame_backward(
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see MIN_AREA_RATIO)."""
-    corners = _corners(vertices, faces)
-    area = _length(_normal(corners)) / 2
-    return np.where(area > np.maximum(MIN_AREA_RATIO * _longest_squared(corners), MIN_DIVISOR), area, 0.0)
+    triangles = _triangles(vertices, faces)
+    area = triangles.twice_area / 2
+    return np.where(area > np.maximum(MIN_AREA_RATIO * triangles.longest_squared, MIN_DIVISOR), area, 0.0)
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
@@ -204,15 +210,32 @@ def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
 # Vectors of triangles are (3, F) here: arithmetic on whole rows takes a fraction of the time of that on columns.
 
 
-def _corners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(3 corners, 3, F) float64 positions."""
+class _Triangles(NamedTuple):
+    """corners (3 corners, 3, F); edges p1 − p0, p2 − p0 and p2 − p1, each (3, F); normal (3, F), as long as twice the
+    area; twice_area (F,); longest_squared (F,), of the edges."""
+
+    corners: np.ndarray
+    edges: tuple[np.ndarray, np.ndarray, np.ndarray]
+    normal: np.ndarray
+    twice_area: np.ndarray
+    longest_squared: np.ndarray
+
+
+def _triangles(vertices: np.ndarray, faces: np.ndarray) -> _Triangles:
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
-    return np.stack([np.take(rows, corner, axis=1) for corner in np.ascontiguousarray(faces.T)])
+    corners = np.take(rows, np.ascontiguousarray(faces.T), axis=1).transpose(1, 0, 2)
+    edges = _edges(corners)
+    normal = _cross(edges[0], edges[1])
+    return _Triangles(corners, edges, normal, _length(normal), _longest_squared(edges))
 
 
-def _normal(corners: np.ndarray) -> np.ndarray:
-    """Normals (3, F) of triangles, as long as twice their area."""
-    return _cross(corners[1] - corners[0], corners[2] - corners[0])
+def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return corners[1] - corners[0], corners[2] - corners[0], corners[2] - corners[1]
+
+
+def _longest_squared(edges: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    first, second, third = (_dot(edge, edge) for edge in edges)
+    return np.asarray(np.maximum(np.maximum(first, second), third))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -227,24 +250,19 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _longest_squared(corners: np.ndarray) -> np.ndarray:
-    """Square (F,) of the longest edge of triangles (3 corners, 3, F)."""
-    edges = (corners[b] - corners[a] for a, b in ((0, 1), (1, 2), (2, 0)))
-    first, second, third = (_dot(edge, edge) for edge in edges)
-    return np.asarray(np.maximum(np.maximum(first, second), third))
-
-
-def _orthonormal(first: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors along `first` (3, F) and the normals of triangles (3 corners, 3, F), perpendicular to each other.
+def _orthonormal(first: np.ndarray, triangles: _Triangles) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors along `first` (3, F) and the triangles' normals, perpendicular to each other.
 
     Where the triangle is a line, any perpendicular of `first` is used as the normal; where `first` is negligible beside
     the longest edge, the x axis is used for it. `scene.display.frame_nodes` follows the same rules.
     """
-    longest, length = _longest_squared(corners), _length(first)
+    longest, length, normal = triangles.longest_squared, _length(first), triangles.normal
     no_first = length <= MIN_AREA_RATIO * np.sqrt(longest)
-    first = np.where(no_first, np.array([[1.0], [0.0], [0.0]]), first / np.where(no_first, 1.0, length))
-    normal = _normal(corners)
-    no_normal = _length(normal) <= 2 * MIN_AREA_RATIO * longest
+    if no_first.any():
+        first = np.where(no_first, np.array([[1.0], [0.0], [0.0]]), first / np.where(no_first, 1.0, length))
+    else:
+        first = first / length
+    no_normal = triangles.twice_area <= 2 * MIN_AREA_RATIO * longest
     if no_normal.any():
         upright = np.abs(first[2]) > UPRIGHT_COSINE
         substitute = _cross(first, np.where(upright, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [0.0], [1.0]])))

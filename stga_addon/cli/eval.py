@@ -37,6 +37,8 @@ def run(options: Namespace) -> None:
     for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region")):
         if region in quality.regions:
             print(f"  {name}: {_describe(quality.regions[region])}")
+    if quality.psnr_unmatched is not None:
+        print(f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB")
     if quality.lpips is None:
         print("LPIPS was not measured: it needs its weights, whose file STGA_LPIPS names (docs/dependencies.md),")
         print(f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels")

@@ -15,8 +15,11 @@ from ..jobs.delegate import FOLDER, OpenHead, read_head
 from .streams import safe_streams
 
 COMMANDS = (
+    ".avatar",
     ".track",
     ".train",
+    ".refine",
+    ".extend",
     ".job",
     ".render",
     ".eval",

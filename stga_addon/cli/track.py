@@ -2,20 +2,33 @@
 
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..jobs.delegate import OpenHead
 from .arguments import real_number, usable_path, whole_number
+
+if TYPE_CHECKING:
+    from ..tracking.track import TrackingReport
 
 NAME, HELP = "track", "track a head through footage, and write a capture"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    add_footage(parser)
+    parser.add_argument("--out", type=usable_path, required=True, metavar="CAPTURE", help="folder of the capture")
+
+
+def add_footage(parser: ArgumentParser) -> None:
+    """FOOTAGE, --model, and how both are read."""
     parser.add_argument("footage", type=usable_path, metavar="FOOTAGE", help="folder of images or videos, or a video")
     parser.add_argument(
-        "--model", type=usable_path, required=True, metavar="HEAD", help="FLAME (.pkl, .npz) or linear model (.npz)"
+        "--model",
+        type=usable_path,
+        required=True,
+        metavar="HEAD",
+        help="FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb)",
     )
-    parser.add_argument("--out", type=usable_path, required=True, metavar="CAPTURE", help="folder of the capture")
     parser.add_argument("--cameras", type=usable_path, metavar="FILE", help="calibration that is not in FOOTAGE")
     points = parser.add_mutually_exclusive_group()
     points.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")
@@ -36,6 +49,15 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    result = track_footage(options, options.out)
+    for warning in result.warnings:
+        print(f"warning: {warning}")
+    print(f"reprojection error: {result.median_px:.2f} px (median); by camera and timestep in tracking.json")
+    print(f"capture: {options.out}")
+
+
+def track_footage(options: Namespace, out: Path) -> "TrackingReport":
+    """Track what `add_footage`'s options name into the folder `out`, with a bar for each stage. Raises StgaError."""
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import track
@@ -43,13 +65,7 @@ def run(options: Namespace) -> None:
     frames = FrameRange(options.start, options.stop, options.step, dict(options.offset))
     footage = open_footage(options.footage, options.cameras, frames, options.focal)
     with _Bar() as bar:
-        result = track(
-            footage, options.model, options.out, options.landmarks, options.detector, options.meshes, bar.report
-        )
-    for warning in result.warnings:
-        print(f"warning: {warning}")
-    print(f"reprojection error: {result.median_px:.2f} px (median); by camera and timestep in tracking.json")
-    print(f"capture: {options.out}")
+        return track(footage, options.model, out, options.landmarks, options.detector, options.meshes, bar.report)
 
 
 def _offset(text: str) -> tuple[str, int]:

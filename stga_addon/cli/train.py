@@ -2,7 +2,10 @@
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ..capture.model import Capture
 from ..errors import StgaError
@@ -14,12 +17,21 @@ from .arguments import add_capture, add_device, add_effects, duration, real_numb
 from .inputs import open_named_capture
 from .table import print_table
 
+if TYPE_CHECKING:
+    from ..training.run.folder import Run
+
 NAME, HELP = "train", "train an avatar from a capture"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
     parser.add_argument("--out", type=usable_path, required=True, metavar="RUN", help="folder of the run")
+    add_training(parser)
+    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
+
+
+def add_training(parser: ArgumentParser) -> None:
+    """How a new run is trained."""
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, metavar="TIME", help="training time such as 90s, 10m (default 2m)")
     budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
@@ -38,19 +50,23 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     )
     parser.add_argument("--threshold", type=real_number, metavar="METERS", help="selection threshold")
     add_effects(parser)
-    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
     add_device(parser)
     parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
 
 
 def run(options: Namespace) -> None:
-    from ..effects.plan import describe_effects, with_effect_plan
-    from ..report.run_summary import CurveUpdater, report_run
+    run, capture, selection = prepare(options)
+    train_run(options.out, run, capture, selection, options.resume)
+
+
+def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] | None]:
+    """The run that the options name, its capture and the open head's selection; prints why which device trains.
+
+    Raises StgaError.
+    """
+    from ..effects.plan import with_effect_plan
     from ..training.optimize.device import choose_device
-    from ..training.run.loop import train
     from ..training.run.open_run import device_of, open_run
-    from ..training.run.progress import Progress
-    from ..training.run.progress_bar import ProgressBar
 
     if not options.capture.is_dir():
         raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
@@ -66,24 +82,49 @@ def run(options: Namespace) -> None:
         device, why = choose_device(options.device)
         capture = open_named_capture(options)
         run = with_effect_plan(_new_run(options, capture, device), capture, device)
+    selection = None if options.head is None else options.head.selection()
     print(why)
+    return run, capture, None if selection is None else dict(selection)
+
+
+def train_run(
+    folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
+) -> None:
+    """Train a run into its folder with a progress bar, and print its summary."""
+    from ..report.run_summary import report_run
+
+    avatar = train_with_bar(folder, run, capture, selection, resume)
+    for line in report_run(folder):
+        print(line)
+    print(f"avatar: {avatar}")
+    if run.settings.tracking:
+        print(f"refined meshes: {folder / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+
+
+def train_with_bar(
+    folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
+) -> Path:
+    """Train a run into its folder with a progress bar; returns the avatar's path.
+
+    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
+    """
+    from ..effects.plan import describe_effects
+    from ..report.run_summary import CurveUpdater
+    from ..training.run.loop import train
+    from ..training.run.progress import Progress
+    from ..training.run.progress_bar import ProgressBar
+
     for warning in capture.warnings:
         print(f"warning: {warning}")
     print_table(describe_effects(run.effect_plan))
-    draw = CurveUpdater(options.out)
+    draw = CurveUpdater(folder)
     with ProgressBar() as bar:
 
         def report(progress: Progress) -> bool:
             draw()
             return bar.report(progress)
 
-        selection = None if options.head is None else options.head.selection()
-        avatar = train(capture, options.out, run, selection, options.resume, report)
-    for line in report_run(options.out):
-        print(line)
-    print(f"avatar: {avatar}")
-    if run.settings.tracking:
-        print(f"refined meshes: {options.out / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
+        return train(capture, folder, run, selection, resume, report)
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:

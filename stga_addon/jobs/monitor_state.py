@@ -58,7 +58,13 @@ class MonitorState:
             return None
         if self.building:
             return SLICE_INTERVAL_S
-        return CHECK_INTERVAL_S if self.snapshot.state.is_alive or self.loading is not None else None
+        is_expected = self.snapshot.state.is_alive or self.loading is not None or self.has_result
+        return CHECK_INTERVAL_S if is_expected else None
+
+    @property
+    def has_result(self) -> bool:
+        """Whether training has ended with an avatar that is still to be shown."""
+        return self.snapshot.state in (WorkerState.FINISHED, WorkerState.CANCELLED) and not self.result_shown
 
 
 # Events
@@ -215,9 +221,8 @@ def _status_read(state: MonitorState, event: StatusRead) -> Outcome:
     state = replace(state, folder=folder, files=files, snapshot=event.snapshot, error=error, stopped=False)
     if state.loading is not None:
         return state, tuple(effects)
-    has_result = worker in (WorkerState.FINISHED, WorkerState.CANCELLED) and not state.result_shown
     has_preview = worker.is_alive and files.preview not in (None, state.shown_preview)
-    if has_result:
+    if state.has_result:
         effects.append(StoreAvatar(folder / AVATAR))
         if event.show_result:
             state = replace(state, loading=folder / AVATAR)
@@ -235,4 +240,6 @@ def _loading_ended(state: MonitorState, error: str, effects: tuple[Effect, ...])
     was_result = state.loading is not None and state.loading.name == AVATAR
     state = replace(state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result)
     stored = (StoreTraining(state.run, True),) if was_result else ()
+    if was_result and not error and PushUndo() not in effects:
+        effects = (*effects, PushUndo())  # undo brings back what was shown before the training
     return state, (*stored, *effects, Redraw())

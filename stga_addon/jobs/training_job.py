@@ -2,6 +2,7 @@
 
 RUN/job/job.json       the capture, the device and the settings
 RUN/job/selection.npz  timestep -> triangles to train, where they were painted
+RUN/job/region.npz     weight of each triangle, where a painted region is refined
 RUN/job/preview.npz    the avatar of a few seconds ago
 besides the files of the worker's status folder
 """
@@ -18,20 +19,23 @@ import numpy as np
 from ..avatar.file import Avatar, write_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture
+from ..capture.region import write_region
 from ..errors import StgaError, shorten
 from ..files import read_json, write_json, write_npz
 from ..training.optimize.device import choose_device
 from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
-from ..training.settings import DEVICES, TrainingSettings, from_json, to_json
+from ..training.run.request import Request, request_from_json, request_to_json
+from ..training.settings import TrainingSettings, from_json, is_device, to_json
 from ..worker.launch import prepare_status_folder
 from ..worker.status import StatusWriter, remove_status_folder, status_writer
 
 if TYPE_CHECKING:
+    from ..training.run.continuation import Prepared
     from ..training.run.progress import Progress, Report
 
-FORMAT, VERSION = "stga-job", 2
-JOB, PREVIEW = "job.json", "preview.npz"
+FORMAT, VERSION = "stga-job", 3
+JOB, PREVIEW, REGION = "job.json", "preview.npz", "region.npz"
 PREVIEW_S = 4.0
 """Seconds between two previews."""
 
@@ -40,8 +44,9 @@ PREVIEW_S = 4.0
 class TrainingJob:
     """What to train.
 
-    settings  None to resume the run in the folder
-    device    one of DEVICES; "auto" resumes a run on the device that it was trained on
+    settings  None to resume the run in the folder, or to continue another one
+    device    as `settings.is_device` allows; "auto" resumes a run on the device that it was trained on
+    continues what is asked of a run that continues another one, which the folder is to hold
     """
 
     capture: Path
@@ -49,6 +54,11 @@ class TrainingJob:
     principal_point: str
     settings: TrainingSettings | None
     device: str = "auto"
+    continues: Request | None = None
+
+    @property
+    def resumes(self) -> bool:
+        return self.settings is None and self.continues is None
 
 
 def job_folder(run: Path) -> Path:
@@ -56,23 +66,31 @@ def job_folder(run: Path) -> Path:
     return run / "job"
 
 
-def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] | None = None) -> None:
+def write_job(
+    run: Path,
+    job: TrainingJob,
+    selection: Mapping[int, np.ndarray] | None = None,
+    region: np.ndarray | None = None,
+) -> None:
     """Prepare a run's folder for the job's worker.
 
     selection: timestep -> (F,) bool, to be trained instead of what the rule selects.
+    region: (F,) weight of each triangle in a painted region, for the file that the job refines.
     Raises StgaError while a worker is in the folder, where it holds a run already (to resume: none), or on a full disk.
     Whether a run to resume was trained on this capture, which takes reading it, the worker finds out.
     """
     folder = job_folder(run)
-    if job.settings is None:
+    if job.resumes:
         read_run(run)
     elif (run / "run.json").exists():
         raise StgaError(f"{run}: already holds a run; resume it, or choose another folder")
     prepare_status_folder(folder)
-    for stale in (SELECTION, PREVIEW):
+    for stale in (SELECTION, PREVIEW, REGION):
         (folder / stale).unlink(missing_ok=True)
     if selection is not None:
         write_npz(folder / SELECTION, {f"{t:05d}": faces for t, faces in selection.items()}, compressed=True)
+    if region is not None:
+        write_region(folder / REGION, region)
     write_json(
         folder / JOB,
         {
@@ -83,6 +101,7 @@ def write_job(run: Path, job: TrainingJob, selection: Mapping[int, np.ndarray] |
             "principal_point": job.principal_point,
             "device": job.device,
             "settings": None if job.settings is None else to_json(job.settings),
+            "continues": request_to_json(job.continues),
         },
     )
 
@@ -95,7 +114,7 @@ def read_job(run: Path) -> TrainingJob:
         raise StgaError(f"{path}: is not a job that this version reads (format '{FORMAT}', version {VERSION})")
     try:
         flame, settings, device = values["flame"], values["settings"], values["device"]
-        if device not in DEVICES:
+        if not is_device(device):
             raise ValueError(f"device is {shorten(device)}")
         return TrainingJob(
             Path(values["capture"]),
@@ -103,6 +122,7 @@ def read_job(run: Path) -> TrainingJob:
             str(values["principal_point"]),
             None if settings is None else from_json(settings),
             device,
+            request_from_json(values["continues"]),
         )
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error
@@ -119,7 +139,7 @@ def remove_job(run: Path) -> None:
         read_job(run)
     except StgaError:
         return
-    remove_status_folder(job_folder(run), (JOB, SELECTION, PREVIEW))
+    remove_status_folder(job_folder(run), (JOB, SELECTION, PREVIEW, REGION))
 
 
 def worker_arguments(folder: Path) -> list[str]:
@@ -138,32 +158,44 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
         raise StgaError(f"{run}: holds no job (job/{JOB} is missing)")
     with status_writer(folder) as writer:
         writer.update(0.0, "Starting")
-        from ..training.run.checkpoint import read_selection
         from ..training.run.loop import train
 
         job = read_job(run)
-        wanted, capture = _open(run, job, lambda stage: writer.update(0.0, stage))
-        selection = None
-        if (folder / SELECTION).exists():
-            selection = read_selection(folder, len(capture.faces))
-        return train(capture, run, wanted, selection, job.settings is None, _Report(writer, also))
+        prepared = _prepare(run, job, lambda stage: writer.update(0.0, stage))
+        return train(prepared.capture, run, prepared.run, prepared.selection, job.resumes, _Report(writer, also))
 
 
-def _open(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> tuple[Run, Capture]:
-    """The run to train, new or resumed, and its capture."""
+def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> "Prepared":
+    """The run to train (new, resumed or one that continues another), its capture and the selection."""
     from ..effects.plan import with_effect_plan
+    from ..training.run.continuation import Prepared, prepare
 
-    if job.settings is None:
-        opened = open_run(folder, job.capture, job.flame, job.principal_point)
+    if job.resumes:
+        moved = None if read_run(folder).takes else job.capture  # the head in the scene may be that of any take
+        opened = open_run(folder, moved, job.flame, job.principal_point)
         device, reason = device_of(opened.run, job.device)
         report(reason)
-        return replace(opened.run, device=device), opened.capture
+        return Prepared(replace(opened.run, device=device), opened.capture, _painted(folder, opened.capture))
+    if job.continues is not None:
+        device, reason = device_of(read_run(job.continues.parent), job.device)
+        report(reason)
+        report("Comparing the avatar with the images")
+        return prepare(job.continues, device, job.flame)
+    assert job.settings is not None
     capture = open_capture(job.capture, job.flame, job.principal_point)
     device, reason = choose_device(job.device)
     report(reason)
     report("Analyzing the capture")
     run = Run(capture.root, job.flame, job.principal_point, job.settings, device=device)
-    return with_effect_plan(run, capture, device), capture
+    return Prepared(with_effect_plan(run, capture, device), capture, _painted(folder, capture))
+
+
+def _painted(folder: Path, capture: Capture) -> dict[int, np.ndarray] | None:
+    """The selection that the job trains instead of what the rule selects."""
+    from ..training.run.checkpoint import read_selection
+
+    given = job_folder(folder)
+    return read_selection(given, len(capture.faces)) if (given / SELECTION).exists() else None
 
 
 class _Report:

@@ -6,7 +6,7 @@ besides the files of the worker's status folder
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,7 +15,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..errors import StgaError
-from ..files import read_json, write_json
+from ..files import check_writable, read_json, write_json
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..raster.render_protocol import pack_layers, receive, send, unpack_layers
 from ..worker.launch import prepare_status_folder
@@ -23,6 +23,8 @@ from ..worker.status import remove_status_folder, status_writer
 
 FORMAT, VERSION = "stga-video", 1
 VIDEO, IMAGES = "video.json", "images.bin"
+FIRST_IMAGE = "0001.png"
+"""Of a sequence, as `raster.video.sequence_writer` names it."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ class Recorder:
     """Writes the messages of a job's images; close it before the worker starts."""
 
     def __init__(self, folder: Path, job: VideoJob) -> None:
-        """Raises StgaError where the folder cannot be written."""
+        """Raises StgaError where the folder, or the job's output, cannot be written."""
+        check_writable(job.output if job.is_video else job.output / FIRST_IMAGE)
         prepare_status_folder(folder)
         write_json(
             folder / VIDEO,
@@ -61,7 +64,9 @@ class Recorder:
                 "background": job.background,
             },
         )
-        self._stream: BinaryIO = (folder / IMAGES).open("wb")
+        self._path = folder / IMAGES
+        with self._reported():
+            self._stream: BinaryIO = self._path.open("wb")
         self._before: Sequence[PosedSplats] = ()
 
     def add(self, layers: Sequence[PosedSplats], camera: Camera) -> None:
@@ -69,13 +74,20 @@ class Recorder:
         intrinsics = np.array([camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy])
         message = {"camera": intrinsics, "pose": camera.world_to_camera, **pack_layers(layers, self._before)}
         self._before = layers
-        try:
+        with self._reported():
             send(self._stream, message)
-        except OSError as error:
-            raise StgaError(f"{self._stream.name}: cannot be written ({error.strerror or error})") from error
 
     def close(self) -> None:
-        self._stream.close()
+        """Raises StgaError on a full disk, and closes all the same."""
+        with self._reported():
+            self._stream.close()
+
+    @contextmanager
+    def _reported(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise StgaError(f"{self._path}: cannot be written ({error.strerror or error})") from error
 
 
 def is_video_job(folder: Path) -> bool:
@@ -124,7 +136,8 @@ def run_video_job(folder: Path) -> None:
                         raise _Cancelled
         except _Cancelled:
             pass
-        (folder / IMAGES).unlink(missing_ok=True)
+        finally:
+            (folder / IMAGES).unlink(missing_ok=True)
 
 
 def finished(image: ComposedImage, background: tuple[float, float, float] | None, opaque: bool) -> np.ndarray:

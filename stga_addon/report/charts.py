@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..training.evaluate.forecast import curve_of
+from ..training.evaluate.forecast import DETAIL, curve_of
 
 if TYPE_CHECKING:  # imported when a chart is drawn: it takes half a second, and the command line starts without it
     from matplotlib.axes import Axes
@@ -16,8 +16,9 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 
 
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
-    """PSNR of one run in the whole image, the head mask and the moving region, with the latest forecast."""
-    figure, axes = psnr_axes("PSNR on held-out views")
+    """PSNR of one run in the whole image, the head mask and the moving region, with the latest forecast; and the detail
+    difference, by which the avatar is kept, on an axis of its own with the best at the top."""
+    figure, axes = psnr_axes("PSNR and detail difference on held-out views")
     for name, key in (("whole image", "psnr"), ("head mask", "psnr_mask"), ("moving region", "psnr_moving")):
         curve = curve_of(metrics, key)
         if curve:
@@ -28,6 +29,13 @@ def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
         error = np.array([0, ahead["error"]])
         (line,) = axes.plot(seconds, psnr, linestyle="--", label="forecast")
         axes.fill_between(seconds, psnr - error, psnr + error, color=line.get_color(), alpha=0.2, linewidth=0)
+    detail = np.array(curve_of(metrics, DETAIL)).reshape(-1, 2).T
+    if detail.size:
+        right = axes.twinx()
+        right.set(ylabel="detail difference (lower is better)", yscale="log")
+        right.plot(*detail, color=COLORS[-1], linestyle=":", marker=".")
+        right.invert_yaxis()
+        axes.plot([], [], color=COLORS[-1], linestyle=":", marker=".", label="detail difference")
     finish_axes(axes)
     return figure
 
@@ -47,6 +55,7 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
 def finish_axes(axes: "Axes") -> None:
     """Add the legend and cut off the steep start: the axis begins at the lowest value after a tenth of the time."""
     curves = [np.asarray(line.get_xydata()).T for line in axes.lines]
+    curves = [curve for curve in curves if curve.size]
     if not curves:
         return
     tenth = max(x[-1] for x, _ in curves) / 10

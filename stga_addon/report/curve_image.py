@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 from ..format import format_duration
-from ..training.evaluate.forecast import curve_of
+from ..training.evaluate.forecast import DETAIL, curve_of, detail_curve
 
 SIZE = 256
 """Width and height in pixels: Blender's icons are square."""
 MARGIN = 6.0
 LINE_WIDTH = 3.0
 BACKGROUND_COLOR, GRID_COLOR = (0.11, 0.11, 0.11), (0.25, 0.25, 0.25)
-CURVE_COLOR, FORECAST_COLOR = (0.34, 0.71, 0.91), (0.90, 0.62, 0.0)
+CURVE_COLOR, FORECAST_COLOR, DETAIL_COLOR = (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45)
 BAND_OPACITY = 0.35
 """Of the band that shows a forecast's error."""
 GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
@@ -23,11 +23,13 @@ MAX_GRID_STEPS = 6
 Color = tuple[float, float, float]
 
 
-def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | None:
+def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, str] | None:
     """Held-out PSNR over training time, with the last forecast and its error; None before two evaluations.
 
-    lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the bottom row first, and the axes' ranges
-    as text. The steep beginning is cut off: the vertical axis starts at the PSNR of a tenth of the time.
+    The detail difference, by which the avatar is kept, is drawn in green over the whole height, the best at the top.
+    lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the bottom row first, and as texts the
+    ranges of the axes and of the detail difference (empty if it was not measured). The steep beginning is cut off: the
+    vertical axis starts at the PSNR of a tenth of the time.
     """
     curve = curve_of(lines)
     if len(curve) < 2:
@@ -47,8 +49,22 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str] | 
         error = np.array([0.0, forecast["error"]])
         plot.band(x, y - error, y + error, FORECAST_COLOR)
         plot.line(x, y, FORECAST_COLOR)
+    detail_range = _draw_detail(plot, lines, (low, high))
     plot.line(seconds, psnr, CURVE_COLOR)
-    return plot.pixels, f"{low:g} to {high:g} dB, 0 to {format_duration(end)}"
+    return plot.pixels, f"{low:g} to {high:g} dB, 0 to {format_duration(end)}", detail_range
+
+
+def _draw_detail(plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]) -> str:
+    """Draw the detail difference, scaled to the height in dB from a tenth of the time on; returns its range as text."""
+    seconds, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
+    if len(detail) < 2:
+        return ""
+    lowest, highest = float(np.interp(seconds[-1] / 10, seconds, detail)), float(detail.max())
+    lowest = min(lowest, float(detail[-1]))
+    share = (detail - lowest) / max(highest - lowest, 1e-9)
+    plot.line(seconds, height[0] + share * (height[1] - height[0]), DETAIL_COLOR)
+    worst, best = 10 ** (-lowest / 20), min(value for _, value in curve_of(lines, DETAIL))
+    return f"Detail difference {worst:.3f} to {best:.3f} (green)"
 
 
 class _Plot:

@@ -11,7 +11,7 @@ from typing import Any
 from ..errors import StgaError
 from ..files import replacing
 from ..format import format_duration
-from ..training.evaluate.forecast import checked_forecasts, curve_of, explain_missed_target, plateau_start
+from ..training.evaluate.forecast import DETAIL, checked_forecasts, curve_of, explain_missed_target, flat_since
 from ..training.run.folder import read_run
 from ..training.run.metrics_log import METRICS, read_metrics
 from .charts import run_chart
@@ -52,7 +52,9 @@ def write_curve(folder: Path) -> None:
 def report_run(folder: Path) -> list[str]:
     """Write the curve of a finished run and return the lines of its summary."""
     write_curve(folder)
-    lines = summarize_run(read_metrics(folder), read_run(folder).settings.target_psnr)
+    run, metrics = read_run(folder), read_metrics(folder)
+    continued = run.continuation is not None
+    lines = summarize_continuation(metrics) if continued else summarize_run(metrics, run.settings.target_psnr)
     return lines if (folder / CURVE).exists() else [*lines, f"{CURVE} was not drawn: matplotlib is not installed"]
 
 
@@ -63,16 +65,17 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
-        best = min(evaluations, key=lambda line: line.get("detail_difference", math.inf))
+        best = min(evaluations, key=lambda line: line.get(DETAIL, math.inf))
         parts = [f"{best['psnr']:.2f} dB", f"SSIM {best['ssim']:.4f}"]
         named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
+        parts += [f"detail difference {best[DETAIL]:.4f}"] if DETAIL in best else []
         when = format_duration(best["seconds"])
         lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
     if target is not None and curve:
         reached = any(psnr >= target for _, psnr in curve)
         lines.append(f"{target:g} dB was reached" if reached else explain_missed_target(curve, target))
-    plateau = plateau_start(curve)
+    plateau = flat_since(metrics)
     if plateau is not None:
         since = format_duration(plateau)
         lines.append(f"nothing was gained after {since}: more time does not help with these settings")
@@ -81,6 +84,20 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
     lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}")
+    return lines
+
+
+def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines on the accuracy of the avatar before and after, by region and group of held-out views."""
+    if not metrics:
+        return []
+    first, last = metrics[0], metrics[-1]
+    lines = [f"splats: {first['splats']} before, {last['splats']} after"]
+    for name in first:
+        if name == "psnr" or name.startswith("psnr_"):
+            label = name.removeprefix("psnr").strip("_").replace("_", " ") or "held-out views"
+            before, after = first[name], last.get(name, math.nan)
+            lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")
     return lines
 
 

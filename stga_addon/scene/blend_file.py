@@ -13,6 +13,11 @@ def new_file() -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
+def empty_file() -> None:
+    """Start from an empty file; preferences and add-ons stay."""
+    bpy.ops.wm.read_homefile(use_empty=True)
+
+
 def save_file(path: Path) -> None:
     """Save the open file. Raises StgaError where it cannot be written."""
     try:

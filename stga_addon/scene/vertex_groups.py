@@ -8,6 +8,7 @@ those whose three corners all belong to selected ones.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import bmesh
 import numpy as np
 
 from ..errors import StgaError
@@ -34,10 +35,31 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
     for group in reversed(list(head.vertex_groups)):  # last first: removing a group renumbers those after it
         if tags.group_timestep(group.name) is not None:
             head.vertex_groups.remove(group)
-    for timestep in sorted(selection):
-        vertices = np.unique(faces[selection[timestep]])
-        if len(vertices):
-            head.vertex_groups.new(name=tags.group_name(timestep)).add(vertices.tolist(), 1.0, "REPLACE")
+    vertices = {timestep: np.unique(faces[selection[timestep]]) for timestep in sorted(selection)}
+    groups = {
+        head.vertex_groups.new(name=tags.group_name(each)).index: vertices[each]
+        for each in vertices
+        if len(vertices[each])
+    }
+    _fill_groups(head.data, groups)
+
+
+def _fill_groups(mesh: Any, groups: Mapping[int, np.ndarray]) -> None:
+    """Give the vertices of each group, by its index, a weight of 1.
+
+    For every vertex, `VertexGroup.add` looks for the group in the list of all: seconds for 1,000 groups.
+    """
+    whole = bmesh.new()
+    try:
+        whole.from_mesh(mesh, face_normals=False, vertex_normals=False)
+        layer = whole.verts.layers.deform.verify()
+        weights = [vertex[layer] for vertex in whole.verts]
+        for index, vertices in groups.items():
+            for vertex in vertices.tolist():
+                weights[vertex][index] = 1.0
+        whole.to_mesh(mesh)
+    finally:
+        whole.free()
 
 
 def read_selection(head: Any) -> dict[int, np.ndarray]:
@@ -70,6 +92,25 @@ def read_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
     """name -> (F,) bool of vertex groups of the head: the triangles whose corners all have a weight of 0.5 or more."""
     head.update_from_editmode()
     return dict(zip(names, _read_faces(head, [head.vertex_groups[name].index for name in names]), strict=True))
+
+
+def read_triangle_weights(head: Any, name: str) -> np.ndarray:
+    """(F,) float32 weight of each triangle in a vertex group: the least of its corners'."""
+    head.update_from_editmode()
+    index, weights = head.vertex_groups[name].index, np.zeros(len(head.data.vertices), np.float32)
+    for vertex in head.data.vertices:
+        for member in vertex.groups:
+            if member.group == index:
+                weights[vertex.index] = member.weight
+    return np.asarray(weights[mesh_triangles(head.data)].min(1))
+
+
+def selected_triangles(head: Any) -> np.ndarray:
+    """(F,) bool: the triangles that are selected in Edit Mode."""
+    head.update_from_editmode()
+    selected = np.zeros(len(head.data.polygons), bool)
+    head.data.polygons.foreach_get("select", selected)
+    return selected
 
 
 def frame_selection(head: Any, timestep: int) -> np.ndarray | None:

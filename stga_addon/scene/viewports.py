@@ -1,6 +1,7 @@
 """3D viewports: where they look when a head is imported."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import bpy
@@ -34,10 +35,10 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_location, region.view_distance = center, DISTANCE * radius
 
 
-def frame_demo(head: Any, scene: Any, frames_per_second: int) -> None:
+def frame_alone(head: Any, scene: Any, frames_per_second: int) -> None:
     """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head.
 
-    The world is white, as behind the images of the demo's capture.
+    The world is white, the background of captures without one of their own.
     """
     scene.render.fps = frames_per_second
     scene.world = bpy.data.worlds.new("World")
@@ -45,6 +46,23 @@ def frame_demo(head: Any, scene: Any, frames_per_second: int) -> None:
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, scene.view_layers[0], False)
     frame_head(head, scene.camera, bpy.data.screens)
+
+
+def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
+    """Open the sidebar of the 3D viewports at a tab; whether they show it.
+
+    Blender knows a sidebar's tabs only once it was drawn: call it again until it returns True.
+    """
+    is_shown = True
+    for screen in screens:
+        for area in screen.areas:
+            if area.type == "VIEW_3D":
+                area.spaces.active.show_region_ui = True
+                sidebar = next(region for region in area.regions if region.type == "UI")
+                with suppress(AttributeError, TypeError):  # not drawn yet
+                    sidebar.active_panel_category = tab
+                is_shown &= sidebar.active_panel_category == tab
+    return is_shown
 
 
 def _bounds(vertices: Any) -> tuple[Any, Any]:

@@ -1,6 +1,7 @@
 """Face landmark detectors: MediaPipe's face mesh with its own network or with a .task file."""
 
 import os
+import sys
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -65,7 +66,9 @@ def make_detector(task: Path | None = None) -> Detector:
         import mediapipe
     except ImportError as error:
         raise StgaError(
-            "landmarks need the Python package mediapipe (pip install mediapipe==0.10.21), or files with --landmarks"
+            f"landmarks need the Python package mediapipe, which {sys.executable} (Python "
+            f"{sys.version_info[0]}.{sys.version_info[1]}) lacks: make an environment with `stga environment make "
+            "--tracking`, run `pip install mediapipe==0.10.21` (Python 3.11 or 3.12), or give files with --landmarks"
         ) from error
     if task is not None:
         try:
@@ -75,7 +78,7 @@ def make_detector(task: Path | None = None) -> Detector:
     if not hasattr(mediapipe, "solutions"):
         raise StgaError(
             f"mediapipe {mediapipe.__version__} has no network in its wheel; "
-            "give Google's face_landmarker.task with --detector, or install mediapipe==0.10.21"
+            "give Google's face_landmarker.task with --detector, or install mediapipe==0.10.21 (Python 3.11 or 3.12)"
         )
     return FaceMesh(mediapipe.solutions)
 

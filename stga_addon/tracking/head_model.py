@@ -1,5 +1,6 @@
-"""Head models that can be tracked: FLAME, or any linear model in an npz."""
+"""Head models that can be tracked: FLAME, any linear model in an npz, or a GLB with morph targets."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,9 +8,12 @@ import numpy as np
 
 from ..capture.flame_capture import flame_model
 from ..errors import StgaError
-from ..files import read_npz
+from ..files import read_npz, write_npz
 from ..flame.model import JOINTS, POSE_FEATURES, FlameModel
+from .glb import read_glb
 
+IDENTITY_PREFIX = "identity"
+"""Begins the names of shapes that make another person; all others are expressions."""
 LINEAR_KEYS = ("mean", "faces")
 MIN_EXTENT_M, MAX_EXTENT_M = 0.1, 2.0
 """Extent of a head model along its longest axis; outside of it, the file is in other units."""
@@ -36,17 +40,42 @@ class HeadModel:
 
 
 def read_head_model(path: Path) -> HeadModel:
-    """Read a FLAME model (.pkl or .npz), or a linear model from an .npz.
+    """Read a FLAME model (.pkl or .npz), a linear model from an .npz, or morph targets from a .glb (`shape_arrays`).
 
     A linear model has `mean` (V, 3) meters and `faces` (F, 3), and optionally `identity` (V, 3, I), `expression`
     (V, 3, E), and `J_regressor` (5, V) with `weights` (V, 5) for the joints root, neck, jaw, left and right eye.
     Components are scaled so that a coefficient is of the order of 1. Raises StgaError naming the file and the field.
     """
+    if path.suffix.lower() == ".glb":
+        mesh = read_glb(path)
+        arrays = shape_arrays(mesh.positions, mesh.faces, mesh.names, mesh.targets)
+        return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
     if path.suffix.lower() == ".npz":
         arrays = read_npz(path)
         if "mean" in arrays:
             return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
     return checked(path, HeadModel(flame_model(path), "flame"))
+
+
+def shape_arrays(
+    mean: np.ndarray, faces: np.ndarray, names: Sequence[str], shapes: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The arrays of a linear model from K named displacements: mean (V, 3), faces (F, 3), shapes (V, 3, K)."""
+    identity = np.array([name.lower().startswith(IDENTITY_PREFIX) for name in names], bool)
+    return {
+        "mean": mean,
+        "faces": faces.astype(np.int32),
+        "identity": shapes[:, :, identity],
+        "expression": shapes[:, :, ~identity],
+    }
+
+
+def write_linear_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write a linear model as an npz. Raises StgaError where it is none that `read_head_model` would take."""
+    checked(path, HeadModel(linear_model(path, arrays), "mesh"))
+    write_npz(
+        path, {name: array.astype(np.float32) if array.dtype.kind == "f" else array for name, array in arrays.items()}
+    )
 
 
 def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:

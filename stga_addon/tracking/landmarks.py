@@ -11,10 +11,10 @@ import numpy as np
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .detectors import Detector
+from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .posed_points import SurfacePoints
 
-PLACES_FILE = "head_model.npz"
 MIN_BARYCENTRIC = -1e-3
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""
@@ -35,8 +35,9 @@ class CameraLandmarks:
 
 
 def landmark_file(folder: Path, camera: str) -> Path:
-    """The file of a camera; characters that file names cannot have become `_`."""
-    return folder / (re.sub(r"[^\w.-]", "_", camera) + ".npz")
+    """The file of a camera; characters that not all file systems allow are percent-encoded, as in `walk%2F1.npz`."""
+    name = re.sub(r"[^\w.-]", lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), camera) + ".npz"
+    return folder / (name if name != PLACES_FILE else name.replace("h", "%68", 1))
 
 
 def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report: Report) -> dict[str, CameraLandmarks]:
@@ -126,6 +127,15 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
 
 def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
     write_npz(path, {"face": np.where(used, places.face, -1), "barycentric": places.barycentric})
+
+
+def write_landmarks(
+    folder: Path, found: Mapping[str, CameraLandmarks], places: SurfacePoints, used: np.ndarray
+) -> None:
+    """Write all files that `read_landmarks` and `read_places` read."""
+    for name, camera in found.items():
+        write_camera(landmark_file(folder, name), camera)
+    write_places(folder / PLACES_FILE, places, used)
 
 
 def timesteps_with_landmarks(found: Mapping[str, CameraLandmarks]) -> set[int]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..capture.camera import Camera
-from .mesh_image import rasterize
+from ..capture.mesh_raster import rasterize
 
 PATCH_SAMPLES = 9
 """Samples along each side of a patch."""

@@ -16,23 +16,23 @@ from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
 from .fit import HeadFit, TimestepLandmarks, fit_head
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
 from .footage.model import Footage, FootageCamera
 from .head_model import read_head_model
 from .landmarks import (
-    PLACES_FILE,
     CameraLandmarks,
     Report,
     detect_landmarks,
     read_landmarks,
     read_places,
     timesteps_with_landmarks,
+    write_landmarks,
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
 from .surface import Take, fit_surface
-from .write_capture import SPLIT_FILES, posed_mesh, write_capture
+from .write_capture import posed_mesh, write_capture
 
-REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER = "tracking.json", "contact_sheet.png", "landmarks"
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the others, and by this share
 of the face's size."""
@@ -73,7 +73,7 @@ def track(
     What was detected is kept in OUT/landmarks: called again after an interruption, those cameras are not detected
     again. The capture's world is in meters, y up, with the head near its origin. Raises StgaError.
     """
-    if any((out / name).exists() for name in (*SPLIT_FILES, "transforms.json")):
+    if is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
@@ -115,6 +115,8 @@ def track(
         fit.head.model.faces,
         result.reprojection_px,
     )
+    if landmarks is not None:  # what a correction of the capture starts from
+        write_landmarks(out / LANDMARKS_FOLDER, found, places, reliable)
     write_capture(out, footage, fit, parameters, meshes, report)
     return result
 

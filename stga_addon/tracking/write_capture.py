@@ -13,12 +13,12 @@ from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
 from ..files import replacing, write_json, write_npz
 from ..flame.forward import FlameFrame, flame_forward
 from .fit import HeadFit
+from .folder import SPLIT_FILES
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 from .posed_points import RIGID_SIZE
 
 MIN_CAMERAS_TO_HOLD_OUT = 4
-SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 
 
 def write_capture(
@@ -40,7 +40,7 @@ def write_capture(
         frames["val" if camera.name == held_out else "train"].append(entry)
         report("Images", number + 1, len(views))
     top = _write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)
-    for name, entries in zip(SPLIT_FILES, frames.values(), strict=True):
+    for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):  # train last: see is_written
         write_json(out / name, {**top, "frames": entries})
 
 

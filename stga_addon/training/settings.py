@@ -14,10 +14,12 @@ from .effect_plan import CHOICES, EFFECTS
 from .schema import MAX_COUNT, build, complaint, setting, validate_fields
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
+CONTINUATIONS = ("refine", "extend")
+"""Strategies of runs that continue a finished one (`run.continuation`)."""
 SCHEDULES = ("default", "paper")
 GLOBAL_UNITS = ("iteration", "frame")
-DEVICES = ("auto", "cpu", "cuda", "warp-cpu")
-"""Choices of `choose_device`. Not part of the settings: a run may be continued on another device."""
+DEVICES = ("auto", "cpu", "gpu")
+"""Choices of `choose_device`, beside "gpu:NAME". Not part of the settings: a run may be continued on another device."""
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
 MAX_RATE = 1e3
@@ -49,7 +51,7 @@ class TrainingSettings:
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
                    ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training
-                   with that method's binding, losses and rates
+                   with that method's binding, losses and rates; "refine" and "extend" continue a finished run
     schedule       "paper": with `PAPER_SETTINGS` instead of the defaults
     seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two
     seed           fixes the order of views and every random choice
@@ -82,7 +84,7 @@ class TrainingSettings:
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
                    `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
-    stop_when_flat  stop when more time no longer helps (`forecast.plateau_start`)
+    stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
@@ -94,7 +96,7 @@ class TrainingSettings:
                    (`effects.plan`). None: these settings are final
     """
 
-    strategy: str = setting("global", choices=STRATEGIES)
+    strategy: str = setting("global", choices=(*STRATEGIES, *CONTINUATIONS))
     schedule: str = setting("default", choices=SCHEDULES)
     seconds: float | None = setting(None, above=0)
     iterations: int | None = setting(None, 1, MAX_COUNT)
@@ -235,6 +237,11 @@ def validate(settings: TrainingSettings) -> None:
     if effects and (settings.schedule == "paper" or settings.strategy == "gaussian-avatars"):
         other = "--schedule paper" if settings.schedule == "paper" else "--strategy gaussian-avatars"
         raise StgaError(f"--effect cannot be combined with {other}")
+
+
+def is_device(value: Any) -> bool:
+    """Whether a value is one of DEVICES or "gpu:" and a name."""
+    return isinstance(value, str) and (value in DEVICES or (4 < len(value) < 256 and value.startswith("gpu:")))
 
 
 def to_json(settings: TrainingSettings) -> dict[str, Any]:

@@ -14,7 +14,20 @@ REQUIREMENTS = {
     "av": "av>=14,<19",
 }
 """Imported module -> requirement as pip reads it."""
-GPU_REQUIREMENT = "warp-lang>=1.19,<2"
+TRACKING_REQUIREMENTS = (
+    "numpy>=1.26,<2; python_version < '3.13'",
+    "opencv-python-headless>=4.9,<5",
+    "absl-py>=2.3,<3",
+    "flatbuffers>=25.9,<26",
+    "attrs>=23,<27; python_version < '3.13'",
+    "protobuf>=4.25.3,<5; python_version < '3.13'",
+)
+"""What tracking needs besides: OpenCV for distorted lenses, and what the landmark detector imports."""
+DETECTOR_REQUIREMENTS = ("mediapipe==0.10.21; python_version < '3.13'", "mediapipe>=1,<2; python_version >= '3.13'")
+"""Installed without dependencies: most of what MediaPipe lists, 600 MB, it imports for other tasks only. 0.10.21 is the
+last version with the network in its wheel; newer ones need the user's `face_landmarker.task`."""
+GPU_REQUIREMENT = "wgpu>=0.32,<1"
+"""Trains on a GPU; without it, or where it has no driver, the CPU trains."""
 
 
 def package_name(requirement: str) -> str:

@@ -10,14 +10,18 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
+from tracking.test_track import record  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
+from stga_addon.tracking.head_model import HeadModel  # noqa: E402
+from stga_addon.tracking.mesh_image import shaded_image  # noqa: E402
 
 
 @pytest.fixture
@@ -175,7 +179,7 @@ def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_p
     place = tmp_path / "environment"
     for module in (operators, extension.operators.command_line):
         monkeypatch.setattr(module, "environment_folder", lambda create=False: place)
-    monkeypatch.setattr(worker, "check_python", lambda python: "good")
+    monkeypatch.setattr(worker, "check_python", lambda python, folder: "good")
     assert stga("environment", "use", sys.executable) == 0
     assert capsys.readouterr().out == f"{sys.executable}: good\n"
     assert operators.training_python(bpy.context) == sys.executable
@@ -189,3 +193,19 @@ def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_p
     if not bpy.app.online_access:
         assert stga("environment", "make") == 2
         assert "start it with --online-mode, or give a folder of --wheels" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_an_avatar_from_footage(stga, bare, tmp_path, capfd):
+    """Catches a .blend file that is missing because the training environment has no Blender, or one without links."""
+    head = HeadModel(synthetic_flame(0), "flame")
+    record(tmp_path, head, lambda mesh, camera: shaded_image(mesh, head.model.faces, camera))
+    given = [tmp_path / "footage", "--model", tmp_path / "head.npz", "--landmarks", tmp_path / "points"]
+    more = ["--iterations", "4", "--effect", "tracking=on"]
+    bare()
+    assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0
+    assert capfd.readouterr().out.splitlines()[-1] == f"blender: {tmp_path / 'out/avatar.blend'}"
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out/avatar.blend"))
+    (splats,) = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
+    assert splats["stga_avatar"] == "//run/avatar.npz"
+    assert any("tracking" in action.name for action in bpy.data.actions)  # the refined motion

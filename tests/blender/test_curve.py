@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stga_addon.report.curve_image import CURVE_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
+from stga_addon.report.curve_image import CURVE_COLOR, DETAIL_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
@@ -27,7 +27,8 @@ def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
 
 def test_curve_agrees_with_its_axes():
     """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not after the curve."""
-    pixels, axes = curve_image(lines())
+    pixels, axes, detail = curve_image(lines())
+    assert detail == ""
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
     inner = SIZE - 2 * MARGIN
     for second, color in [(second, CURVE_COLOR) for second in (15, 30, 50, 75)] + [(90, FORECAST_COLOR)]:
@@ -44,9 +45,20 @@ def test_short_and_constant_curves():
     assert curve_image([]) is None
     assert curve_image(lines(1, forecast=False)) is None
     flat = [{"iteration": row, "seconds": 1.0 + row, "psnr": 30.0} for row in range(3)]
-    pixels, axes = curve_image(flat)
+    pixels, axes, _ = curve_image(flat)
     assert np.isfinite(pixels).all()
     assert axes == "30 to 30.1 dB, 0 to 3 s"
+
+
+def test_detail_difference_is_drawn_with_the_best_at_the_top():
+    """Catches the measure by which the avatar is kept left out, upside down, or with another range than its text."""
+    measured = [{**line, "detail_difference": 0.08 - 0.01 * row} for row, line in enumerate(lines(forecast=False))]
+    pixels, _, text = curve_image(measured)
+    worst, best = map(float, re.fullmatch(r"Detail difference (\S+) to (\S+) \(green\)", text).groups())
+    assert (worst, best) == (0.072, 0.03)  # a tenth of the time is 8 s
+    rows, columns = np.nonzero(np.abs(pixels[..., :3] - np.array(DETAIL_COLOR)).sum(-1) < 0.05)
+    assert rows[columns > columns.max() - 5].mean() > rows[columns < columns.mean()].mean() + 30
+    assert rows.max() > SIZE - 2 * MARGIN
 
 
 def test_preview_follows_the_evaluations(extension, tmp_path):

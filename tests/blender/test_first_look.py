@@ -10,9 +10,9 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 from mathutils import Vector  # noqa: E402
 
 from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS, QUADS  # noqa: E402
+from stga_addon.scene.display.display_modes import AS_TRAINED, ELLIPSOIDS, LIMITS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
-from stga_addon.scene.display.splat_object import set_input  # noqa: E402
+from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier  # noqa: E402
 from stga_addon.scene.objects import layers_of  # noqa: E402
 from stga_addon.scene.viewports import frame_head  # noqa: E402
 
@@ -84,3 +84,24 @@ def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
     assert images[QUADS][..., :3].max() > 50
     np.testing.assert_array_equal(images[AS_TRAINED], images[QUADS])
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
+
+
+def test_preview_for_other_engines(extension, tmp_path):
+    """Catches quads that face no camera, black holes in Cycles, and displays without a word on their limits."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene = bpy.context.scene
+    shown, scene.render.engine, scene.cycles.transparent_max_bounces = scene.stga.splats, "CYCLES", 8
+    assert bpy.ops.stga.preview_images() == {"FINISHED"}
+    assert (display_mode(shown), scene.cycles.transparent_max_bounces) == (QUADS, 64)
+    with pytest.raises(RuntimeError, match="displayed as trained"):
+        bpy.ops.stga.preview_images()
+    set_input(shown, DISPLAY, AS_TRAINED)
+    scene.camera = None
+    assert bpy.ops.stga.preview_images() == {"FINISHED"}
+    assert display_mode(shown) == ELLIPSOIDS
+    tree = splat_modifier(shown).node_group
+    menu = next(node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch")
+    described = {item.name: item.description for item in menu.enum_definition.enum_items}
+    assert described == {name: LIMITS[name] for name in described}

@@ -71,6 +71,7 @@ def test_drawing_order(distance, spread):
     order = drawing_order(static, posed_frames([layer], [frame_block(WORLD)], view), view).astype(int)
     depth = distance - xyz[:, 2].astype(np.float64)
     assert sorted(order) == sorted(np.flatnonzero(depth >= view.near))
+    assert order[0] == depth.argmax(), "the largest sort key overflows"
     wrong = np.diff(depth[order]).max()
     assert wrong <= max(1e-4 * depth[order].min(), 1e-6 * np.abs(depth).max())
 

@@ -32,6 +32,10 @@ class Layout:
     def prop(self, owner, name, **_):
         assert name.startswith("[") or hasattr(owner, name)
 
+    def prop_search(self, owner, name, other, collection, **_):
+        assert hasattr(owner, name)
+        assert hasattr(other, collection)
+
     def progress(self, factor, text):
         self.texts.append(text)
 
@@ -83,7 +87,9 @@ def draw(extension) -> list[str]:
         scene=bpy.context.scene,
         region=SimpleNamespace(width=10_000),
         preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0), addons=bpy.context.preferences.addons),
-        space_data=SimpleNamespace(shading=SimpleNamespace(type="SOLID")),
+        space_data=SimpleNamespace(
+            shading=SimpleNamespace(type="SOLID"), region_3d=SimpleNamespace(view_perspective="PERSP")
+        ),
         view_layer=bpy.context.view_layer,
         screen=SimpleNamespace(is_animation_playing=False),
     )

@@ -1,5 +1,9 @@
 """Render Video in background mode: the worker's images are those of the render engine."""
 
+import errno
+import os
+import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,9 +34,17 @@ def shown(extension, tmp_path):
     render = bpy.context.scene.render
     render.resolution_percentage, render.fps, render.film_transparent = 200, 10, True
     bpy.context.scene.frame_set(1)
-    yield tmp_path
-    if bpy.ops.stga.dismiss_video.poll():
-        bpy.ops.stga.dismiss_video()
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path, monkeypatch):
+    """The folder of temporary files; whatever happens, nothing is left in it."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield folder
+    assert not list(folder.glob("stga_video_*"))
 
 
 def engine_image(frame: int, path: Path) -> np.ndarray:
@@ -92,7 +104,6 @@ def test_turntable_of_a_ply(extension, tmp_path):
     assert len(images) == 12
     shown = [(image[..., :3].max(2) > image[0, 0, :3].max() + 20).mean() for image in images]
     assert min(shown) > 0.5 * max(shown) > 0
-    bpy.ops.stga.dismiss_video()
 
 
 def test_a_head_that_is_gone(shown):
@@ -101,3 +112,43 @@ def test_a_head_that_is_gone(shown):
     with pytest.raises(RuntimeError, match="has no head to follow"):
         bpy.ops.stga.render_video(filepath=str(shown / "turn"), path="scene")
     assert not bpy.ops.stga.cancel_video.poll()
+
+
+def test_an_output_that_cannot_be_written(shown):
+    """Catches a path that is refused only after everything was recorded and rendered."""
+    (shown / "file").write_text("")
+    with pytest.raises(RuntimeError, match="cannot be written"):
+        bpy.ops.stga.render_video(filepath=str(shown / "file/turn.mp4"))
+    assert not bpy.ops.stga.dismiss_video.poll()
+
+
+def test_a_full_disk(shown, monkeypatch):
+    """Catches a traceback, and a recording that keeps filling the disk after it failed."""
+    operator = sys.modules["stga_checkout.operators.render_video"]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(sys.modules[operator.Recorder.__module__], "send", full)
+    with pytest.raises(RuntimeError, match="No space left on device"):
+        bpy.ops.stga.render_video(filepath=str(shown / "turn"))
+    assert bpy.context.scene.frame_current == 1
+    assert not bpy.ops.stga.dismiss_video.poll()
+
+
+def test_an_interpreter_that_does_not_start(shown, monkeypatch):
+    """Catches a job that is left behind where its worker cannot be started."""
+    operator = sys.modules["stga_checkout.operators.render_video"]
+    monkeypatch.setattr(operator, "training_python", lambda _: str(shown / "no python"))
+    with pytest.raises(RuntimeError, match="cannot be started"):
+        bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=0.1)
+
+
+def test_finished_jobs_end_with_the_add_on(shown, temporary):
+    """Catches temporary folders of videos that nobody dismissed."""
+    operator = sys.modules["stga_checkout.operators.render_video"]
+    folder = temporary / "stga_video_kept"
+    operator.Recorder(folder, operator.VideoJob(shown / "turn.mp4", 1, 25.0, None)).close()
+    operator._videos[bpy.context.scene.session_uid] = operator.Video(shown / "turn.mp4", folder, 1, 1)
+    operator.unregister()
+    assert not folder.exists()

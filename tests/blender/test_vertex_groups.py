@@ -7,6 +7,7 @@ bpy = pytest.importorskip("bpy")
 
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
 from stga_addon.scene.vertex_groups import read_selection, write_selection  # noqa: E402
 
@@ -63,6 +64,31 @@ def test_new_selection_replaces_only_selection_groups(tmp_path):
     read = read_selection(head)
     assert not read[1].any()
     assert read[2].sum() == 4
+
+
+def test_the_rest_of_the_head_stays(tmp_path):
+    """Fails when writing weights moves vertices or shape keys, turns triangles, or drops what is stored on them."""
+    sequence = flame_sequence(flame_model(), timesteps=(1, 2))
+    head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
+    mesh = head.data
+    keys = mesh.shape_keys.key_blocks
+    head.active_shape_key_index = len(keys) - 1
+    keys[-1].value = 0.5
+    own = mesh.attributes.new("own", "FLOAT", "CORNER")
+    own.data.foreach_set("value", np.arange(len(mesh.loops), dtype=np.float32))
+    write_selection(head, {1: np.ones(len(mesh.polygons), bool)})
+
+    def state() -> dict[str, np.ndarray]:
+        found = {key.name: read_values(key.data, "co", 3) for key in keys}
+        found |= {"": read_values(mesh.vertices, "co", 3), "shown": evaluated_vertices(head)}
+        found["edges"] = read_values(mesh.edges, "vertices", 2, np.int32)
+        return found | {"own": read_values(mesh.attributes["own"].data, "value", 1), "faces": mesh_triangles(mesh)}
+
+    before = state()
+    write_selection(head, {2: np.arange(len(mesh.polygons)) < 4})
+    after = state()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert head.active_shape_key_index == len(keys) - 1
 
 
 def test_weights_of_one_half_and_more_select(capture, head):

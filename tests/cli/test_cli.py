@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -258,11 +259,15 @@ def test_export_refuses_what_does_not_fit(
     assert "--timestep cannot be combined with --format usd" in message
     message = refused(capsys, "export", trained, "--format", "ply", "--motion-only", *out)
     assert "--motion-only cannot be combined with --format ply, only with web" in message
+    message = refused(capsys, "export", trained, "--format", "spz", "--fps", "30", *out)
+    assert "--fps cannot be combined with --format spz, only with usd, web" in message
+    message = refused(capsys, "export", trained, "--format", "usd", "--out", tmp_path / "o.usda")
+    assert "o.usda: expected a name that ends in .usdc or .usdz" in message
     message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)
     assert "has no timestep from 7 to 9" in message
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
-    message = refused(capsys, "export", trained, "--format", "ply-sequence", *out)
-    assert "1.0 kB are free there" in message
+    for words in (["ply-sequence", *out], ["web", "--out", tmp_path / "o.html"]):
+        assert "1.0 kB are free there" in refused(capsys, "export", trained, "--format", *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -283,7 +288,7 @@ def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.C
 
 WITHOUT_TORCH = """
 import sys
-sys.modules.update(dict.fromkeys(("torch", "numba", "warp")))  # importing one of them fails
+sys.modules.update(dict.fromkeys(("torch", "numba", "wgpu")))  # importing one of them fails
 from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -349,7 +354,7 @@ def test_an_avatar_without_capture(
     assert "give --capture" in message
     message = refused(capsys, "export", avatar, "--format", "ply-sequence", "--out", tmp_path / "o")
     assert "give --capture" in message
-    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o")
+    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o.ply")
     assert "give --capture" in message
     assert not (tmp_path / "o").exists()
 
@@ -485,7 +490,8 @@ def commands_of(parser: argparse.ArgumentParser) -> set[str]:
 
 def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that the parser lost, and an extension without `development` whose parser needs it."""
-    shipped = {"train", "presets", "render", "eval", "select", "export", "info", "job", "environment", "track"}
+    shipped = {"train", "refine", "presets", "render", "eval", "select", "export", "info", "job", "environment"}
+    shipped |= {"extend", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
     assert commands_of(make_parser()) == shipped
@@ -493,7 +499,7 @@ def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 WITH_NUMPY_ALONE = """
 import sys
-missing = ("torch", "numba", "warp", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
+missing = ("torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
 sys.modules.update(dict.fromkeys(missing))  # importing one of them fails
 from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))
@@ -584,3 +590,38 @@ def test_damaged_folder_of_the_open_head(tmp_path: Path, content: str | None) ->
     assert done.stderr.startswith("stga: ")
     assert "head.json" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a refinement that is put into the run's own folder, one that cannot be evaluated or refined again, and
+    one that says nothing about what it gained."""
+    runs = Path(shutil.copytree(trained, tmp_path / "anna"))
+    assert main(["refine", str(runs), "--region", "mouth", "--frames", "1-3", "--iterations", "6"]) == 0
+    printed = capsys.readouterr().out
+    assert "region: " in printed
+    assert f"avatar: {tmp_path / 'anna_2' / 'avatar.npz'}" in printed
+    assert main(["refine", str(tmp_path / "anna_2"), "--region", "mouth", "--iterations", "3", "--growth", "0.5"]) == 0
+    assert read_checkpoint(tmp_path / "anna_3").iteration == 3
+    assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
+    assert main(["eval", str(tmp_path / "anna_3")]) == 0
+    assert "--region: is missing" in refused(capsys, "refine", runs)
+    assert "already holds a run" in refused(capsys, "refine", runs, "--region", "mouth", "--out", tmp_path / "anna_2")
+    assert "does not continue another run" in refused(capsys, "refine", runs, "--resume")
+    assert "neither a region of the capture" in refused(capsys, "refine", runs, "--region", "chin")
+    assert not (tmp_path / "anna_4").exists()
+
+
+def test_extend(trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an extended run that cannot be evaluated, rendered or extended again, and one that does not say what it
+    learned and forgot."""
+    runs, take = Path(shutil.copytree(trained, tmp_path / "anna")), Path(shutil.copytree(root, tmp_path / "smile"))
+    assert main(["extend", str(runs), str(take), "--iterations", "6"]) == 0
+    printed = capsys.readouterr().out
+    assert "take 1: " in printed
+    assert "take 2: " in printed
+    out = tmp_path / "anna_2"
+    assert main(["eval", str(out)]) == 0
+    assert main(["refine", str(out), "--region", "mouth", "--iterations", "3"]) == 0
+    assert main(["extend", str(out), "--resume"]) == 0
+    assert "CAPTURE: is missing" in refused(capsys, "extend", runs)
+    assert "is a take of this run already" in refused(capsys, "extend", out, take)

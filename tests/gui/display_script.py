@@ -26,9 +26,11 @@ sys.path.append(str(FOLDER / "packages"))
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
-from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
+from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
 from stga_addon.scene.gpu import viewport_display  # noqa: E402
+from stga_addon.scene.gpu.renderer import SplatRenderer  # noqa: E402
 from stga_addon.scene.gpu.viewport_display import display, region_view  # noqa: E402
 from stga_addon.scene.render import engine  # noqa: E402
 
@@ -147,6 +149,56 @@ def parts_of_the_view(area: Any) -> None:
     view.use_clip_planes = False
 
 
+def textures() -> list[Any]:
+    """What the display holds on the GPU, besides shaders."""
+    renderer = display._renderer
+    return [*renderer._static_textures.values(), renderer._color, renderer._depth]
+
+
+def freed(held: list[Any]) -> bool:
+    """Whether nobody else holds any of the textures: Blender frees one with its Python object."""
+    return all(sys.getrefcount(held[index]) == 2 for index in range(len(held)))
+
+
+def pictures_per_redraw() -> int:
+    """How often one redraw of the only viewport draws: more than once where a handler was left behind."""
+    count, draw = 0, SplatRenderer.draw
+
+    def counted(*arguments: Any) -> None:
+        nonlocal count
+        count += 1
+        draw(*arguments)
+
+    SplatRenderer.draw = counted  # type: ignore[method-assign]
+    redraw(1)
+    SplatRenderer.draw = draw  # type: ignore[method-assign]
+    return count
+
+
+def memory(shown: Any) -> None:
+    """Textures while the display is off, and while its only object is gone; then undo brings that back."""
+    seen["drawn"] = [pictures_per_redraw()]
+    held = textures()
+    seen["freed"] = {"while drawn": freed(held)}
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
+    redraw()
+    seen["freed"]["off"] = freed(held)
+    set_input(shown, splat_nodes.DISPLAY, AS_TRAINED)
+    redraw()
+    held = textures()
+    name = shown.name
+    with bpy.context.temp_override(window=viewport()[0]):
+        bpy.ops.ed.undo_push(message="shown")
+        bpy.data.objects.remove(shown)
+        bpy.ops.ed.undo_push(message="removed")
+        redraw()
+        seen["freed"]["removed"] = freed(held)
+        bpy.ops.ed.undo()
+    seen["undone"] = name in bpy.data.objects
+    seen["drawn"].append(pictures_per_redraw())
+    picture("after undo")
+
+
 def failure() -> None:
     """An error while drawing: reported once, the handler removed, points shown."""
 
@@ -161,16 +213,30 @@ def failure() -> None:
     seen["failed"] = display.failed, display._handler is None, display.problem
 
 
-def after_failure(shown: Any) -> None:
+def after_failure() -> Any:
+    """Off and on again; returns the textures that are held before another file is opened."""
+    shown = bpy.data.objects["head splats"]
     seen["fallback"] = display_mode(shown)
     viewport_display.unregister()
-    seen["unregistered"] = display._handler is None, display._renderer is None
     viewport_display.register()
+    set_input(shown, splat_nodes.DISPLAY, AS_TRAINED)
+    seen["drawn"].append(pictures_per_redraw())
+    held = textures()
+    viewport_display.unregister()
+    seen["freed"]["disabled"] = freed(held)
+    seen["unregistered"] = display._handler is None, display._renderer is None
+    seen["drawn without"] = pictures_per_redraw()
+    viewport_display.register()
+    redraw()
+    held = textures()
     bpy.ops.wm.read_homefile(use_empty=True)
+    seen["freed"]["loaded"] = freed(held)
 
 
 def after_load() -> None:
     seen["after load"] = display._handler is not None, display._renderer is None, display.problem
+    set_up()
+    seen["drawn"].append(pictures_per_redraw())
 
 
 def finish() -> None:
@@ -195,6 +261,7 @@ def steps() -> Any:
     shown = set_up()
     yield
     pictures(shown)
+    memory(shown)
     in_viewport(bpy.ops.screen.region_quadview)
     yield  # regions get their places between two steps
     picture("four views")
@@ -203,7 +270,7 @@ def steps() -> Any:
     failure()
     yield
     yield
-    after_failure(shown)
+    after_failure()
     yield
     after_load()
 

@@ -19,6 +19,8 @@ from mathutils import Vector
 
 PART, RESULT, CAPTURE, BLEND, PYTHON = sys.argv[sys.argv.index("--") + 1 :]
 STEP_S, PATIENCE_S = 0.1, 180.0
+WORKER_PATIENCE_S = 1200.0
+"""While a worker is alive: compiling kernels for the first time takes a minute, and far longer on a busy machine."""
 seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
@@ -57,6 +59,14 @@ def figures() -> dict[str, float]:
 
 def is_training() -> bool:
     return state() == "working" and figures().get("iteration", 0) > 0
+
+
+def has_worker() -> bool:
+    """Whether a run, the test of the environment or a video has a worker that is alive."""
+    video = render_video.video_of(bpy.context.scene)
+    folders = [*Path(BLEND).parent.glob("*/job"), status_folder(environment_folder())]
+    folders += [] if video is None else [video.folder]
+    return any(monitor.inspect_status(folder).state.is_alive for folder in folders)
 
 
 def splats() -> int:
@@ -195,7 +205,7 @@ class Player:
         try:
             if self.until():
                 self.until, self.since = next(self.part), time.monotonic()
-            elif time.monotonic() - self.since > PATIENCE_S:
+            elif time.monotonic() - self.since > (WORKER_PATIENCE_S if has_worker() else PATIENCE_S):
                 raise TimeoutError(f"waited in vain: {state()}, {figures()}, {sorted(seen)}")
             return STEP_S
         except StopIteration:

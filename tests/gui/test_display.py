@@ -34,21 +34,32 @@ BEHIND = linear_to_srgb(np.array([0.2, 0.3, 0.4]))
 BLACK = np.zeros(3)
 
 
-@pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder with the pictures, and what display_script.py saw."""
+PROBE = "import bpy, gpu, os; print('BACKEND', gpu.platform.backend_type_get(), flush=True); os._exit(0)"
+
+
+def has_vulkan() -> bool:
+    """Whether Blender starts with Vulkan and does not fall back to OpenGL."""
+    command = [*BLENDER, "--factory-startup", "--gpu-backend", "vulkan", "--python-expr", PROBE]
+    return "BACKEND VULKAN" in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
+
+
+@pytest.fixture(scope="module", params=["opengl", "vulkan"])
+def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder with the pictures, and what display_script.py saw, by each of Blender's GPU backends."""
+    backend = request.param
+    if backend == "vulkan" and not has_vulkan():
+        pytest.skip("Blender does not start with Vulkan here: too old, or no driver")
     folder = tmp_path_factory.mktemp("display")
     write_avatar(folder / "avatar.npz", avatar(3))
     shutil.copytree(Path(filelock.__file__).parent, folder / "packages/filelock")
-    backend = os.environ.get("STGA_GPU_BACKEND")
-    arguments = ["--factory-startup", *(["--gpu-backend", backend] if backend else [])]
     script = Path(__file__).with_name("display_script.py")
-    command = [*BLENDER, *arguments, "--python", str(script), "--", str(folder)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    arguments = ["--factory-startup", "--gpu-backend", backend, "--python", str(script), "--", str(folder)]
+    done = subprocess.run([*BLENDER, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert (folder / "result.json").exists(), done.stdout[-3000:] + done.stderr[-3000:]
     result = json.loads((folder / "result.json").read_text())
     print({name: result[name] for name in ("version", "device", "pictures")})
     assert "traceback" not in result, result["traceback"]
+    assert result["device"] == backend.upper()
     return folder, result
 
 
@@ -118,3 +129,16 @@ def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
     assert result["fallback"] == result["points"]
     assert result["unregistered"] == [True, True]
     assert result["after load"] == [True, True, ""]
+    assert result["drawn"] == [1, 1, 1, 1], "at first, after undo, after the add-on was off, and in the next file"
+    assert result["drawn without"] == 0
+
+
+def test_textures_are_freed(shown: tuple[Path, dict[str, Any]]) -> None:
+    """Catches GPU memory held while nothing is displayed as trained, and splats that undo does not bring back."""
+    folder, result = shown
+    assert result["freed"] == {
+        "while drawn": False, "off": True, "removed": True, "disabled": True, "loaded": True,
+    }  # fmt: skip
+    assert result["undone"]
+    before, after = (on_screen(folder, result, name)[0] for name in ("solid", "after undo"))
+    assert psnr_db(after, before) > MIN_PSNR_DB

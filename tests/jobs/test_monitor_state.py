@@ -87,13 +87,13 @@ def test_no_preview_unless_wanted():
 
 @pytest.mark.parametrize("end", [WorkerState.FINISHED, WorkerState.CANCELLED])
 def test_result_is_shown_once(end):
-    """Catches a result that is not shown, or shown again at every check."""
+    """Catches a result that is not shown, or shown again at every check, or that undo cannot take back."""
     state, effects = after(Started(RUN), status(end))
     assert StoreAvatar(AVATAR) in effects
     assert loads(effects) == [AVATAR]
     assert state.interval_s == CHECK_INTERVAL_S
     state, effects = after(AvatarShown(created=False), state=state)
-    assert effects == [StoreTraining(RUN, True), Redraw()]
+    assert effects == [StoreTraining(RUN, True), PushUndo(), Redraw()]
     assert state.interval_s is None
     assert after(status(end), state=state) == (state, [])
 
@@ -194,3 +194,15 @@ def test_unexpected_error_stops_until_the_next_start_or_check():
     for restart in (Started(RUN), status(WorkerState.WORKING)):
         restarted, _ = after(restart, status(WorkerState.WORKING), state=state)
         assert (restarted.interval_s, restarted.error) == (CHECK_INTERVAL_S, "")
+
+
+def test_training_that_ends_while_a_preview_is_shown():
+    """Catches checks that end with the worker, so that its last avatar never reaches the scene."""
+    state, _ = after(Started(RUN), status(WorkerState.WORKING, preview=1), status(WorkerState.CANCELLED, preview=1))
+    state, _ = after(AvatarShown(created=False), state=state)
+    assert state.interval_s == CHECK_INTERVAL_S
+    state, effects = after(status(WorkerState.CANCELLED, preview=1), state=state)
+    assert loads(effects) == [AVATAR]
+    state, _ = after(AvatarShown(created=False), state=state)
+    assert state.result_shown
+    assert state.interval_s is None

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture.factory import write_mesh_capture
+from capture.factory import ball, write_mesh_capture
 
+from stga_addon.avatar.file import read_avatar
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
@@ -18,6 +19,7 @@ from stga_addon.jobs.delegate import FOLDER
 from stga_addon.jobs.training_job import TrainingJob, job_folder, read_job, run_training_job, write_job
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.run.progress import describe_figures
+from stga_addon.training.run.request import Extension, Refinement, Request
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.launch import start_worker
 from stga_addon.worker.status import (
@@ -297,3 +299,41 @@ def test_removed_job_leaves_other_files(tmp_path, capture):
     write_job(tmp_path / "run", new_job(capture), painted())
     training_job.remove_job(tmp_path / "run")
     assert not folder.exists()
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        Refinement(Path("/runs/anna"), "mouth", (3, 5), 0.5, seconds=20.0),
+        Refinement(Path("/runs/anna"), "painted.npz", None, iterations=3, seed=2),
+        Extension(Path("/runs/anna"), (Path("/smile"), Path("/frown")), iterations=3),
+    ],
+)
+def test_jobs_that_continue_a_run(tmp_path: Path, wanted: Request) -> None:
+    """Catches a region, frames or takes that the worker does not get."""
+    write_job(tmp_path / "run", TrainingJob(Path("/anna"), None, "vhap", None, continues=wanted), region=np.ones(4))
+    job = read_job(tmp_path / "run")
+    assert job.continues == wanted
+    assert not job.resumes
+    assert read_npz(job_folder(tmp_path / "run") / training_job.REGION)["weights"].sum() == 4
+    training_job.remove_job(tmp_path / "run")
+    assert not job_folder(tmp_path / "run").exists()
+
+
+def test_a_worker_refines_and_resumes(tmp_path: Path) -> None:
+    """Catches a worker that trains anew, or ignores the painted region, where a run is to be continued."""
+    capture = write_mesh_capture(tmp_path / "capture")
+    write_job(tmp_path / "run", new_job(capture))
+    run_training_job(tmp_path / "run")
+    refined, weights = tmp_path / "run_2", np.zeros(len(ball()[1]))
+    weights[:40] = 1.0
+    wanted = Refinement(tmp_path / "run", str(job_folder(refined) / training_job.REGION), iterations=4)
+    job = TrainingJob(capture, None, "opencv", None, "cpu", wanted)
+    write_job(refined, job, region=weights)
+    run_training_job(refined)
+    before, after = (read_avatar(folder / "avatar.npz").splats for folder in (tmp_path / "run", refined))
+    same = (before.sh == after.sh).all((1, 2))
+    assert same[before.face >= 40].all()
+    assert not same[before.face < 40].all()
+    write_job(refined, TrainingJob(capture, None, "opencv", None, "cpu"))
+    run_training_job(refined)

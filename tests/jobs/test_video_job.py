@@ -114,3 +114,27 @@ def test_a_truncated_recording(tmp_path: Path) -> None:
     with pytest.raises(StgaError, match="cannot be read as the images of a video"):
         run_video_job(folder)
     assert inspect_worker(folder).state == "failed"
+    assert not (folder / IMAGES).exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_full_disk_while_recording(tmp_path: Path) -> None:
+    """Catches a recording whose end never reached the disk and that counts as whole, and a traceback."""
+    recorder = Recorder(tmp_path / "job", VideoJob(tmp_path / "out", 1, 25.0, None))
+    recorder._stream.close()
+    recorder._stream = Path("/dev/full").open("wb")  # noqa: SIM115
+    with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
+        recorder.add([layer(0, count=10_000)], CAMERA)
+    with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
+        recorder.close()
+    recorder.close()
+
+
+@pytest.mark.parametrize("output", ["file/video.mp4", "folder.mp4", "file"])
+def test_an_output_that_cannot_be_written(tmp_path: Path, output: str) -> None:
+    """Catches a path that is refused only after everything was rendered."""
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.mp4").mkdir()
+    with pytest.raises(StgaError, match="cannot be written"):
+        Recorder(tmp_path / "job", VideoJob(tmp_path / output, 1, 25.0, None))
+    assert not (tmp_path / "job").exists()

@@ -1,6 +1,7 @@
-"""Triangles that are hardly any: by name, as corners (3, 3) at the scale of a head's, in meters."""
+"""Meshes that are hard to compute with: triangles that are hardly any, and a bent ball."""
 
 import numpy as np
+import trimesh
 
 WHOLE = np.array([[0.0, 0, 0], [0.009, 0.001, 0.002], [0.002, 0.008, -0.001]])
 """A sound triangle, for the frames in which the others are sound."""
@@ -24,9 +25,24 @@ DEGENERATE = {
     "first and last corner one": _line([0.2, 0.9, 0.4], [0, 1, 0]),
     "needle, 1e6 : 1": _line([0.3, -0.5, 0.81], [0, 0.5, 1]) + np.eye(3)[1, :, None] * [1e-8, 0, 0],
 }
+"""Triangles that are hardly any: by name, as corners (3, 3) at the scale of a head's, in meters."""
 
 
 def mesh_of(triangles: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (3·F, 3), as a float32 file would hold them, and faces (F, 3) int32 of separate triangles."""
     vertices = np.concatenate(triangles).astype(np.float32).astype(np.float64)
     return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+
+
+def bent_ball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Posed and neutral vertices (V, 3) of a ball, and its faces."""
+    sphere = trimesh.creation.icosphere(2, 0.1)
+    neutral = np.array(sphere.vertices)
+    noise = np.random.default_rng(6).normal(size=neutral.shape) * 0.003
+    return neutral * [1.1, 0.9, 1] + noise, neutral, np.array(sphere.faces, np.int32)
+
+
+def collapsed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles that become lines and points."""
+    posed, faces = mesh_of([*DEGENERATE.values()])
+    return posed, mesh_of([WHOLE] * len(DEGENERATE))[0], faces

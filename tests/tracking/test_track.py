@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
@@ -14,11 +15,12 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import calibrate, nearest_points
+from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
-from stga_addon.tracking.mesh_image import rasterize, shaded_image
+from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.track import track
 
 from .test_fit import frame_at, places_on
@@ -53,24 +55,32 @@ def write_footage(folder, cameras, timesteps, picture):
     return folder
 
 
-@pytest.fixture
-def recorded(tmp_path, head):
-    """Footage of blank images, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2."""
+def record(folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8)):
+    """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2; returns its meshes.
+
+    picture(mesh, camera) gives the pixels.
+    """
     cameras, places = rig(), places_on(head, LANDMARKS)
-    write_footage(tmp_path / "footage", cameras, 5, lambda *_: np.zeros((SIZE, SIZE, 3), np.uint8))
-    write_flame(head.model, tmp_path / "head.npz")
-    write_places(tmp_path / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     shape = np.zeros(head.model.n_identity)
     meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(5)]
+    write_footage(folder / "footage", cameras, 5, lambda camera, timestep: picture(meshes[timestep], camera))
+    write_flame(head.model, folder / "head.npz")
+    write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     for number, camera in enumerate(cameras):
         points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
         confidence = np.ones(points.shape[:2])
         confidence[2] = 0
         write_npz(
-            tmp_path / f"points/cam{number}.npz",
+            folder / f"points/cam{number}.npz",
             {"timesteps": np.arange(5), "points": points, "confidence": confidence},
         )
-    return tmp_path, meshes
+    return meshes
+
+
+@pytest.fixture
+def recorded(tmp_path, head):
+    """The folder of a take with blank images, and its meshes."""
+    return tmp_path, record(tmp_path, head)
 
 
 def command(folder, *more):
@@ -228,6 +238,15 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
     camera = footage.cameras[0]
     np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+
+
+def test_cameras_have_landmark_files_of_their_own(tmp_path):
+    """Catches cameras whose landmarks overwrite each other, or the correspondence of the head model."""
+    names = ["walk/1", "walk_1", "walk%2F1", "walk 1", "head_model", "kamera-Ä.2", "a\\b", "a:b"]
+    files = [landmark_file(tmp_path, name) for name in names]
+    assert len({*files, tmp_path / PLACES_FILE}) == len(names) + 1
+    assert files[0].name == "walk%2F1.npz"
+    assert all(file.parent == tmp_path for file in files)
 
 
 def test_the_capture_is_not_written_into_the_footage(tmp_path):

@@ -51,7 +51,7 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 1}, r"run\.json: has run format version 1, this add-on reads 2"),
+        ({"version": 1}, r"run\.json: has run format version 1, this add-on reads 2 to 3"),
         ({"version": None}, r"run\.json: has run format version None"),
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
         ({"capture": None}, r"run\.json: a field is missing or malformed"),
@@ -60,6 +60,8 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
         ({"device": "toaster"}, r"run\.json: .*device is 'toaster'"),
         ({"principal_point": "corner"}, r"run\.json: .*principal_point is 'corner'"),
         ({"identity": {"faces": 5}}, r"run\.json: a field is missing or malformed"),
+        ({"takes": [{"capture": "a"}]}, r"run\.json: a field is missing or malformed"),
+        ({"continuation": {"parent": "a", "avatar": "b", "first": 5, "last": 3}}, r"run\.json: .*continuation is"),
     ],
 )
 def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> None:

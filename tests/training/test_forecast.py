@@ -9,9 +9,12 @@ from stga_addon.training.evaluate.forecast import (
     Forecast,
     checked_forecasts,
     curve_of,
+    detail_curve,
     explain_missed_target,
+    flat_since,
     forecast,
     forecast_horizon,
+    forecast_text,
     plateau_start,
 )
 
@@ -100,6 +103,35 @@ def test_plateau_start() -> None:
     assert plateau_start(curve(TIMES[:12], fell[:12])) is None
     assert plateau_start([]) is None
     assert plateau_start(curve(TIMES[:3], np.full(3, 30.0))) is None
+
+
+def evaluations(psnr: np.ndarray, detail: np.ndarray) -> list[dict[str, float]]:
+    rows = zip(TIMES.tolist(), psnr.tolist(), detail.tolist(), strict=True)
+    return [{"seconds": s, "psnr": p, "detail_difference": d} for s, p, d in rows]
+
+
+def test_a_run_is_flat_when_neither_measure_rises() -> None:
+    """Catches a run stopped by PSNR while detail, by which the avatar is kept, still improves."""
+    fell = np.where(TIMES < 50, rising(TIMES), 30.0)
+    sharper = 0.1 / np.sqrt(TIMES)
+    assert flat_since(evaluations(fell, sharper)) is None
+    assert flat_since(evaluations(fell, np.where(TIMES < 30, sharper, 0.05))) == 48.0
+    assert flat_since([{"seconds": s, "psnr": p} for s, p in curve(TIMES, fell)]) == 48.0
+    assert flat_since([]) is None
+
+
+def test_forecast_of_both_measures() -> None:
+    """Catches a detail difference that is forecast in dB, upwards, or for a run that does not measure it."""
+    lines = evaluations(rising(TIMES), 10 ** (-(30 - 20 / np.sqrt(TIMES)) / 20))
+    assert detail_curve(lines)[-1][1] == pytest.approx(30 - 20 / np.sqrt(120))
+    gain = 20 / np.sqrt(120) - 20 / np.sqrt(240)
+    percent = 100 * (10 ** (-gain / 20) - 1)
+    text = forecast_text(lines, 120.0)
+    assert text.startswith(f"another 2 min: about +{gain:.1f} dB")
+    assert f", detail difference {percent:.0f} % (±" in text
+    only_psnr = [{"seconds": line["seconds"], "psnr": line["psnr"]} for line in lines]
+    assert "detail" not in forecast_text(only_psnr, 120.0)
+    assert forecast_text([], 120.0) == ""
 
 
 def test_hits() -> None:

@@ -31,7 +31,7 @@ def run_of(capture: Capture, **changes: Any) -> Run:
 
 
 def scores(values: Iterator[float]) -> Evaluate:
-    return lambda draw, evaluation_views, perceptual: Quality(next(values), 0.5)
+    return lambda *args, **kwargs: Quality(next(values), 0.5)
 
 
 class Clock:

@@ -21,6 +21,7 @@ from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.residual_file import read_residuals
 from stga_addon.training.settings import STRATEGIES
 
 from .toys import quick_settings
@@ -80,11 +81,15 @@ def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
     assert np.isfinite([line["psnr"] for line in lines]).all()
     assert lines[-1]["splats"] == len(checkpoint.state) > 3 * len(toy.faces)
     assert lines[-1]["psnr"] > lines[0]["psnr"]
+    residual = read_residuals(unbroken, len(toy.faces))
+    assert 0 < np.nanmean(residual) < 1
+    with pytest.raises(StgaError, match=r"residuals\.npz: expected 'residual', float32 \(7,\)"):
+        read_residuals(unbroken, 7)
     avatar = read_avatar(unbroken / "avatar.npz")
     np.testing.assert_array_equal(avatar.faces, toy.faces)
     assert avatar.settings["strategy"] == "selective"
     assert sorted(p.name for p in unbroken.iterdir()) == [
-        "avatar.npz", "checkpoint.npz", "metrics.jsonl", "run.json", "selection.npz",
+        "avatar.npz", "checkpoint.npz", "metrics.jsonl", "residuals.npz", "run.json", "selection.npz",
     ]  # fmt: skip
 
 
@@ -200,7 +205,9 @@ def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pyte
 
     run_module_write = run_module.write_avatar
     monkeypatch.setattr(
-        run_module, "evaluate", lambda draw, views, perceptual: Quality(30.0, 0.5, detail_difference=next(scores))
+        run_module,
+        "evaluate",
+        lambda *args, **kwargs: Quality(30.0, 0.5, detail_difference=next(scores)),
     )
     monkeypatch.setattr(run_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))

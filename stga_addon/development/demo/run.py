@@ -69,18 +69,12 @@ def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
 
 def _import_and_select(capture: Capture, model: Path) -> tuple[object, dict[int, np.ndarray]]:
     """Make a Blender scene with head, cameras and a vertex group per frame; returns head and selection read back."""
-    from ...scene import tags
-    from ...scene.blend_file import current_scene, new_file
-    from ...scene.cameras import central, configure_scene, import_cameras
-    from ...scene.objects import capture_root
-    from ...scene.rig.head import import_head
+    from ...scene.avatar_scene import set_up_head
+    from ...scene.blend_file import new_file
     from ...scene.vertex_groups import read_selection, write_selection
 
     new_file()
-    head = import_head(capture)
-    head[tags.FLAME_MODEL] = str(model.resolve())  # so that Train works in the saved file
-    cameras = import_cameras(capture, capture_root(capture.root))
-    configure_scene(current_scene(), capture, central(cameras))
+    head = set_up_head(capture, model)
     write_selection(head, select_capture(capture, SelectionOptions()))
     return head, read_selection(head)
 
@@ -102,18 +96,12 @@ def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat from numpy's."""
-    from ...scene import tags
-    from ...scene.blend_file import current_scene, object_named, open_file, save_file
-    from ...scene.display.splat_object import evaluated_splats, hide_object, show_avatar
+    from ...scene.avatar_scene import show_on_head
+    from ...scene.blend_file import object_named, open_file, save_file
+    from ...scene.display.splat_object import evaluated_splats
     from ...scene.timeline import go_to_frame
-    from ...scene.viewports import frame_demo
 
-    shown = show_avatar(avatar, head)
-    shown[tags.AVATAR] = "//avatar.npz"
-    hide_object(head, current_scene())
-    name = shown.name
-    go_to_frame(capture.timesteps[0])
-    frame_demo(head, current_scene(), FRAMES_PER_SECOND)
+    name = show_on_head(avatar, head, "//avatar.npz", FRAMES_PER_SECOND).name
     save_file(path)
     open_file(path)
     worst = 0.0

@@ -17,6 +17,14 @@ POINTS = "Points"
 ELLIPSOIDS = "Ellipsoids"
 QUADS = "Camera Quads"
 NATIVE = "Native Splats"
+LIMITS = {
+    AS_TRAINED: "Exact in viewports and by the engine STGA Splats; EEVEE and Cycles render camera quads",
+    POINTS: "Fast: round, of each splat's mean size",
+    ELLIPSOIDS: "For EEVEE and Cycles, from all sides, in the colors that the scene's camera sees",
+    QUADS: "For EEVEE and Cycles, faster; right through the scene's camera only",
+    NATIVE: "Blender's own splats; this was not tried",
+}
+"""What each display is for and what it is not, in its tooltip and in the panel."""
 
 
 def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> Any:
@@ -36,7 +44,7 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
     menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
     menu.enum_definition.enum_items.clear()
     for name in geometries:
-        menu.enum_definition.enum_items.new(name)
+        menu.enum_definition.enum_items.new(name).description = LIMITS[name]
     for name, geometry in geometries.items():
         nodes.tree.links.new(geometry, menu.inputs[name])
     nodes.tree.links.new(mode, menu.inputs["Menu"])

@@ -1,4 +1,4 @@
-"""How often each triangle is selected, as colors on the head."""
+"""How often each triangle is selected, or how far the avatar is from the images there, as colors on the head."""
 
 from typing import Any
 
@@ -10,7 +10,8 @@ from .node_builder import Nodes, new_material
 from .splat_attributes import write_attributes
 
 SHARE = "stga_selected_share"  # on faces: fraction of the frames that select them
-HEAT = "stga_heat"  # on face corners: that fraction as a color, relative to the most selected triangle
+RESIDUAL = "stga_residual"  # on faces: mean absolute error (0…1) of what their splats show
+HEAT = "stga_heat"  # on face corners: one of these as a color, relative to the largest
 MODIFIER = "STGA Heat Map"
 # Linear RGB from never to most often selected.
 STOPS = (0.0, 1e-9, 0.25, 0.5, 0.75, 1.0)
@@ -24,16 +25,17 @@ COLORS = (
 )
 
 
-def show_heat_map(head: Any, share: np.ndarray) -> None:
-    """Color the head's triangles by share (F,), 0 to 1. Its own materials stay: a modifier assigns the heat map's.
+def show_heat_map(head: Any, values: np.ndarray, attribute: str = SHARE, largest: float | None = None) -> None:
+    """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value).
 
-    The colors are the active color attribute, for solid shading, and a material, for EEVEE and Cycles.
+    Its own materials stay: a modifier assigns the heat map's. The colors are the active color attribute, for solid
+    shading, and a material, for EEVEE and Cycles. attribute: SHARE or RESIDUAL, in which the values are stored.
     """
     hide_heat_map(head)
-    scaled = share / max(share.max(initial=0.0), 1e-9)
+    scaled = np.minimum(values / max(values.max(initial=0.0) if largest is None else largest, 1e-9), 1.0)
     channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLORS, strict=True)]
-    colors = np.column_stack([*channels, np.ones(len(share))])
-    write_attributes(head.data, {SHARE: ("FLOAT", "value", flat_floats(share))}, "FACE")
+    colors = np.column_stack([*channels, np.ones(len(values))])
+    write_attributes(head.data, {attribute: ("FLOAT", "value", flat_floats(values))}, "FACE")
     write_attributes(head.data, {HEAT: ("FLOAT_COLOR", "color", flat_floats(np.repeat(colors, 3, axis=0)))}, "CORNER")
     head.data.attributes.active_color_name = HEAT
     head.modifiers.new(MODIFIER, "NODES").node_group = _node_group()
@@ -43,13 +45,17 @@ def hide_heat_map(head: Any) -> None:
     """Show the head as it was before `show_heat_map`."""
     for modifier in [old for old in head.modifiers if old.name.startswith(MODIFIER)]:
         head.modifiers.remove(modifier)
-    for name in (SHARE, HEAT):
+    for name in (SHARE, RESIDUAL, HEAT):
         if name in head.data.attributes:
             head.data.attributes.remove(head.data.attributes[name])
 
 
 def has_heat_map(head: Any) -> bool:
     return MODIFIER in head.modifiers
+
+
+def shows_residuals(head: Any) -> bool:
+    return has_heat_map(head) and RESIDUAL in head.data.attributes
 
 
 def _node_group() -> Any:

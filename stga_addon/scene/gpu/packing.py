@@ -22,6 +22,9 @@ LAYER_TEXELS = 5
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
 
+MAX_SORT_KEY = (1 << 24) - (1 << 8)
+"""Of 24 bits, less what rounding may add."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -39,20 +42,21 @@ class View:
 class StaticSplats:
     """What does not change while layers show the same splats.
 
-    centers (N, 4): xyz and 1; face (N,) index into all layers' triangles. texels: name -> (M, 4) for the textures.
+    positions (3, N): in the splats' triangles; face (N,) index into all layers' triangles. texels: name -> (M, 4) for
+    the textures.
     """
 
     def __init__(self, layers: Sequence[SceneLayer]) -> None:
         self.key = static_key(layers)
         count = sum(len(layer.splats) for layer in layers)
-        self.centers = np.ones((count, 4), np.float32)
+        centers = np.empty((count, 4), np.float32)
         self.face = np.empty(count, np.intp)
         axes = np.empty((count, 3, 4), np.float32)
         colors, self.rows = [], np.empty((len(layers), 4), np.float32)
         begin = first_face = first_color = 0
         for index, layer in enumerate(layers):
             splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
-            self.centers[rows, :3] = splats.xyz
+            centers[rows, :3] = splats.xyz
             self.face[rows] = splats.face + first_face
             axes[rows] = _axes(splats, index)
             coefficients = np.concatenate([splats.sh, splats.strain_color], axis=1)
@@ -62,8 +66,8 @@ class StaticSplats:
             first_color += len(colors[-1])
         if max(first_color, 3 * count, 4 * first_face) > MAX_INDEX:
             raise StgaError(f"{count} splats with their colors are too many to display as trained; choose Points")
-        centers = self.centers.copy()
         centers[:, 3] = self.face
+        self.positions = np.ascontiguousarray(centers[:, :3].T)
         self.texels = {"centers": centers, "axes": axes.reshape(-1, 4), "colors": np.concatenate(colors)}
 
     def __len__(self) -> int:
@@ -99,7 +103,9 @@ def _axes(splats: Splats, layer: int) -> np.ndarray:
 def frame_block(frames: FaceFrames) -> np.ndarray:
     """(3, 4·F) float64: the rows of the triangles' affine maps, [scale · rotation | origin]."""
     block = np.empty((3, len(frames.origin), 4))
-    np.multiply(frames.rotation.transpose(1, 0, 2), frames.scale[None, :, None], out=block[..., :3])
+    for row in range(3):
+        for column in range(3):  # a column at a time: numpy is slow where the last axis is short
+            np.multiply(frames.rotation[:, row, column], frames.scale, out=block[row, :, column])
     block[..., 3] = frames.origin.T
     return block.reshape(3, -1)
 
@@ -109,7 +115,7 @@ class PosedFrames:
     """The triangles of all layers as a camera sees them.
 
     texels (4, F, 4) float32: three rows of the map to camera space, then strain and whether the triangle is frozen.
-    depth_rows (F, 4) float32: the third row, less `base` meters: far from the camera, float32 would round away the
+    depth_rows (4, F) float32: the third row, less `base` meters: far from the camera, float32 would round away the
     differences by which splats are sorted.
     """
 
@@ -121,7 +127,7 @@ class PosedFrames:
 def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], view: View) -> PosedFrames:
     """Compose `frame_block` of each layer with its object and the camera, in float64."""
     count = sum(len(layer.frames.origin) for layer in layers)
-    texels, depth_rows, base = np.zeros((4, count, 4), np.float32), np.empty((count, 4), np.float32), None
+    texels, depth_rows, base = np.zeros((4, count, 4), np.float32), np.empty((4, count), np.float32), None
     begin = 0
     for layer, block in zip(layers, blocks, strict=True):
         to_camera = view.camera.world_to_camera @ layer.to_world
@@ -131,7 +137,7 @@ def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], vie
         texels[:3, begin:end] = part
         base = float(part[2, 0, 3]) if base is None else base
         part[2, :, 3] -= base
-        depth_rows[begin:end] = part[2]
+        depth_rows[:, begin:end] = part[2].T
         texels[3, begin:end, : layer.frames.strain.shape[1]] = layer.frames.strain
         texels[3, begin:end, 3] = 0 if layer.frozen is None else layer.frozen
         begin = end
@@ -140,19 +146,33 @@ def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], vie
 
 def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.ndarray:
     """Indices (M,) float32 of the splats within the view's near and far ends, farthest first."""
-    depth = np.einsum("ij,ij->i", np.take(frames.depth_rows, static.face, axis=0), static.centers)
-    inside = np.flatnonzero((depth >= view.near - frames.base) & (depth <= view.far - frames.base))
-    if not len(inside):
+    depth = _depths(static, frames)
+    near, far, chosen = view.near - frames.base, view.far - frames.base, None
+    if not (len(depth) and depth.min() >= near and depth.max() <= far):
+        chosen = np.flatnonzero((depth >= near) & (depth <= far))
+        depth = depth[chosen]
+    if not len(depth):
         return np.empty(0, np.float32)
-    if len(inside) < len(depth):
-        depth = depth[inside]
+    # Keys of 24 bits, as many as float32 has, sorted in two stable passes of 8 and 16, for which numpy uses radix sort.
+    # Fewer bits would swap close splats.
     nearest, farthest = float(depth.min()), float(depth.max())
-    # Keys of 32 bits in two stable passes over 16, which numpy sorts by radix. Fewer bits would swap close splats.
-    key = ((depth.astype(np.float64) - nearest) * ((2**32 - 1) / max(farthest - nearest, 1e-30))).astype(np.uint32)
-    order = np.argsort(key.astype(np.uint16), kind="stable")
-    order = order[np.argsort((key >> 16).astype(np.uint16)[order], kind="stable")]
+    depth -= np.float32(nearest)
+    depth *= np.float32(MAX_SORT_KEY / max(farthest - nearest, 1e-30))
+    key = depth.astype(np.uint32)
+    order = np.argsort(key.astype(np.uint8), kind="stable")
+    order = order[np.argsort((key >> 8).astype(np.uint16)[order], kind="stable")]
     # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
-    return np.asarray(inside[order[::-1]], np.float32)
+    return np.asarray(order[::-1] if chosen is None else chosen[order[::-1]], np.float32)
+
+
+def _depths(static: StaticSplats, frames: PosedFrames) -> np.ndarray:
+    """(N,) float32 of all splats, along the view axis, less `frames.base`; row by row, which is fastest."""
+    depth, product = np.take(frames.depth_rows[3], static.face, mode="clip"), np.empty(len(static), np.float32)
+    for row, coordinate in zip(frames.depth_rows, static.positions, strict=False):
+        np.take(row, static.face, out=product, mode="clip")
+        product *= coordinate
+        depth += product
+    return depth
 
 
 def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.ndarray:

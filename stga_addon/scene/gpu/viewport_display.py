@@ -79,8 +79,8 @@ class GpuDisplay:
             depsgraph, self._cache, space, lambda shown: everything or display_mode(shown) == AS_TRAINED
         )
         if not layers:
-            if not any(candidate.get(tags.KIND) == tags.SPLATS for candidate in bpy.data.objects):
-                self._renderer = None
+            if not any(is_shown_as_trained(candidate) for candidate in bpy.data.objects):
+                self._renderer = None  # frees its textures
             return
         if self._renderer is None:
             self._renderer = SplatRenderer(COMPACT)
@@ -99,13 +99,20 @@ class GpuDisplay:
 display = GpuDisplay()
 
 
+def is_shown_as_trained(candidate: Any) -> bool:
+    """Whether the object is one of splats that are displayed as trained."""
+    if candidate.get(tags.KIND) != tags.SPLATS:
+        return False
+    with suppress(StgaError):  # it has lost its modifier
+        return display_mode(candidate) == AS_TRAINED
+    return False
+
+
 def show_points() -> float | None:
     """Display as points what is to be displayed as trained, from a timer: also what is added or opened later."""
     for candidate in bpy.data.objects:
-        if candidate.get(tags.KIND) == tags.SPLATS and candidate.library is None:
-            with suppress(StgaError):
-                if display_mode(candidate) == AS_TRAINED:
-                    set_input(candidate, splat_nodes.DISPLAY, POINTS)
+        if candidate.library is None and is_shown_as_trained(candidate):
+            set_input(candidate, splat_nodes.DISPLAY, POINTS)
     return POINTS_INTERVAL_S if display.failed else None
 
 

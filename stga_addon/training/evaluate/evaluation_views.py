@@ -29,20 +29,26 @@ class EvaluationView:
     regions  name -> (H, W) bool. "mask": the head mask, if the view has one; "moving": visible pixels of the triangles
              that the default selection picks at the timestep, if there are any
     interior (H, W) bool: the head mask without the matte's border; None without a mask
+    group    of views whose quality is reported apart as well, such as those of one take; empty for none
     """
 
     view: View
     target: np.ndarray
     regions: Mapping[str, np.ndarray] = field(default_factory=dict)
     interior: np.ndarray | None = None
+    group: str = ""
 
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
     """The held-out views that are evaluated during training: at most MAX_EVALUATION_VIEWS, evenly spread."""
-    views = capture.views.get("val", ())
-    if len(views) <= MAX_EVALUATION_VIEWS:
+    return spread_views(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
+
+
+def spread_views(views: Sequence[View], limit: int) -> Sequence[View]:
+    """At most `limit` of the views, evenly spread."""
+    if len(views) <= limit:
         return views
-    return [views[n] for n in np.linspace(0, len(views) - 1, MAX_EVALUATION_VIEWS).round().astype(int)]
+    return [views[n] for n in np.linspace(0, len(views) - 1, limit).round().astype(int)]
 
 
 def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:

@@ -1,4 +1,4 @@
-"""Forecast of held-out PSNR from the evaluations of a run so far."""
+"""Forecast of held-out quality from the evaluations of a run so far."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +11,8 @@ from ...format import format_duration
 Curve = Sequence[tuple[float, float]]
 """(seconds of training, PSNR in dB) of each evaluation, ascending."""
 
+DETAIL = "detail_difference"
+"""Key, in a metrics.jsonl, of what the avatar that a run keeps is chosen by; lower is better."""
 MIN_EVALUATIONS = 4
 """Evaluations that a forecast needs."""
 FITTED_SINCE_SHARE = 2 / 3
@@ -113,6 +115,32 @@ def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tupl
         if key in line and np.isfinite(line[key]) and (not curve or line["seconds"] > curve[-1][0]):
             curve.append((line["seconds"], line[key]))
     return curve
+
+
+def detail_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """(seconds, −20·log10 of the detail difference) of the evaluations: dB like PSNR, higher is sharper."""
+    return [(seconds, -20 * np.log10(value)) for seconds, value in curve_of(lines, DETAIL) if value > 0]
+
+
+def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
+    """Seconds since when nothing was gained, neither PSNR nor detail; None while one of them rises.
+
+    Late in a run, PSNR may stand still or fall while hair and skin become sharper.
+    """
+    curves = [curve for curve in (curve_of(lines), detail_curve(lines)) if curve]
+    starts = [start for start in map(plateau_start, curves) if start is not None]
+    return max(starts) if starts and len(starts) == len(curves) else None
+
+
+def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
+    """What `ahead` more seconds of training would bring, in PSNR and in the detail difference; empty if unknown."""
+    predicted, detail = forecast(curve_of(lines), ahead), forecast(detail_curve(lines), ahead)
+    if predicted is None:
+        return ""
+    if detail is None:
+        return str(predicted)
+    change, error = (100 * (10 ** (-gain / 20) - 1) for gain in (detail.gain, -detail.error))
+    return f"{predicted}, detail difference {change:+.0f} % (±{error:.0f})"
 
 
 def explain_missed_target(curve: Curve, target: float) -> str:

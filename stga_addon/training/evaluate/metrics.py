@@ -4,7 +4,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,18 @@ from ..optimize.losses import similarity
 from . import lpips
 from .detail_difference import detail_difference
 from .evaluation_views import EvaluationView, read_evaluation_view
+from .match_exposure import match_exposure
 
 
 @dataclass(frozen=True)
 class Quality:
     """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None if it was not measured.
 
-    regions  the same per region ("mask", "moving"), over the views that have the region
+    regions  the same per region ("mask", "moving"), over the views that have the region; per group of views
+             ("take_1"), and per region of a group ("moving_take_1")
     detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
                        None for a region
+    psnr_unmatched     PSNR without matching the exposure of each view; None where it was not matched
     """
 
     psnr: float
@@ -32,6 +35,7 @@ class Quality:
     lpips: float | None = None
     regions: Mapping[str, "Quality"] = field(default_factory=dict)
     detail_difference: float | None = None
+    psnr_unmatched: float | None = None
 
     def as_json(self) -> dict[str, float]:
         """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
@@ -42,28 +46,52 @@ class Quality:
 
 
 def evaluate(
-    render: Callable[[View], np.ndarray], evaluation_views: Iterable[EvaluationView], perceptual: bool = False
+    render: Callable[[View], np.ndarray],
+    evaluation_views: Iterable[EvaluationView],
+    perceptual: bool = False,
+    matched: bool = False,
 ) -> Quality:
-    """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1; perceptual: whether to measure LPIPS."""
+    """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1.
+
+    perceptual: whether to measure LPIPS; matched: whether to match the exposure of each view first (`match_exposure`).
+    """
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
-    differences = []
+    differences, unmatched = [], []
     for evaluation_view in evaluation_views:
+        target = evaluation_view.target
         image = np.clip(render(evaluation_view.view), 0, 1)
-        differences.append(detail_difference(image, evaluation_view.target, evaluation_view.interior))
-        scores[""].append(_scores(image, evaluation_view.target, perceptual))
-        for region, where in evaluation_view.regions.items():
-            scores.setdefault(region, []).append(_scores(image, evaluation_view.target, perceptual, where))
+        if matched:
+            unmatched.append(psnr(image, target))
+            image = match_exposure(image, target, evaluation_view.regions.get("mask"), evaluation_view.interior)
+        differences.append(detail_difference(image, target, evaluation_view.interior))
+        parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
+        for region, where in parts.items():
+            found = _scores(image, target, perceptual, where)
+            scores.setdefault(region, []).append(found)
+            if evaluation_view.group:
+                scores.setdefault("_".join(filter(None, (region, evaluation_view.group))), []).append(found)
     means = {region: _mean(of_views) for region, of_views in scores.items()}
     whole = means.pop("")
-    return Quality(whole.psnr, whole.ssim, whole.lpips, means, float(np.mean(differences)) if differences else None)
+    return replace(
+        whole,
+        regions=means,
+        detail_difference=float(np.mean(differences)) if differences else None,
+        psnr_unmatched=float(np.mean(unmatched)) if unmatched else None,
+    )
 
 
-def evaluate_avatar(avatar: Avatar, capture: Capture, split: str, perceptual: bool = False) -> Quality:
-    """Quality of an avatar on all views of a split; holds one view at a time in memory."""
+def evaluate_avatar(
+    avatar: Avatar, capture: Capture, split: str, perceptual: bool = False, matched: bool | None = None
+) -> Quality:
+    """Quality of an avatar on all views of a split; holds one view at a time in memory.
+
+    matched: as in `evaluate`; None: where the avatar was trained with `exposure`.
+    """
     return evaluate(
         lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
         (read_evaluation_view(capture, view) for view in capture.views[split]),
         perceptual,
+        bool(avatar.settings.get("exposure")) if matched is None else matched,
     )
 
 

@@ -20,6 +20,7 @@ class Batch:
     sh_degree   degree of spherical harmonics in use
     selected    (F,) bool triangles whose splats are trained; None trains all
     rates       learning rate by parameter name, and "sh_rest"
+    accumulate  whether screen gradients are summed for density control
     refinement_rate  share of the full learning rates for the timestep's FLAME parameters; 0 leaves them unchanged
     """
 
@@ -30,6 +31,7 @@ class Batch:
     sh_degree: int
     selected: np.ndarray | None
     rates: Mapping[str, float]
+    accumulate: bool = True
     refinement_rate: float = 0.0
 
 

@@ -42,7 +42,7 @@ class CpuBackend:
             self._refine_tracking(batch, rows)
         self._add_limit_gradients(rows)
         adam.step(state, rows, batch.rates, self._settings.ema_share)
-        if focus is None:
+        if batch.accumulate:
             state.screen_gradient.numpy()[rows] += screen[rows]
             state.gradient_count.numpy()[rows] += 1
         return loss

@@ -17,17 +17,23 @@ SPLIT_LOG_SCALE = np.log(1.6)
 
 
 def control_density(
-    state: TrainState, budget: int, rng: np.random.Generator, max_share: float = MAX_SPLIT_SHARE
+    state: TrainState,
+    budget: int,
+    rng: np.random.Generator,
+    max_share: float = MAX_SPLIT_SHARE,
+    region: np.ndarray | None = None,
 ) -> TrainState:
     """Split the splats with the largest mean screen gradient and prune those of low opacity.
 
-    budget: how many splats may be added; max_share: largest share of the splats that is split. Every triangle with
-    bound splats keeps one. Children inherit triangle, binding and unseen share, lie within the parent's Gaussian in
-    local units, and keep Adam's second moment and step count, without which their first steps would all be as long as
-    the rate.
+    budget: how many splats may be added; max_share: largest share of the splats that is split; region (F,) bool: the
+    triangles whose splats may change, None for all. Every triangle with bound splats keeps one. Children inherit
+    triangle, binding and unseen share, lie within the parent's Gaussian in local units, and keep Adam's second moment
+    and step count, without which their first steps would all be as long as the rate.
     """
     gradient = (state.screen_gradient / state.gradient_count.clamp_min(1)).numpy()
-    count = max(0, min(budget, int(max_share * len(state))))
+    within = np.ones(len(state), bool) if region is None else region[state.face.numpy()]
+    gradient[~within] = 0.0
+    count = max(0, min(budget, int(max_share * within.sum())))
     split = np.argsort(-gradient, kind="stable")[:count]
     split = split[gradient[split] > 0]
     parents = keep_rows(state, torch.from_numpy(split))
@@ -38,7 +44,7 @@ def control_density(
         steps=pairs.steps,
         unseen_share=pairs.unseen_share,
     )
-    keep = ~_prunable(state)
+    keep = ~(_prunable(state) & within)
     keep[split] = False
     state = join(keep_rows(state, torch.from_numpy(keep)), children)
     return replace(state, screen_gradient=torch.zeros(len(state)), gradient_count=torch.zeros(len(state)))
@@ -47,10 +53,10 @@ def control_density(
 def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
     """Move bound splats farther than `limit` from their triangle's origin back to `share` of it; returns how many.
 
-    limit (F,) in local units. Works in place. (STGA, training, which moves them onto the origin: share = 0.)
-    Adam's first moment of the position is reset. The second moment is kept: with it at zero and the step count of the
-    row, which all its parameters share, in the thousands, the bias correction would make the next step 3.2 times as
-    long as the learning rate (0.1 / √0.001).
+    limit (F,) in local units, infinite where none is moved. Works in place. (STGA, training, which moves them onto the
+    origin: share = 0.) Adam's first moment of the position is reset. The second moment is kept: with it at zero and
+    the step count of the row, which all its parameters share, in the thousands, the bias correction would make the
+    next step 3.2 times as long as the learning rate (0.1 / √0.001).
     """
     distance = state.parameters.xyz.norm(dim=1)
     allowed = torch.from_numpy(limit)[state.face.long()]

@@ -6,13 +6,24 @@ from typing import Protocol
 
 import numpy as np
 
-from ..settings import TrainingSettings
-from .density import control_density, reset_strays
+from ..settings import CONTINUATIONS, TrainingSettings
+from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .state import TrainState
+
+EXTEND_GLOBAL_INTERVAL = 4
+"""Local iterations of an extension between two that train all splats."""
+MAX_REGION_SPLIT_SHARE = 0.1
+"""Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
 
 
 class Strategy(Protocol):
-    """Decides which triangles each iteration trains."""
+    """Decides which triangles each iteration trains.
+
+    region  (F,) bool: the only triangles whose splats the run may change; None for all
+    """
+
+    @property
+    def region(self) -> np.ndarray | None: ...
 
     def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
         """(F,) bool triangles whose splats are trained; None trains all splats.
@@ -24,6 +35,8 @@ class Strategy(Protocol):
 
 class GlobalStrategy:
     """Every iteration trains all splats."""
+
+    region = None
 
     def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> None:
         return None
@@ -38,6 +51,7 @@ class SelectiveStrategy:
 
     settings: TrainingSettings
     selection: Mapping[int, np.ndarray]
+    region = None
 
     def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
         settings, selected = self.settings, self.selection.get(timestep)
@@ -48,8 +62,38 @@ class SelectiveStrategy:
         return selected
 
 
+@dataclass
+class RefineStrategy:
+    """Every iteration trains the same region."""
+
+    region: np.ndarray
+
+    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray:
+        return self.region
+
+
+@dataclass
+class ExtendStrategy:
+    """Trains what new takes need, in all frames; every so often all splats.
+
+    region  (F,) bool: what moves in the new takes, or looks different there
+    """
+
+    region: np.ndarray
+
+    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+        is_global = iteration % (EXTEND_GLOBAL_INTERVAL + 1) == EXTEND_GLOBAL_INTERVAL
+        return None if is_global or not self.region.any() else self.region
+
+
 def make_strategy(settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> Strategy:
-    """The strategy that the settings name; "gaussian-avatars" differs from "global" in its settings only."""
+    """The strategy that the settings name; "gaussian-avatars" differs from "global" in its settings only.
+
+    selection: timestep -> (F,) bool; "refine" and "extend" train the union.
+    """
+    if settings.strategy in CONTINUATIONS:
+        union = np.any(list(selection.values()), axis=0)
+        return RefineStrategy(union) if settings.strategy == "refine" else ExtendStrategy(union)
     return SelectiveStrategy(settings, selection) if settings.strategy == "selective" else GlobalStrategy()
 
 
@@ -65,25 +109,36 @@ class PostStep(Protocol):
 
 @dataclass(frozen=True)
 class StrayReset:
-    """Moves splats back that left their triangle's neighborhood; `unit` (F,) is what the limit is a multiple of."""
+    """Moves splats back that left their triangle's neighborhood; `unit` (F,) is what the limit is a multiple of.
+
+    region  (F,) bool: only splats on these triangles are moved; None for all
+    """
 
     settings: TrainingSettings
     unit: np.ndarray
+    region: np.ndarray | None = None
 
     def is_due(self, iteration: int, progress: float) -> bool:
         return _at_interval(iteration, self.settings.stray_reset_interval)
 
     def apply(self, state: TrainState, iteration: int) -> TrainState:
-        reset_strays(state, self.settings.stray_limit * self.unit, self.settings.stray_reset_share)
+        limit = self.settings.stray_limit * self.unit
+        if self.region is not None:
+            limit = np.where(self.region, limit, np.inf).astype(limit.dtype)
+        reset_strays(state, limit, self.settings.stray_reset_share)
         return state
 
 
 @dataclass(frozen=True)
 class DensityControl:
-    """Splits and prunes splats; the count may grow to (1 + `settings.growth`) · `initial_count`."""
+    """Splits and prunes splats; the count may grow to (1 + `settings.growth`) · `initial_count`.
+
+    region  (F,) bool: only splats on these triangles are split and pruned; None for all
+    """
 
     settings: TrainingSettings
     initial_count: int
+    region: np.ndarray | None = None
 
     def is_due(self, iteration: int, progress: float) -> bool:
         start, end = self.settings.density_span
@@ -91,7 +146,10 @@ class DensityControl:
 
     def apply(self, state: TrainState, iteration: int) -> TrainState:
         budget = round(self.initial_count * (1 + self.settings.growth)) - len(state)
-        return control_density(state, budget, np.random.default_rng([self.settings.seed, iteration]))
+        share = MAX_SPLIT_SHARE if self.region is None else MAX_REGION_SPLIT_SHARE
+        return control_density(
+            state, budget, np.random.default_rng([self.settings.seed, iteration]), share, self.region
+        )
 
 
 def _at_interval(iteration: int, interval: int) -> bool:

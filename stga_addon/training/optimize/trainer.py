@@ -113,6 +113,7 @@ class Trainer:
                 sh_degree=sh_degree(settings, progress),
                 selected=selected,
                 rates=learning_rates(settings.rates, progress),
+                accumulate=selected is None or self.strategy.region is not None,
                 refinement_rate=refinement_rate(progress) if self.tracking is not None and selected is None else 0.0,
             )
         )
@@ -126,8 +127,8 @@ class Trainer:
 
     def _post_step(self, progress: float) -> None:
         steps: tuple[PostStep, ...] = (
-            StrayReset(self.settings, self._limit_units),
-            DensityControl(self.settings, self.initial_count),
+            StrayReset(self.settings, self._limit_units, self.strategy.region),
+            DensityControl(self.settings, self.initial_count, self.strategy.region),
         )
         due = [step for step in steps if step.is_due(self.iteration, progress)]
         if due:

@@ -8,21 +8,52 @@ tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
 metrics.jsonl   one line per evaluation
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
 from ...files import read_json, remove_leftovers, write_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
-from ..settings import DEVICES, TrainingSettings, from_json, to_json
+from ..settings import TrainingSettings, from_json, is_device, to_json
 from .identity import Identity, identity_from_json
 
-FORMAT, VERSION = "stga-run", 2
+FORMAT, VERSION, OLDEST_VERSION = "stga-run", 3, 2
+OLD_DEVICES = ("cuda", "cuda:0", "warp-cpu")
+"""What runs of earlier versions call a GPU."""
 CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
+
+
+@dataclass(frozen=True)
+class Take:
+    """A capture that joined a run after its first one; `start` is added to its timesteps (`join_takes`)."""
+
+    capture: Path
+    start: int
+    identity: Identity
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """How a run continues another one.
+
+    parent        folder of the run that it starts from
+    avatar        SHA-256 of that run's avatar file
+    first, last   timesteps whose views are trained; views of the others are replayed now and then
+    """
+
+    parent: Path
+    avatar: str
+    first: int
+    last: int
+
+    def includes(self, timestep: int) -> bool:
+        return self.first <= timestep <= self.last
 
 
 @dataclass(frozen=True)
@@ -34,6 +65,8 @@ class Run:
     effect_plan      what was decided about effects
     device           one of `choose_device` that trains
     identity         None before training begins
+    takes            further captures of the same head, whose timesteps follow those of `capture` (`join_takes`)
+    continuation     how the run continues another one; None: it began with new splats
     """
 
     capture: Path
@@ -43,6 +76,8 @@ class Run:
     effect_plan: tuple[EffectDecision, ...] = ()
     device: str = "cpu"
     identity: Identity | None = field(default=None, compare=False)
+    takes: tuple[Take, ...] = ()
+    continuation: Continuation | None = None
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -58,6 +93,8 @@ def write_run(folder: Path, run: Run) -> None:
             "settings": to_json(run.settings),
             "effect_plan": effect_plan_to_json(run.effect_plan),
             "identity": None if run.identity is None else asdict(run.identity),
+            "takes": [{**asdict(take), "capture": str(take.capture)} for take in run.takes],
+            "continuation": _continuation_to_json(run.continuation),
         },
     )
 
@@ -70,13 +107,16 @@ def read_run(folder: Path) -> Run:
     values = read_json(path)
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
-    if values.get("version") != VERSION:
-        raise StgaError(f"{path}: has run format version {shorten(values.get('version'))}, this add-on reads {VERSION}")
+    if values.get("version") not in range(OLDEST_VERSION, VERSION + 1):
+        found, known = shorten(values.get("version")), f"{OLDEST_VERSION} to {VERSION}"
+        raise StgaError(f"{path}: has run format version {found}, this add-on reads {known}")
     try:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
             raise ValueError(f"principal_point is {shorten(principal_point)}")
-        if not isinstance(device, str) or device.partition(":")[0] not in DEVICES:
+        if device in OLD_DEVICES:
+            device = "gpu"
+        if not is_device(device):
             raise ValueError(f"device is {shorten(device)}")
         return Run(
             Path(values["capture"]),
@@ -86,11 +126,46 @@ def read_run(folder: Path) -> Run:
             effect_plan_from_json(values["effect_plan"]),
             device,
             identity_from_json(values["identity"]),
+            tuple(_take_from_json(take) for take in values.get("takes", ())),
+            _continuation_from_json(values.get("continuation")),
         )
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
+
+
+def next_folder(run: Path) -> Path:
+    """The first of RUN_2, RUN_3, … that does not exist; after RUN_2 comes RUN_3."""
+    run = run.resolve()
+    match = re.fullmatch(r"(.+?)_(\d{1,6})", run.name, re.ASCII)
+    name, number = (match[1], int(match[2])) if match else (run.name, 1)
+    while True:
+        number += 1
+        folder = run.with_name(f"{name}_{number}")
+        if not folder.exists():
+            return folder
+
+
+def _take_from_json(values: Any) -> Take:
+    identity = identity_from_json(values["identity"])
+    if identity is None or type(values["start"]) is not int:
+        raise ValueError(f"takes holds {shorten(values)}")
+    return Take(Path(values["capture"]), values["start"], identity)
+
+
+def _continuation_to_json(continuation: Continuation | None) -> dict[str, Any] | None:
+    return None if continuation is None else {**vars(continuation), "parent": str(continuation.parent)}
+
+
+def _continuation_from_json(values: Any) -> Continuation | None:
+    if values is None:
+        return None
+    continuation = Continuation(**{**values, "parent": Path(values["parent"])})
+    span = continuation.first, continuation.last
+    if not isinstance(continuation.avatar, str) or not all(type(n) is int for n in span) or span[0] > span[1]:
+        raise ValueError(f"continuation is {shorten(values)}")
+    return continuation
 
 
 @contextmanager

@@ -56,7 +56,7 @@ def identity_of(capture: Capture, flame: Path | None, principal_point: str, sett
         _digest(_quantized(_camera_table([view.camera for _, view in views]))),
         _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
         _digest(_quantized(capture.neutral)),
-        "" if flame is None or capture.flame is None else _file_digest(flame),
+        "" if flame is None or capture.flame is None else file_digest(flame),
         _digest(json.dumps(to_json(settings), sort_keys=True).encode()),
     )
 
@@ -86,7 +86,8 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _file_digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file. Raises StgaError where it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -7,39 +7,48 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from ...avatar.file import Avatar, write_avatar
+from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture
 from ...errors import StgaError
+from ...files import replacing
 from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
-from ..evaluate.forecast import curve_of, forecast, forecast_horizon, plateau_start
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view, spread_views
+from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
+from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
-from ..optimize.tracking import write_tracking
+from ..optimize.tracking import with_refined_tracking, write_tracking
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import to_json
 from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
+from .continuation import continued_evaluation_views, starting_state
 from .folder import CHECKPOINT, SELECTION, Run, locked, read_run, write_run
 from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
 from .open_run import check_identity
 from .progress import Progress, Report
+from .replay import continued_order
+from .residual_file import write_residuals
+from .strain_range import trained_strain_range
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 EVALUATIONS = 10
 """Evaluations over a budget in iterations, at fixed shares of it so that the run is reproducible."""
+RESIDUAL_VIEWS = 24
+"""Views in which the residuals of a finished run are measured."""
 EVALUATION_SHARE = 0.04
 """Largest share of the training time that evaluations add to a budget in seconds, without the last one."""
 MAX_EVALUATIONS = 40
@@ -123,17 +132,25 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
-        self.evaluation_views = [read_evaluation_view(capture, view) for view in choose_evaluation_views(capture)]
+        self.measured_strain: list[np.ndarray | None] = []
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""
         self.report(Progress(message="Placing splats"))
+        continuation, state = self.run.continuation, None
         if selection is None:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
-        self.trainer = Trainer(self.capture, self.settings, selection, device=self.run.device)
+        if continuation is not None:
+            state = starting_state(continuation)
+            self._check(state)
+        self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
             (self.out / stale).unlink(missing_ok=True)
+        if continuation is not None and (continuation.parent / TRACKING).exists():
+            with replacing(self.out / TRACKING) as partial:
+                copyfile(continuation.parent / TRACKING, partial)
+        self._read_evaluation_views()
         write_selection(self.out, selection, self.digest)
         write_run(self.out, self.run)
 
@@ -158,7 +175,18 @@ class _Loop:
         self.evaluations = checkpoint.evaluations
         cut_metrics(self.out, checkpoint.iteration)
         self.lines = read_metrics(self.out)
+        self._read_evaluation_views()
         write_run(self.out, self.run)  # capture, model and device may be others now
+
+    def _read_evaluation_views(self) -> None:
+        if self.run.continuation is None:
+            chosen = choose_evaluation_views(self.capture)
+            self.evaluation_views = [read_evaluation_view(self.capture, view) for view in chosen]
+        else:
+            self.evaluation_views = continued_evaluation_views(self.run, self.capture, self._refined_region())
+
+    def _refined_region(self) -> np.ndarray | None:
+        return self.trainer.strategy.region if self.settings.strategy == "refine" else None
 
     def _check(self, state: TrainState) -> None:
         """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
@@ -177,9 +205,13 @@ class _Loop:
             return  # a finished run was resumed
         self.clock_began = perf_counter() - (self.lines[-1]["wall_s"] if self.lines else 0.0)
         with _interrupt_requests() as interrupts:
+            if self.run.continuation is not None and not self.lines:
+                self._evaluate()  # the avatar before, which the others are compared with
             self._train(interrupts)
             self._evaluate(perceptual=self._finished())  # LPIPS takes long, so a run that is stopped goes without
             self._save()
+            if self._finished():
+                self._measure_residuals()
         self.report(self._progress("Interrupted" if interrupts else "Finished"))
         if interrupts:
             raise KeyboardInterrupt
@@ -203,7 +235,10 @@ class _Loop:
     def _loader(self) -> ViewLoader:
         settings, first = self.settings, self.trainer.iteration
         red, green, blue = (round(255 * c) for c in settings.background)
-        order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
+        if self.run.continuation is None:
+            order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
+        else:
+            order = continued_order(self.run.continuation, self.capture, self._refined_region(), settings.seed, first)
         correct = exposure_correction(settings)
         mesh = self.capture.mesh if self.trainer.tracking is None else None  # refined meshes change with every step
         return ViewLoader(
@@ -245,7 +280,7 @@ class _Loop:
         curve, target = curve_of(self.lines), self.settings.target_psnr
         if self._share() >= 1 or (target is not None and any(psnr >= target for _, psnr in curve)):
             return True
-        return self.settings.stop_when_flat and plateau_start(curve) is not None
+        return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Measure the evaluation views, keep the avatar if it is the sharpest so far, and append a line of metrics."""
@@ -260,10 +295,15 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.evaluation_views:
-            quality = evaluate(lambda view: self.trainer.render(view, share), self.evaluation_views, perceptual)
+            quality = evaluate(
+                lambda view: self.trainer.render(view, share),
+                self.evaluation_views,
+                perceptual,
+                matched=bool(self.settings.exposure),
+            )
             self.psnr = quality.psnr
             line.update(quality.as_json())
-        self._keep_best(line.get("detail_difference"))
+        self._keep_best(line.get(DETAIL))
         now = perf_counter()
         line.update(evaluation_s=round(now - begin, 3), wall_s=round(now - self.clock_began, 3))
         line["peak_memory_mb"] = peak_memory_mb()
@@ -271,12 +311,27 @@ class _Loop:
         self._forecast(line)
         append_metrics(self.out, line)
 
+    def _measure_residuals(self) -> None:
+        """Write the error of the avatar on each triangle, over a few views of all frames and cameras."""
+        self.report(self._progress("Measuring residuals"))
+        views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
+        mean = triangle_residuals(
+            read_avatar(self.out / "avatar.npz"), self._refined_capture(), spread_views(views, RESIDUAL_VIEWS),
+            exposure_correction(self.settings), RESIDUAL_SCALE,
+        ).mean()  # fmt: skip
+        write_residuals(self.out, mean)
+
+    def _refined_capture(self) -> Capture:
+        """The capture with the meshes that the avatar in the folder was trained on."""
+        return self.capture if self.trainer.tracking is None else with_refined_tracking(self.capture, self.out)
+
     def _keep_best(self, detail_difference: float | None) -> None:
         """Write the avatar if it is the sharpest so far; without evaluation views the latest one is kept.
 
-        Not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
+        Not by PSNR, which prefers an early, blurred state to detail that is a pixel off. A continuation keeps the
+        latest one, too: the one before is in the folder of the run that it continues.
         """
-        if detail_difference is not None:
+        if detail_difference is not None and self.run.continuation is None:
             if not detail_difference <= self.best_difference:
                 return
             self.best_difference = detail_difference
@@ -289,10 +344,10 @@ class _Loop:
         curve, left = curve_of(self.lines), self._left_s()
         ahead = forecast_horizon(self.elapsed, left)
         predicted = None if ahead is None else forecast(curve, ahead)
-        self.forecast_text = "" if predicted is None else str(predicted)
+        self.forecast_text = "" if ahead is None else forecast_text(self.lines, ahead)
         if predicted is not None and "psnr" in line:
             line["forecast"] = predicted.as_json()
-        plateau = plateau_start(curve) if left else None
+        plateau = flat_since(self.lines) if left else None
         if plateau is not None:
             self.forecast_text = f"no gain since {format_duration(plateau)}: more time no longer helps"
         target, end = self.settings.target_psnr, forecast(curve, left) if left else None
@@ -311,7 +366,17 @@ class _Loop:
             self.settings.background,
             self.settings.antialiased,
             self.run.principal_point,
+            self._strain_range(),
         )
+
+    def _strain_range(self) -> np.ndarray | None:
+        """Measured once, or whenever refined tracking may have moved the meshes."""
+        if not self.settings.strain_color:
+            return None
+        if not self.measured_strain or self.trainer.tracking is not None:
+            mesh = self.trainer.frames.mesh if self.trainer.tracking is not None else self.capture.mesh
+            self.measured_strain = [trained_strain_range(self.capture, mesh, self.run.continuation)]
+        return self.measured_strain[0]
 
     def _save(self) -> None:
         trainer = self.trainer

@@ -5,18 +5,23 @@ from pathlib import Path
 
 from ...capture.model import Capture
 from ...capture.open import open_capture
+from ...capture.takes import join_takes
 from ...errors import StgaError
 from ..optimize.device import choose_device
-from .folder import Run, read_run
+from .folder import Run, Take, read_run
 from .identity import Identity, difference, identity_of
 
 
 @dataclass(frozen=True)
 class OpenedRun:
-    """A run and its capture. `run` has the paths of `capture` and FLAME model that were opened."""
+    """A run and its capture. `run` has the paths of `capture` and FLAME model that were opened.
+
+    takes  the captures that `capture` is joined from
+    """
 
     run: Run
     capture: Capture
+    takes: tuple[Capture, ...]
 
 
 def open_run(
@@ -31,10 +36,25 @@ def open_run(
     if principal_point not in (None, run.principal_point):
         raise StgaError(f"{folder}: was trained with principal point '{run.principal_point}', not '{principal_point}'")
     flame = run.flame if flame is None else flame.resolve()
-    opened = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
-    run = replace(run, capture=opened.root, flame=flame)
+    first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
+    run = replace(run, capture=first.root, flame=flame)
+    takes = (first, *(_open_take(folder, run, take) for take in run.takes))
+    opened = join_takes(takes)
     check_identity(folder, run, opened)
-    return OpenedRun(run, opened)
+    if run.continuation is not None:  # it was trained on the meshes that the run before has refined
+        from ..optimize.tracking import with_refined_tracking  # imports torch, which Blender's own Python lacks
+
+        opened = with_refined_tracking(opened, folder)
+    return OpenedRun(run, opened, takes)
+
+
+def _open_take(folder: Path, run: Run, take: Take) -> Capture:
+    """A capture that joined the run. Raises StgaError where it is missing or has changed."""
+    capture = open_capture(take.capture, run.flame, run.principal_point)
+    changed = difference(take.identity, identity_of(capture, run.flame, run.principal_point, run.settings))
+    if changed is not None:
+        raise StgaError(f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it now {changed}")
+    return capture
 
 
 def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:

@@ -1,5 +1,6 @@
 """Progress of a training run, and the figures of it that people read."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -56,7 +57,9 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     )
     lines = []
     for pair in pairs:
-        known = [(text, figures[name], name) for name, text in pair if figures.get(name)]
+        known = [
+            (text, figures[name], name) for name, text in pair if figures.get(name) and not math.isnan(figures[name])
+        ]
         parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
         lines.append("   ".join(parts).replace(",", "\u202f"))
     return [line for line in lines if line]

@@ -1,5 +1,7 @@
 """Progress bar of a training run on a terminal."""
 
+import math
+
 from tqdm import tqdm
 
 from .progress import Progress
@@ -20,7 +22,8 @@ class ProgressBar:
         self._bar.set_description(progress.message, refresh=bool(progress.iteration == 0))
         psnr = "" if progress.psnr is None else f", PSNR {progress.psnr:.2f}"
         if progress.iteration:
-            figures = f"{progress.per_second:.1f} it/s, loss {progress.loss:.4f}{psnr}, {progress.splats} splats"
+            loss = "" if math.isnan(progress.loss) else f", loss {progress.loss:.4f}"  # local iterations have none
+            figures = f"{progress.per_second:.1f} it/s{loss}{psnr}, {progress.splats} splats"
             forecast_text = f"; {progress.forecast_text}" if progress.forecast_text else ""
             self._bar.set_postfix_str(figures + forecast_text, refresh=False)
         self._bar.update(progress.share - self._bar.n)

@@ -1,0 +1,164 @@
+"""Continues a trained avatar: refines a region of it, or extends it by a further take of the same head."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+import numpy as np
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs.training_job import REGION, TrainingJob, job_folder, write_job
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_triangles
+from ..stga_addon.training.run.folder import next_folder
+from ..stga_addon.training.run.request import Extension, Refinement, Request
+from . import ids
+from .common import file_path, head_of, reporting, scene_settings
+from .train import device_property, may_train, python_of, python_property, start_job, wait_property
+
+
+class Refine(bpy.types.Operator):
+    """Train one region of the avatar further; all other splats stay as they are. In Edit Mode the region is the
+    selected triangles, otherwise a vertex group"""
+
+    bl_idname = ids.REFINE
+    bl_label = "Refine"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    directory: bpy.props.StringProperty(
+        name="Run Folder", description="Folder of the run to refine", subtype="DIR_PATH", options=PATH_OPTIONS
+    )
+    group: bpy.props.StringProperty(
+        name="Vertex Group",
+        description="Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the selected "
+        "triangles are refined instead",
+        options={"SKIP_SAVE"},
+    )
+    region: bpy.props.StringProperty(
+        name="Region",
+        description="Region of the capture, such as mouth, to refine instead of a vertex group",
+        options={"SKIP_SAVE"},
+    )
+    first: bpy.props.IntProperty(
+        name="First Frame", description="First frame to train on", default=-1, min=-1, options={"SKIP_SAVE"}
+    )
+    last: bpy.props.IntProperty(
+        name="Last Frame",
+        description="Last frame to train on; -1: all frames",
+        default=-1,
+        min=-1,
+        options={"SKIP_SAVE"},
+    )
+    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=20.0, min=0.1)
+    iterations: bpy.props.IntProperty(
+        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
+    )
+    growth: bpy.props.FloatProperty(
+        name="More Splats",
+        description="Splats that may be added, as a share of those in the region",
+        default=0.0,
+        min=0.0,
+        soft_max=2.0,
+        subtype="FACTOR",
+    )
+    device: device_property()
+    python: python_property()
+    wait: wait_property()
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return may_train(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head, parent = head_of(context), file_path(self.directory, "run folder").resolve()
+        run = next_folder(parent)
+        weights = None if self.region else _painted_region(head, self.group)
+        region = self.region or str(job_folder(run) / REGION)
+        frames = None if self.last < 0 else (max(self.first, 0), self.last)
+        wanted = Refinement(parent, region, frames, self.growth, **_budget(self))
+        return _start(self, context, run, wanted, weights)
+
+
+class Extend(bpy.types.Operator):
+    """Train a further take of the same head into the avatar, which keeps what it has learned"""
+
+    bl_idname = ids.EXTEND
+    bl_label = "Extend with Take"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    directory: bpy.props.StringProperty(
+        name="Run Folder", description="Folder of the run to extend", subtype="DIR_PATH", options=PATH_OPTIONS
+    )
+    take: bpy.props.StringProperty(
+        name="Take",
+        description="Folder of a further capture of the same head",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS,
+    )
+    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
+    iterations: bpy.props.IntProperty(
+        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
+    )
+    device: device_property()
+    python: python_property()
+    wait: wait_property()
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return may_train(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        parent = file_path(self.directory, "run folder").resolve()
+        take = file_path(self.take, "take").resolve()
+        if not take.is_dir():
+            raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
+        return _start(self, context, next_folder(parent), Extension(parent, (take,), **_budget(self)), None)
+
+
+def _budget(operator: Any) -> dict[str, Any]:
+    return {"iterations": operator.iterations} if operator.iterations else {"seconds": operator.seconds}
+
+
+def _painted_region(head: Any, group: str) -> np.ndarray:
+    """(F,) weights of the triangles selected in Edit Mode, or of a vertex group. Raises StgaError for none."""
+    if head.mode == "EDIT":
+        weights = selected_triangles(head).astype(np.float32)
+        where = "no triangle is selected in Edit Mode"
+    else:
+        found = head.vertex_groups.get(group) if group else head.vertex_groups.active
+        if found is None:
+            raise StgaError(f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in Edit Mode")
+        weights = read_triangle_weights(head, found.name)
+        where = f"no triangle has all its corners in the vertex group '{found.name}'"
+    if not (weights >= tags.SELECTED_WEIGHT).any():
+        raise StgaError(f"{head.name}: {where}")
+    return weights
+
+
+def _start(operator: Any, context: Any, run: Path, wanted: Request, weights: "np.ndarray | None") -> set[str]:
+    """Start the worker; the splats that show the run before show the new one, so that its preview changes them."""
+    head, settings = head_of(context), scene_settings(context)
+    model = head.get(tags.FLAME_MODEL)
+    if not (wanted.parent / "avatar.npz").is_file():
+        raise StgaError(f"{wanted.parent}: holds no trained avatar; train one first")
+    job = TrainingJob(
+        Path(head[tags.CAPTURE]),
+        Path(model) if model else None,
+        head.get(tags.PRINCIPAL_POINT, "vhap"),
+        None,
+        operator.device,
+        wanted,
+    )
+    python = python_of(operator, context)
+    write_job(run, job, region=weights)
+    result = start_job(operator, context, run, python)
+    shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(wanted.parent)]
+    if not shown and settings.splats is not None:
+        shown = [settings.splats]
+    for thing in shown:
+        thing[tags.RUN] = str(run)
+    settings.run_folder = str(run)
+    return result

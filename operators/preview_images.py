@@ -1,0 +1,49 @@
+"""Shows splats in the viewport as EEVEE and Cycles render them."""
+
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.scene.display.display_modes import ELLIPSOIDS, LIMITS, QUADS
+from ..stga_addon.scene.display.hints import use_transparent_bounces, view_transform_hint
+from ..stga_addon.scene.display.splat_nodes import DISPLAY
+from ..stga_addon.scene.display.splat_object import set_input
+from ..stga_addon.scene.gpu.viewport_display import is_shown_as_trained
+from . import ids
+from .common import reporting
+
+
+class PreviewImages(bpy.types.Operator):
+    """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads that face it,
+    without a camera as ellipsoids. Choose the display As Trained to go back"""
+
+    bl_idname = ids.PREVIEW_IMAGES
+    bl_label = "Preview for EEVEE/Cycles"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if any(is_shown_as_trained(thing) for thing in context.view_layer.objects):
+            return True
+        cls.poll_message_set("No splats are displayed as trained")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        scene = context.scene
+        mode = QUADS if scene.camera is not None else ELLIPSOIDS
+        for thing in context.view_layer.objects:
+            if thing.library is None and is_shown_as_trained(thing):
+                set_input(thing, DISPLAY, mode)
+        engine = scene.render.engine
+        if engine == "CYCLES" and hasattr(scene, "cycles"):  # it can be chosen while its add-on is disabled
+            use_transparent_bounces(scene)
+        if getattr(context.space_data, "type", "") == "VIEW_3D":  # none where a script calls it
+            # Material Preview is EEVEE, whatever the scene's engine is.
+            is_shown_by_engine = engine == "CYCLES" or engine.startswith("BLENDER_EEVEE")
+            context.space_data.shading.type = "RENDERED" if is_shown_by_engine else "MATERIAL"
+            if scene.camera is not None:
+                context.space_data.region_3d.view_perspective = "CAMERA"
+        hint = view_transform_hint(scene)
+        self.report({"WARNING" if hint else "INFO"}, f"{mode}: {LIMITS[mode]}" + (f". {hint}" if hint else ""))
+        return {"FINISHED"}

@@ -1,0 +1,394 @@
+"""WebGPU device: adapters by name, buffers that grow, kernels from WGSL files, recorded work, late readback.
+
+Work is recorded into one command encoder and submitted at once; nothing waits for the device except `read` and
+`Readback.result`. A failure of driver or memory becomes a StgaError.
+"""
+
+import logging
+import os
+import re
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from time import sleep
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import wgpu
+from wgpu.backends.wgpu_native.extras import set_instance_extras
+
+from ...errors import StgaError
+from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
+
+if TYPE_CHECKING:
+    from .timing import KernelTimes
+
+NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
+"""What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
+POLL_INTERVAL_S = 2e-4
+BACKENDS = ("Vulkan", "Metal", "DX12")
+"""Without OpenGL, which lacks what the kernels need and complains where there is no display."""
+
+_BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)")
+_LAYOUT_TYPE = {"uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage"}
+
+Groups = tuple[int, int, int] | tuple[Any, int]
+"""Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
+
+
+@cache
+def adapters() -> dict[str, Any]:
+    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first, software last.
+
+    A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the slowest.
+    """
+    os.environ.setdefault("NODEVICE_SELECT", "1")  # Mesa's layer for windows complains where there is no display
+    set_instance_extras(backends=BACKENDS)
+    found: dict[str, Any] = {}
+    every = wgpu.gpu.enumerate_adapters_sync()
+    for adapter in sorted(every, key=_preference):
+        if any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items()):
+            continue
+        name = f"{adapter.info['device']} ({adapter.info['backend_type']})"
+        same = sum(known == name or known.startswith(f"{name} #") for known in found)
+        found[f"{name} #{same + 1}" if same else name] = adapter
+    return found
+
+
+def _preference(adapter: Any) -> tuple[int, bool]:
+    kinds, info = ("DiscreteGPU", "IntegratedGPU", "CPU"), adapter.info
+    rank = kinds.index(info["adapter_type"]) if info["adapter_type"] in kinds else 1
+    return rank, info["backend_type"] == "D3D12"
+
+
+def is_software(adapter: Any) -> bool:
+    """Whether an adapter computes on the CPU."""
+    return bool(adapter.info["adapter_type"] == "CPU")
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """An entry point of a WGSL file, ready to be dispatched; bindings: index of each of the file's buffers by name."""
+
+    name: str
+    pipeline: Any
+    layout: Any
+    bindings: dict[str, int]
+
+
+class Device:
+    """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels.
+
+    dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
+    kernel_times                times the kernels while it is set
+    """
+
+    def __init__(self, name: str | None = None) -> None:
+        """Open the adapter called `name` in `adapters()`, the first one by default."""
+        known = adapters()
+        if not known:
+            raise StgaError("--device gpu: no graphics driver with Vulkan, Metal or Direct3D 12 was found")
+        self.name = name or next(iter(known))
+        if self.name not in known:
+            raise StgaError(f"--device gpu:{self.name}: no such adapter; there are: {', '.join(known)}")
+        self.is_software = is_software(known[self.name])
+        with self.errors():
+            self.gpu, self._kernels = _open(self.name)
+        self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
+        self.dispatches = self.submits = self.waits = 0
+        self.kernel_times: KernelTimes | None = None
+        self._buffers: dict[str, Any] = {}
+        self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
+
+    @property
+    def bytes(self) -> int:
+        """Size of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
+
+    def buffer(self, name: str, words: int, usage: str = "storage") -> Any:
+        """A buffer of at least so many 32-bit words; the same memory until more is asked for, then fresh zeros.
+
+        usage: "storage", "uniform", or "indirect" (storage that also holds the workgroups of a dispatch).
+        """
+        buffer = self._buffers.get(name)
+        needed = 4 * max(words, 4)
+        if buffer is None or buffer.size < needed:
+            # An eighth to spare, so that a slowly growing count does not allocate every time.
+            size = needed if buffer is None else min(needed + needed // 32 * 4, max(needed, self.max_bytes // 4 * 4))
+            self._groups.clear()  # which would keep the old buffer's memory
+            buffer = self._buffers[name] = self.new_buffer(name, size, _USAGE[usage])
+        return buffer
+
+    def new_buffer(self, name: str, size: int, usage: int) -> Any:
+        """A buffer of so many bytes; usage: flags of WebGPU."""
+        if size > self.max_bytes:
+            raise StgaError(
+                f"--device gpu: {self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of "
+                f"{size >> 20} MiB for {name}; train smaller images or fewer splats, or give --device cpu"
+            )
+        with self.errors():
+            return self.gpu.create_buffer(label=name, size=size, usage=usage)
+
+    def upload(self, name: str, values: np.ndarray, usage: str = "storage") -> Any:
+        """Copy an array, which may be changed as soon as this returns, to a buffer before the next submit.
+
+        The driver keeps the copy until earlier work is done. Bytes are padded with zeros to whole words.
+        """
+        data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+        buffer = self.buffer(name, -(-data.size // 4), usage)
+        whole = data.size // 4 * 4
+        with self.errors():
+            if whole:
+                self.gpu.queue.write_buffer(buffer, 0, data, 0, whole)
+            if whole < data.size:
+                self.gpu.queue.write_buffer(buffer, whole, np.pad(data[whole:], (0, 4 - data.size % 4)))
+        return buffer
+
+    def read(self, buffer: Any, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+        """Wait for all submitted work and copy the beginning of a buffer to host memory."""
+        count = int(np.prod(shape))
+        if not count:
+            return np.empty(shape, dtype)
+        self.waits += 1
+        with self.errors():
+            size = -(-count * np.dtype(dtype).itemsize // 4) * 4
+            data = np.frombuffer(self.gpu.queue.read_buffer(buffer, 0, size), dtype)
+        return data[:count].reshape(shape).copy()
+
+    def kernel(self, file: str, entry: str = "main", include: tuple[str, ...] = (), **constants: float) -> Kernel:
+        """The entry point of `file`.wgsl, compiled once.
+
+        The module's text is the shared prelude, the included files, and the file itself; constants: values of its
+        `override` declarations.
+        """
+        key = (file, entry, include, *sorted(constants.items()))
+        if key not in self._kernels:
+            self._kernels[key] = self._compile(file, entry, include, constants)
+        return self._kernels[key]
+
+    def _compile(self, file: str, entry: str, include: tuple[str, ...], constants: dict[str, float]) -> Kernel:
+        code = "".join([constants_wgsl(), struct_wgsl("View", VIEW), *map(_source, ("common", *include, file))])
+        found = [(int(index), _LAYOUT_TYPE[kind], name) for index, kind, name in _BINDING.findall(code)]
+        with self.errors():
+            layout = self.gpu.create_bind_group_layout(
+                entries=[
+                    {"binding": index, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
+                    for index, kind, _ in found
+                ]
+            )
+            pipeline = self.gpu.create_compute_pipeline(
+                label=f"{file}.{entry}",
+                layout=self.gpu.create_pipeline_layout(bind_group_layouts=[layout]),
+                compute={
+                    "module": self.gpu.create_shader_module(label=file, code=code),
+                    "entry_point": entry,
+                    "constants": constants,
+                },
+            )
+        return Kernel(f"{file}.{entry}", pipeline, layout, {name: index for index, _, name in found})
+
+    def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
+        """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
+        key = id(kernel), *(id(buffers.get(name)) for name in kernel.bindings)
+        found = self._groups.get(key)
+        if found is None:
+            if buffers.keys() != kernel.bindings.keys():
+                raise TypeError(f"{kernel.name} binds {sorted(kernel.bindings)}, not {sorted(buffers)}")
+            entries = [
+                {"binding": index, "resource": {"buffer": buffers[name]}} for name, index in kernel.bindings.items()
+            ]
+            group = self.gpu.create_bind_group(layout=kernel.layout, entries=entries)
+            # Kept with its buffers, so that no identity in the key is given to another one.
+            found = self._groups[key] = group, tuple(buffers.values())
+        return found[0]
+
+    def record(self) -> "Recording":
+        """Begin to record work; used as a context manager it is submitted at the end."""
+        return Recording(self)
+
+    @staticmethod
+    def groups(threads: int) -> tuple[int, int, int]:
+        """Workgroups for at least so many threads; `thread_number` in WGSL numbers them."""
+        return Device.groups_of(-(-threads // WORKGROUP))
+
+    @staticmethod
+    def groups_of(workgroups: int) -> tuple[int, int, int]:
+        """At least so many workgroups, in rows of a length that every adapter allows."""
+        rows = max(1, -(-workgroups // MAX_GROUPS))
+        return -(-workgroups // rows), rows, 1
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Turn what driver and library raise into a StgaError; mistakes in kernels and calls pass as they are."""
+        try:
+            yield
+        except wgpu.GPUOutOfMemoryError as error:
+            raise StgaError(_memory_sentence(self.name)) from error
+        except (wgpu.GPUError, RuntimeError) as error:
+            text = str(error).lower()
+            if "memory" in text and "out of" in text:
+                raise StgaError(_memory_sentence(self.name)) from error
+            if "lost" in text:
+                _open.cache_clear()
+                raise StgaError(
+                    f"--device gpu: {self.name} was lost (the driver was reset, or took too long); "
+                    "resume the run, with --device cpu if it happens again"
+                ) from error
+            raise
+
+
+class Recording:
+    """Work for the device in the order in which it is recorded; each dispatch sees what those before it wrote."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.dispatches = 0
+        self._encoder = device.gpu.create_command_encoder()
+        self._pass: Any = None
+
+    def dispatch(self, kernel: Kernel, groups: Groups, **buffers: Any) -> None:
+        """Run a kernel with a buffer for each of its bindings, by name."""
+        indirect = not isinstance(groups[0], int)
+        if not indirect and 0 in groups:
+            return
+        compute = self._compute_pass(kernel)
+        compute.set_pipeline(kernel.pipeline)
+        compute.set_bind_group(0, self.device.bind(kernel, buffers))
+        if indirect:
+            compute.dispatch_workgroups_indirect(*groups)
+        else:
+            compute.dispatch_workgroups(*groups)
+        self.dispatches += 1
+        self.device.dispatches += 1
+
+    def copy(self, source: Any, target: Any, words: int, at: int = 0, to: int = 0) -> None:
+        """Copy words of a buffer to another, from word `at` to word `to`."""
+        self._end_pass()
+        self._encoder.copy_buffer_to_buffer(source, 4 * at, target, 4 * to, 4 * words)
+
+    def clear(self, buffer: Any, words: int | None = None) -> None:
+        """Fill the beginning of a buffer, or all of it, with zeros."""
+        self._end_pass()
+        self._encoder.clear_buffer(buffer, 0, None if words is None else 4 * words)
+
+    def submit(self) -> None:
+        """Hand the work to the device and return without waiting for it."""
+        with self.device.errors():
+            self._end_pass()
+            if self.device.kernel_times is not None:
+                self.device.kernel_times.resolve(self._encoder)
+            self.device.gpu.queue.submit([self._encoder.finish()])
+            self.device.submits += 1
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.submit()
+
+    def _compute_pass(self, kernel: Kernel) -> Any:
+        times = self.device.kernel_times
+        if times is not None:
+            self._end_pass()
+            self._pass = self._encoder.begin_compute_pass(timestamp_writes=times.writes(kernel.name))
+        elif self._pass is None:
+            self._pass = self._encoder.begin_compute_pass()
+        return self._pass
+
+    def _end_pass(self) -> None:
+        if self._pass is not None:
+            self._pass.end()
+            self._pass = None
+
+
+class Readback:
+    """Results of one recording, a few words, that arrive in host memory while the host goes on."""
+
+    def __init__(self, device: Device, words: int) -> None:
+        self._device = device
+        usage = wgpu.BufferUsage.COPY_DST | wgpu.BufferUsage.MAP_READ
+        self._buffer = device.new_buffer("readback", -(-words // 2) * 8, usage)
+        self._promise: Any = None
+
+    def copy_from(self, recording: Recording, *parts: tuple[Any, int]) -> None:
+        """Record the copy of the first words of some buffers; `start` is to follow the submit."""
+        at = 0
+        for buffer, words in parts:
+            recording.copy(buffer, self._buffer, words, to=at)
+            at += words
+
+    def start(self) -> None:
+        """Ask for the words as soon as the submitted work is done."""
+        with self._device.errors():
+            # Without the empty submit that wgpu makes for READ, which `read_buffer` avoids in the same way.
+            self._promise = self._buffer.map_async("READ_NOSYNC")
+
+    def result(self) -> np.ndarray:
+        """The words, uint32; waits if the work is not done yet."""
+        with self._device.errors():
+            self._promise.sync_wait()
+            words = np.frombuffer(self._buffer.read_mapped(), np.uint32).copy()
+            self._buffer.unmap()
+        return words
+
+
+_RAISED_LIMITS = (
+    "max-storage-buffer-binding-size",
+    "max-buffer-size",
+    "max-storage-buffers-per-shader-stage",
+    "max-compute-workgroup-storage-size",
+)
+_STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
+_USAGE = {
+    "storage": _STORAGE,
+    "indirect": _STORAGE | wgpu.BufferUsage.INDIRECT,
+    "uniform": wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST | wgpu.BufferUsage.COPY_SRC,
+}
+logging.getLogger("wgpu").setLevel(logging.CRITICAL)  # what it logs it also raises, and that is reported
+
+
+@cache
+def _open(name: str) -> tuple[Any, dict[tuple, Kernel]]:
+    """An adapter's device, with its limits raised, and room for compiled kernels."""
+    adapter = adapters()[name]
+    device = adapter.request_device_sync(
+        required_features=sorted({"timestamp-query"} & adapter.features),
+        required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
+    )
+    _poll_without_blocking(device)
+    return device, {}
+
+
+def _poll_without_blocking(device: Any) -> None:
+    """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is there.
+
+    By itself it waits inside the driver for all submitted work, and holds a lock that the next submit waits for.
+    """
+    reference = weakref.ref(device)
+
+    def poll(_: bool) -> None:
+        alive = reference()
+        if alive is not None:
+            alive._poll(False)
+        sleep(POLL_INTERVAL_S)
+
+    if hasattr(getattr(device, "_poller", None), "_poll_func"):  # private: a version without it is slower, not wrong
+        device._poller._poll_func = poll
+
+
+def _source(name: str) -> str:
+    return files(__package__).joinpath(f"{name}.wgsl").read_text(encoding="utf-8")
+
+
+def _memory_sentence(name: str) -> str:
+    return (
+        f"--device gpu: the memory of {name} is full; close other programs that use it, train smaller images or "
+        "fewer splats, or give --device cpu"
+    )

@@ -1,0 +1,55 @@
+// The pairs of every splat by slot, consecutive for each splat and in order of depth, with their tiles as keys.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> counts: array<u32>;
+@group(0) @binding(2) var<storage, read> order: array<u32>; // (N,) splats, near to far
+@group(0) @binding(3) var<storage, read> pairs_until: array<u32>; // see count_pairs.wgsl
+@group(0) @binding(4) var<storage, read> rect: array<vec4i>;
+@group(0) @binding(5) var<storage, read> rendered: array<u32>;
+@group(0) @binding(6) var<storage, read> focus: array<u32>;
+@group(0) @binding(7) var<storage, read_write> slots: array<vec2u>;
+@group(0) @binding(8) var<storage, read_write> wanted: array<u32>;
+@group(0) @binding(9) var<storage, read_write> slot_tile: array<u32>; // (P,)
+@group(0) @binding(10) var<storage, read_write> slot_splat: array<u32>; // (P,) with WANTED
+
+// A thread a splat.
+@compute @workgroup_size(WORKGROUP)
+fn main(
+  @builtin(workgroup_id) workgroup: vec3u,
+  @builtin(num_workgroups) workgroups: vec3u,
+  @builtin(local_invocation_index) local: u32,
+) {
+  let n = thread_number(workgroup, workgroups, local);
+  if n >= view.splats {
+    return;
+  }
+  let i = order[n];
+  var found = 0u;
+  if counts[OVERFLOWED] == 0u {
+    found = pairs_until[n];
+    if local > 0u {
+      found -= pairs_until[n - 1u];
+    }
+  }
+  var slot = pairs_until[view.splats + n / WORKGROUP] + pairs_until[n] - found;
+  slots[i] = vec2u(slot, found);
+  var is_wanted = found > 0u;
+  if view.focused == 1u {
+    is_wanted = is_wanted && focus[i] == 1u;
+  }
+  wanted[i] = u32(is_wanted);
+  if found == 0u {
+    return;
+  }
+  let r = rect[i];
+  for (var y = r.y; y < r.w; y++) {
+    for (var x = r.x; x < r.z; x++) {
+      let tile = u32(y) * view.tiles_x + u32(x);
+      if rendered[tile] == 1u {
+        slot_tile[slot] = tile;
+        slot_splat[slot] = i | (u32(is_wanted) * WANTED);
+        slot++;
+      }
+    }
+  }
+}

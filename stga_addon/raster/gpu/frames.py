@@ -1,0 +1,86 @@
+"""Camera-space frames and strain of a posed mesh's triangles, computed on the device."""
+
+from typing import Any
+
+import numpy as np
+
+from ...avatar import embedding
+from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis
+from ...capture.camera import Camera
+from .device import Device, Recording
+
+POSE = np.dtype(
+    [("rows", np.float32, (3, 4))] + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "unused")]
+)
+"""The uniform `pose` of frames.wgsl."""
+
+
+class Embedding:
+    """A mesh's topology and neutral form on the device, uploaded once; strains: columns of strain in its frames."""
+
+    def __init__(
+        self, device: Device, neutral: np.ndarray, faces: np.ndarray, convention: str, basis: StrainBasis | None = None
+    ) -> None:
+        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where colors follow strain."""
+        if convention not in embedding.CONVENTIONS:
+            raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
+        self.strains = 0 if basis is None else STRAIN_COMPONENTS
+        self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
+        rows = np.zeros(0) if basis is None else _basis_rows(basis)
+        self._buffers = {
+            "faces": device.upload("faces", faces.astype(np.uint32)),
+            "neutral_area": device.upload("neutral area", _area(neutral, faces)),
+            "basis": device.upload("strain basis", rows.astype(np.float32)),
+            "touching": device.upload("touching", _touching(faces, len(neutral))),
+            "tensors": device.buffer("strain tensors", 6 * len(faces) if self.strains else 0),
+        }
+
+    def upload(self, vertices: np.ndarray, camera: Camera) -> None:
+        """Send a posed mesh (V, 3), world meters, and its camera before the recording is submitted.
+
+        Shaders have no float64: a position becomes the float32 of its distance to the mesh's center and the rest.
+        """
+        center = vertices.mean(0) if len(vertices) else np.zeros(3)
+        local = vertices - center
+        nearest = local.astype(np.float32)
+        self._device.upload("vertices", np.concatenate([nearest, local - nearest], axis=1, dtype=np.float32))
+        pose = np.zeros(1, POSE)
+        turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        pose["rows"] = np.c_[turn, turn @ center + shift]
+        pose["triangles"], pose["strains"], pose["area_scales"] = self._count, self.strains, self._area_scales
+        self._device.upload("pose", pose, "uniform")
+
+    def compose(self, work: Recording) -> Any:
+        """Record the frames of the mesh that was uploaded last; returns their table."""
+        device, groups = self._device, self._device.groups(self._count)
+        buffers = {
+            **self._buffers,
+            "pose": device.buffer("pose", POSE.itemsize // 4, "uniform"),
+            "vertices": device.buffer("vertices", 0),
+            "frames": device.buffer("frames", self._count * (12 + self.strains)),
+        }
+        work.dispatch(device.kernel("frames", "compose"), groups, **buffers)
+        if self.strains:
+            work.dispatch(device.kernel("frames", "average_strain"), groups, **buffers)
+        return buffers["frames"]
+
+
+def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) float32, zero only where the float64 is."""
+    area = embedding.face_areas(neutral, faces)
+    area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)
+    return np.asarray(area, np.float32)
+
+
+def _basis_rows(basis: StrainBasis) -> np.ndarray:
+    """(F, 21 + 6·S): a triangle's numbers side by side."""
+    parts = basis.gram, basis.to_tensor, basis.to_plane
+    return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+
+
+def _touching(faces: np.ndarray, vertices: int) -> np.ndarray:
+    """The triangles that touch each vertex, in order, behind where each vertex's begin in this same array."""
+    corners = faces.ravel()
+    by_vertex = np.argsort(corners, kind="stable")
+    start = np.searchsorted(corners[by_vertex], np.arange(vertices + 1)) + vertices + 1
+    return np.asarray(np.concatenate([start, by_vertex // 3]), np.uint32)

@@ -1,0 +1,177 @@
+// Camera-space frames and strain of a posed mesh's triangles, as `avatar/embedding.py` and `avatar/strain.py` define
+// them.
+//
+// Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's center, of
+// which only differences and means are formed: an edge is as exact as float32 can hold it.
+
+struct Pose {
+  // The matrix from the mesh, relative to its center, to the camera.
+  row_x: vec4f,
+  row_y: vec4f,
+  row_z: vec4f,
+  triangles: u32,
+  strains: u32, // components of strain, 0 where colors do not follow it
+  area_scales: u32, // 1: the convention "stga", 0: "gaussian_avatars"
+  unused: u32,
+}
+
+@group(0) @binding(0) var<uniform> pose: Pose;
+// (V, 6): a position's float32 and what is left of it.
+@group(0) @binding(1) var<storage, read> vertices: array<f32>;
+// (F, 3)
+@group(0) @binding(2) var<storage, read> faces: array<u32>;
+// (F,) area in the neutral mesh, 0 where a triangle counts as a line.
+@group(0) @binding(3) var<storage, read> neutral_area: array<f32>;
+// (F, 21 + 6·S): `gram`, `to_tensor` and `to_plane` of the `StrainBasis`.
+@group(0) @binding(4) var<storage, read> basis: array<f32>;
+// (V + 1 + 3·F): where the triangles that touch a vertex begin in this array, then those triangles.
+@group(0) @binding(5) var<storage, read> touching: array<u32>;
+// (F, 6): a triangle's own strain as xx, yy, zz, xy, yz, zx.
+@group(0) @binding(6) var<storage, read_write> tensors: array<f32>;
+@group(0) @binding(7) var<storage, read_write> frames: array<f32>;
+
+const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
+const TENSOR: u32 = 6u; // words of a tensor
+const TO_TENSOR: u32 = 3u; // columns of `basis`
+const TO_PLANE: u32 = 21u;
+
+struct Edges {
+  first: vec3f, // from corner 0 to corner 1
+  second: vec3f, // from corner 0 to corner 2
+  third: vec3f, // from corner 1 to corner 2
+  center: vec3f,
+}
+
+fn position(vertex: u32) -> vec3f {
+  return vec3f(vertices[6u * vertex], vertices[6u * vertex + 1u], vertices[6u * vertex + 2u]);
+}
+
+fn remainder(vertex: u32) -> vec3f {
+  return vec3f(vertices[6u * vertex + 3u], vertices[6u * vertex + 4u], vertices[6u * vertex + 5u]);
+}
+
+fn edges_of(f: u32) -> Edges {
+  let a = faces[3u * f];
+  let b = faces[3u * f + 1u];
+  let c = faces[3u * f + 2u];
+  return Edges(
+    (position(b) - position(a)) + (remainder(b) - remainder(a)),
+    (position(c) - position(a)) + (remainder(c) - remainder(a)),
+    (position(c) - position(b)) + (remainder(c) - remainder(b)),
+    (position(a) + position(b) + position(c)) / 3.0,
+  );
+}
+
+// The unit normal beside a unit axis; any perpendicular where the triangle is a line.
+fn perpendicular(first: vec3f, raw_normal: vec3f, longest: f32) -> vec3f {
+  var normal = raw_normal;
+  if length(normal) <= 2.0 * MIN_AREA_RATIO * longest {
+    normal = cross(first, select(vec3f(0.0, 0.0, 1.0), vec3f(1.0, 0.0, 0.0), abs(first.z) > UPRIGHT_COSINE));
+  }
+  normal -= dot(normal, first) * first;
+  return normal / length(normal);
+}
+
+// Write a triangle's origin and matrix: camera point = matrix · local + origin. And its strain, where it is wanted.
+@compute @workgroup_size(WORKGROUP)
+fn compose(
+  @builtin(workgroup_id) workgroup: vec3u,
+  @builtin(num_workgroups) workgroups: vec3u,
+  @builtin(local_invocation_index) local: u32,
+) {
+  let f = thread_number(workgroup, workgroups, local);
+  if f >= pose.triangles {
+    return;
+  }
+  let e = edges_of(f);
+  let longest = max(dot(e.first, e.first), max(dot(e.second, e.second), dot(e.third, e.third)));
+  let least = MIN_AREA_RATIO * sqrt(longest);
+  let raw_normal = cross(e.first, e.second);
+  let edge = length(e.first);
+  var first = e.first;
+  if pose.area_scales == 1u {
+    first = -(e.first + e.second) / 3.0; // from the center to corner 0
+  }
+  if length(first) <= least {
+    first = vec3f(1.0, 0.0, 0.0);
+  } else {
+    first /= length(first);
+  }
+  let normal = perpendicular(first, raw_normal, longest);
+  var axes = mat3x3f(first, normal, cross(first, normal));
+  var across = length(e.second);
+  if edge > least {
+    across = length(raw_normal) / edge;
+  }
+  var scale = 0.5 * (edge + across);
+  if pose.area_scales == 1u {
+    axes = mat3x3f(first, cross(normal, first), normal);
+    scale = 1.0;
+    if neutral_area[f] > 0.0 {
+      scale = sqrt(0.5 * length(raw_normal) / neutral_area[f]);
+    }
+  }
+  let at = f * (FRAME_STRAIN + pose.strains);
+  let center = vec4f(e.center, 1.0);
+  frames[at + FRAME_ORIGIN] = dot(pose.row_x, center);
+  frames[at + FRAME_ORIGIN + 1u] = dot(pose.row_y, center);
+  frames[at + FRAME_ORIGIN + 2u] = dot(pose.row_z, center);
+  write_row(at + FRAME_MATRIX, scale * (pose.row_x.xyz * axes));
+  write_row(at + FRAME_MATRIX + 3u, scale * (pose.row_y.xyz * axes));
+  write_row(at + FRAME_MATRIX + 6u, scale * (pose.row_z.xyz * axes));
+  if pose.strains > 0u {
+    write_tensor(f, e);
+  }
+}
+
+fn write_row(at: u32, row: vec3f) {
+  frames[at] = row.x;
+  frames[at + 1u] = row.y;
+  frames[at + 2u] = row.z;
+}
+
+// Green's strain of a triangle: the change of its edges' squared lengths and product, as a tensor.
+fn write_tensor(f: u32, e: Edges) {
+  let at = f * (TO_PLANE + TENSOR * pose.strains);
+  let gram = vec3f(dot(e.first, e.first), dot(e.first, e.second), dot(e.second, e.second));
+  let change = gram - vec3f(basis[at], basis[at + 1u], basis[at + 2u]);
+  for (var d = 0u; d < TENSOR; d++) {
+    let row = at + TO_TENSOR + d;
+    tensors[TENSOR * f + d] = change.x * basis[row] + change.y * basis[row + TENSOR]
+      + change.z * basis[row + 2u * TENSOR];
+  }
+}
+
+// Strain in the triangle's own directions: of the mean over its corners of the mean over the triangles touching each.
+@compute @workgroup_size(WORKGROUP)
+fn average_strain(
+  @builtin(workgroup_id) workgroup: vec3u,
+  @builtin(num_workgroups) workgroups: vec3u,
+  @builtin(local_invocation_index) local: u32,
+) {
+  let f = thread_number(workgroup, workgroups, local);
+  if f >= pose.triangles {
+    return;
+  }
+  var mean: array<f32, TENSOR>;
+  for (var corner = 0u; corner < 3u; corner++) {
+    let vertex = faces[3u * f + corner];
+    let end = touching[vertex + 1u];
+    let share = 1.0 / (3.0 * f32(max(end - touching[vertex], 1u)));
+    for (var n = touching[vertex]; n < end; n++) {
+      for (var d = 0u; d < TENSOR; d++) {
+        mean[d] += share * tensors[TENSOR * touching[n] + d];
+      }
+    }
+  }
+  for (var k = 0u; k < pose.strains; k++) {
+    let row = f * (TO_PLANE + TENSOR * pose.strains) + TO_PLANE + TENSOR * k;
+    var strain = 0.0;
+    for (var d = 0u; d < TENSOR; d++) {
+      strain += mean[d] * basis[row + d];
+    }
+    strain = clamp(STRAIN_GAIN * strain, -MAX_STRAIN, MAX_STRAIN);
+    // Rounding of a rigid triangle is no strain: Adam would take its sign for a gradient and step at full rate.
+    frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
+  }
+}

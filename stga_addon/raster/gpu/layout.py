@@ -1,0 +1,148 @@
+"""Memory layout of the GPU's arrays, in Python and as the WGSL prelude that every kernel begins with.
+
+A table is a flat array of 32-bit words, row by row, without padding: word c of row i is table[i * stride + c].
+N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs, image H × W.
+
+| table          | words per row    | content                                                                          |
+|----------------|------------------|----------------------------------------------------------------------------------|
+| splats         | 11 + 3K + 3S f32 | the fields of `cpu.layout.Parameters` in that order; also gradients and moments  |
+| frames         | 12 + columns f32 | a triangle's origin (3), matrix (3, 3) by rows, strain, in camera space          |
+| projected      | PROJECTED f32    | a splat on the screen: the columns of `cpu.layout`                               |
+| rect           | 4 i32            | tile bounds x0, y0, x1, y1 of a splat, as in `cpu.layout.Projection`             |
+| depth_key      | 1 u32            | bits of a splat's depth; HIDDEN where it is not visible                          |
+| slots          | 2 u32            | a splat's first row in pair_gradients, and how many there are                    |
+| pair_gradients | PROJECTED f32    | gradient of a pair with respect to the splat's projected columns; by splat       |
+| wanted         | 1 u32            | 1 for splats that are visible and in focus: only their gradients are written     |
+| touched        | 1 u32            | 1 for the tiles that a splat in focus reaches                                    |
+| rendered       | 1 u32            | 1 for those and the tiles around them, as far as their gradient depends on       |
+| tile_range     | 2 u32            | a tile's first pair and one past its last                                        |
+| pairs          | 2 u32            | splat, with WANTED, and row in pair_gradients; by tile, near to far              |
+| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile   |
+"""
+
+import math
+
+import numpy as np
+
+from ...avatar import embedding, strain
+from ..cpu import blend, image_loss, layout, optimizer, project
+from ..cpu.layout import Parameters
+
+WORKGROUP = 256
+"""Threads of a workgroup: a tile's pixels, and the largest size that every adapter has."""
+HIDDEN = 0xFFFFFFFF
+WANTED = 0x80000000
+"""Marks the pairs of wanted splats in `pairs`, beside the splat's number."""
+MAX_GROUPS = 65535
+"""Workgroups along one dimension of a dispatch."""
+DIGIT_BITS = 11
+SORT_BLOCK = 2048
+"""Keys that a workgroup sorts."""
+SORT_GROUPS, PAIR_GROUPS, PAIRS, NEEDED, OVERFLOWED, COUNTS = 0, 3, 6, 7, 8, 9
+"""Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and 1 if they did not
+fit since the host last cleared it."""
+XYZ, ROTATION, LOG_SCALE, OPACITY_LOGIT, SH = 0, 3, 7, 10, 11
+"""Columns of a splat; its strain colors begin after the SH coefficients."""
+FRAME_ORIGIN, FRAME_MATRIX, FRAME_STRAIN = 0, 3, 12
+
+VIEW = np.dtype(
+    [(name, np.float32) for name in ("fl_x", "fl_y", "cx", "cy")]
+    + [(name, np.uint32) for name in ("width", "height", "tiles_x", "tiles_y")]
+    + [(f"to_world_{row}{column}", np.float32) for row in range(3) for column in range(3)]
+    + [(f"background_{channel}", np.float32) for channel in "rgb"]
+    + [
+        (name, np.uint32)
+        for name in (
+            "splats",  # N
+            "coefficients",  # K, stored
+            "strain_colors",  # S, stored
+            "degree",  # of the spherical harmonics in use
+            "strains",  # strain colors in use
+            "frame_strains",  # columns of strain in `frames`
+            "depth_as_color",
+            "antialiased",
+            "focused",  # 0 where every splat is in focus
+            "ring",  # tiles that are rendered around those which the focus touches
+            "capacity",  # pairs that the buffers hold
+        )
+    ]
+)
+"""The uniform `view` of an iteration: camera, sizes and rendering options."""
+
+CONSTANTS: dict[str, int | float] = {
+    "WORKGROUP": WORKGROUP,
+    "TILE": layout.TILE,
+    "PIXELS": layout.PIXELS,
+    "PROJECTED": layout.PROJECTED,
+    **{name: getattr(layout, name) for name in ("MEAN_X", "MEAN_Y", "PRECISION_X", "SHEAR", "PRECISION_Y")},
+    **{name: getattr(layout, name) for name in ("OPACITY", "RED", "GREEN", "BLUE")},
+    "XYZ": XYZ,
+    "ROTATION": ROTATION,
+    "LOG_SCALE": LOG_SCALE,
+    "OPACITY_LOGIT": OPACITY_LOGIT,
+    "SH": SH,
+    "FRAME_ORIGIN": FRAME_ORIGIN,
+    "FRAME_MATRIX": FRAME_MATRIX,
+    "FRAME_STRAIN": FRAME_STRAIN,
+    "HIDDEN": HIDDEN,
+    "WANTED": WANTED,
+    "MAX_GROUPS": MAX_GROUPS,
+    "DIGITS": 1 << DIGIT_BITS,
+    "SORT_BLOCK": SORT_BLOCK,
+    "SORT_GROUPS": SORT_GROUPS,
+    "PAIR_GROUPS": PAIR_GROUPS,
+    "PAIRS": PAIRS,
+    "NEEDED": NEEDED,
+    "OVERFLOWED": OVERFLOWED,
+    **{name: float(getattr(blend, name)) for name in ("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE")},
+    **{name: float(getattr(project, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
+    **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
+    **{name: getattr(strain, name) for name in ("STRAIN_GAIN", "MAX_STRAIN")},
+    "WINDOW_RADIUS_PX": image_loss.WINDOW_RADIUS_PX,
+    **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
+    "SSIM_C1": float(image_loss.C1),
+    "SSIM_C2": float(image_loss.C2),
+    "MAX_GRADIENT": float(optimizer.MAX_GRADIENT),
+}
+
+
+def splat_stride(splats: Parameters) -> int:
+    """Words per row of `splats`."""
+    strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
+    return int(SH + 3 * splats.sh.shape[1] + 3 * strain_colors)
+
+
+def splat_rows(splats: Parameters) -> np.ndarray:
+    """Numpy arrays of splats as one table (N, stride) float32."""
+    parts = [part for part in splats if part is not None]
+    flat = [np.asarray(part, np.float32).reshape(len(part), math.prod(part.shape[1:])) for part in parts]
+    return np.concatenate(flat, axis=1)
+
+
+def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
+    """The opposite of `splat_rows`: copies of its columns; coefficients: K."""
+    n, end = len(rows), SH + 3 * coefficients
+    return Parameters(
+        xyz=rows[:, XYZ:ROTATION].copy(),
+        rotation=rows[:, ROTATION:LOG_SCALE].copy(),
+        log_scale=rows[:, LOG_SCALE:OPACITY_LOGIT].copy(),
+        opacity=rows[:, OPACITY_LOGIT].copy(),
+        sh=rows[:, SH:end].reshape(n, coefficients, 3).copy(),
+        strain_color=rows[:, end:].reshape(n, (rows.shape[1] - end) // 3, 3).copy(),
+    )
+
+
+def struct_wgsl(name: str, fields: np.dtype) -> str:
+    """A WGSL struct with the memory layout of a numpy record of 32-bit scalars."""
+    kinds = {"f": "f32", "u": "u32", "i": "i32"}
+    lines = [f"  {field}: {kinds[fields[field].kind]}," for field in fields.names or ()]
+    return "\n".join([f"struct {name} {{", *lines, "}", ""])
+
+
+def constants_wgsl() -> str:
+    """Every constant that Python and WGSL share."""
+    return "".join(
+        f"const {name}: {'u32' if isinstance(value, int) else 'f32'} = "
+        f"{f'{value}u' if isinstance(value, int) else float(np.float32(value)).hex() + 'f'};\n"
+        for name, value in CONSTANTS.items()
+    )

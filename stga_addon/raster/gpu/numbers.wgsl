@@ -1,0 +1,20 @@
+// Functions of single numbers that several kernels need.
+
+const MAX_EXPONENT: f32 = 88.0; // the largest whose exponential float32 holds
+
+// By its bits, because a shader's compiler may assume that there are no infinities and NaNs.
+fn is_finite(value: f32) -> bool {
+  return (bitcast<u32>(value) & 0x7f800000u) != 0x7f800000u;
+}
+
+fn is_nan(value: f32) -> bool {
+  return (bitcast<u32>(value) & 0x7fffffffu) > 0x7f800000u;
+}
+
+fn bounded_exp(value: f32) -> f32 {
+  return exp(min(value, MAX_EXPONENT));
+}
+
+fn sigmoid(logit: f32) -> f32 {
+  return 1.0 / (1.0 + bounded_exp(-logit));
+}

@@ -1,0 +1,37 @@
+"""A capture's head, its cameras and its avatar in an empty scene."""
+
+from pathlib import Path
+from typing import Any
+
+from ..avatar.file import Avatar
+from ..capture.model import Capture
+from . import tags
+from .blend_file import current_scene
+from .cameras import central, configure_scene, import_cameras
+from .display.splat_object import hide_object, show_avatar
+from .objects import capture_root
+from .rig.head import import_head
+from .timeline import go_to_frame
+from .viewports import frame_alone
+
+
+def set_up_head(capture: Capture, flame: Path | None) -> Any:
+    """Bring the capture's head and cameras into the open file's empty scene; returns the head. Raises StgaError."""
+    head = import_head(capture)
+    head[tags.FLAME_MODEL] = str(flame.resolve()) if flame is not None else ""  # so that Train works in the saved file
+    cameras = import_cameras(capture, capture_root(capture.root))
+    configure_scene(current_scene(), capture, central(cameras))
+    return head
+
+
+def show_on_head(avatar: Avatar, head: Any, link: str, fps: int) -> Any:
+    """Show the avatar in place of the mesh, with every viewport on it; returns the splats.
+
+    link: the avatar's file, relative to the .blend file; fps: frames per second at which the scene plays.
+    """
+    shown = show_avatar(avatar, head)
+    shown[tags.AVATAR] = link
+    hide_object(head, current_scene())
+    go_to_frame(head[tags.TIMESTEPS][0])
+    frame_alone(head, current_scene(), fps)
+    return shown

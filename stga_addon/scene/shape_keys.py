@@ -1,0 +1,38 @@
+"""A mesh object with shape keys as a linear head model."""
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from .arrays import read_values
+
+
+def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
+    """Basis (V, 3) in meters, y up, triangles (F, 3), and names and displacements (V, 3, K) of the other shape keys.
+
+    In world space, turned from Blender's axes, in which a head looks along -y: z up becomes y up. Modifiers, values
+    and drivers are left out. Raises StgaError for an object without shape keys.
+    """
+    keys: Any = thing.data.shape_keys if thing.type == "MESH" else None
+    blocks = [] if keys is None else list(keys.key_blocks)
+    if len(blocks) < 2:
+        raise StgaError(f"{thing.name}: has no shape keys; a head model needs a basis and expressions")
+    turn = _world_to_y_up() @ np.array(thing.matrix_world)
+    basis = keys.reference_key
+    mean = _points(basis) @ turn[:3, :3].T + turn[:3, 3]
+    others = [block for block in blocks if block != basis]
+    moved = np.stack([_points(block) - _points(block.relative_key) for block in others], axis=2)
+    shapes = np.einsum("ab,vbk->vak", turn[:3, :3], moved)
+    thing.data.calc_loop_triangles()
+    faces = read_values(thing.data.loop_triangles, "vertices", 3, np.int32)
+    return mean, faces, tuple(block.name for block in others), shapes
+
+
+def _points(block: Any) -> np.ndarray:
+    return read_values(block.data, "co", 3).astype(np.float64)
+
+
+def _world_to_y_up() -> np.ndarray:
+    """(x, y, z) of Blender is (x, z, -y)."""
+    return np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)

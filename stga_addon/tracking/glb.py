@@ -1,0 +1,200 @@
+"""Reading of meshes with morph targets from binary glTF."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import file_size, parse_json
+
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3}
+TRIANGLES = 4
+MAX_ELEMENTS = 20_000_000
+"""Largest accessor: one without data promises as many zeros as it likes."""
+READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
+
+
+@dataclass(frozen=True)
+class MorphMesh:
+    """positions (V, 3) in meters, y up; faces (F, 3); names of K morph targets and their displacements (V, 3, K)."""
+
+    positions: np.ndarray
+    faces: np.ndarray
+    names: tuple[str, ...]
+    targets: np.ndarray
+
+
+def read_glb(path: Path) -> MorphMesh:
+    """All triangle meshes of the scene of a .glb file, as one; targets of the same name are one.
+
+    Vertices that are split at seams of normals and texture coordinates are merged. Skins are left in their bind pose.
+    Raises StgaError naming the file and what is missing or not supported. Source: Khronos, glTF 2.0.
+    """
+    file_size(path)
+    try:
+        document, data = _chunks(path.read_bytes())
+        _require_readable(path, document)
+        nodes = _mesh_nodes(document)
+        parts = [part for node, matrix in nodes for part in _placed(document, data, node, matrix)]
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except StgaError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, struct.error, RecursionError) as error:
+        raise StgaError(f"{path}: is not a readable GLB ({type(error).__name__}: {error!s:.100})") from error
+    if not parts:
+        raise StgaError(f"{path}: its scene has no triangle mesh")
+    return _merged(_joined(parts))
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON document and the binary chunk."""
+    magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
+    if (magic, version, kind) != (b"glTF", 2, b"JSON"):
+        raise ValueError("expected binary glTF 2.0")
+    document = parse_json(data[20 : 20 + length])
+    rest = data[20 + length :]
+    size = struct.unpack_from("<I", rest)[0] if len(rest) >= 8 else 0
+    return document, rest[8 : 8 + size]
+
+
+def _require_readable(path: Path, document: dict[str, Any]) -> None:
+    unknown = set(document.get("extensionsRequired", ())) - READABLE_EXTENSIONS
+    if unknown:
+        raise StgaError(f"{path}: needs {', '.join(sorted(map(str, unknown)))}; export it without compression")
+    if any("uri" in buffer for buffer in document.get("buffers", ())):
+        raise StgaError(f"{path}: refers to other files; export a GLB that holds its buffers")
+
+
+def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Nodes of the scene that have a mesh, and their transforms (4, 4)."""
+    nodes = document.get("nodes", [])
+    waiting = [(int(row), np.eye(4)) for row in document["scenes"][document.get("scene", 0)].get("nodes", ())]
+    for _ in range(len(nodes)):  # each node has one parent: more would be a loop
+        if not waiting:
+            return
+        row, above = waiting.pop()
+        node = nodes[row]
+        matrix = above @ _transform(node)
+        waiting += [(int(child), matrix) for child in node.get("children", ())]
+        if "mesh" in node:
+            yield node, np.eye(4) if "skin" in node else matrix
+
+
+def _transform(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
+    result = np.eye(4)
+    result[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    result[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), float)
+    result[:3, 3] = node.get("translation", (0, 0, 0))
+    return result
+
+
+def _placed(document: dict[str, Any], data: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[MorphMesh]:
+    """The triangle primitives of a node's mesh, in the scene's axes."""
+    mesh = document["meshes"][node["mesh"]]
+    names = mesh.get("extras", {}).get("targetNames", ()) if isinstance(mesh.get("extras"), dict) else ()
+    parts = []
+    for primitive in mesh["primitives"]:
+        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+            continue
+        positions = _accessor(document, data, primitive["attributes"]["POSITION"])
+        morphs = primitive.get("targets", ())
+        given = (
+            [str(name) for name in names] if len(names) == len(morphs) else [f"target {k}" for k in range(len(morphs))]
+        )
+        shape = positions.shape
+        moved = [_accessor(document, data, m["POSITION"]) if "POSITION" in m else np.zeros(shape) for m in morphs]
+        targets = np.stack(moved, axis=2) if moved else np.zeros((*shape, 0))
+        faces = (
+            _accessor(document, data, primitive["indices"])[:, 0]
+            if "indices" in primitive
+            else np.arange(len(positions))
+        ).astype(np.int64)
+        if faces.max(initial=0) >= len(positions) or targets.shape[:2] != shape or shape[1:] != (3,):
+            raise ValueError("a primitive's indices or morph targets do not fit its vertices")
+        parts.append(
+            MorphMesh(
+                positions @ matrix[:3, :3].T + matrix[:3, 3],
+                faces[: len(faces) // 3 * 3].reshape(-1, 3),
+                tuple(given),
+                np.einsum("ab,vbk->vak", matrix[:3, :3], targets),
+            )
+        )
+    return parts
+
+
+def _accessor(document: dict[str, Any], data: bytes, number: int) -> np.ndarray:
+    """Values (N, width) of an accessor, sparse ones applied."""
+    accessor = document["accessors"][number]
+    count, width = int(accessor["count"]), WIDTHS[accessor["type"]]
+    if not 0 < count <= MAX_ELEMENTS:
+        raise ValueError(f"an accessor of {count} elements")
+    if "bufferView" in accessor:
+        values = _view(document, data, accessor, accessor["componentType"], count, width)
+    else:
+        values = np.zeros((count, width))
+    sparse = accessor.get("sparse")
+    if sparse:
+        changed = int(sparse["count"])
+        rows = _view(document, data, sparse["indices"], sparse["indices"]["componentType"], changed, 1)[:, 0]
+        values[rows.astype(np.int64)] = _view(
+            document, data, sparse["values"], accessor["componentType"], changed, width
+        )
+    if accessor.get("normalized"):
+        limits = np.iinfo(COMPONENTS[accessor["componentType"]])
+        values = np.maximum(values / limits.max, -1)
+    return values
+
+
+def _view(
+    document: dict[str, Any], data: bytes, source: dict[str, Any], component: int, count: int, width: int
+) -> np.ndarray:
+    """(count, width) float64 copies of a buffer view's values."""
+    view, dtype = document["bufferViews"][source["bufferView"]], np.dtype(COMPONENTS[component])
+    if view.get("buffer", 0) != 0:
+        raise ValueError("expected one buffer")
+    start = int(view.get("byteOffset", 0)) + int(source.get("byteOffset", 0))
+    stride = int(view.get("byteStride", dtype.itemsize * width))
+    if min(start, stride, count) < 0 or start + stride * max(count - 1, 0) + dtype.itemsize * width > len(data):
+        raise ValueError("an accessor reaches beyond the file")
+    strides = (stride, dtype.itemsize)
+    return np.ndarray((count, width), dtype, data, start, strides).astype(np.float64)
+
+
+def _joined(parts: list[MorphMesh]) -> MorphMesh:
+    """One mesh of all parts; a part without a target of some name is not moved by it."""
+    names = tuple(dict.fromkeys(name for part in parts for name in part.names))
+    columns = {name: column for column, name in enumerate(names)}
+    starts = np.cumsum([0, *(len(part.positions) for part in parts)])
+    targets = np.zeros((starts[-1], 3, len(names)))
+    for start, part in zip(starts, parts, strict=False):
+        for own, name in enumerate(part.names):
+            targets[start : start + len(part.positions), :, columns[name]] += part.targets[:, :, own]
+    faces = np.concatenate([part.faces + start for start, part in zip(starts, parts, strict=False)])
+    return MorphMesh(np.concatenate([part.positions for part in parts]), faces, names, targets)
+
+
+def _merged(mesh: MorphMesh) -> MorphMesh:
+    """The mesh with vertices merged that no target parts, and without triangles that collapse by it."""
+    rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)]) + 0.0  # no -0
+    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1])))[:, 0]
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # vertices in the order of the file
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    faces = rank[inverse.ravel()][mesh.faces]
+    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    kept = first[order]
+    return MorphMesh(mesh.positions[kept], faces[~collapsed], mesh.names, mesh.targets[kept])

@@ -1,0 +1,235 @@
+"""Continuing a finished run in another folder: refining a region of its avatar, or extending it by further takes."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...avatar.file import read_avatar
+from ...capture.model import Capture, View
+from ...capture.open import open_capture
+from ...capture.region import find_region
+from ...capture.takes import first_timesteps, join_takes, require_same_head
+from ...errors import StgaError
+from ...raster.cpu.layout import Parameters
+from ...selection import select_capture
+from ..evaluate.evaluation_views import (
+    MAX_EVALUATION_VIEWS,
+    MIN_REGION_PIXELS,
+    EvaluationView,
+    read_evaluation_view,
+    spread_views,
+    visible_pixels,
+)
+from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
+from ..optimize.exposure import exposure_correction
+from ..optimize.state import TrainState, new_state
+from ..optimize.tracking import with_refined_tracking
+from ..settings import Rates, TrainingSettings, validate
+from .checkpoint import read_checkpoint
+from .folder import CHECKPOINT, Continuation, Run, Take
+from .identity import file_digest, identity_of
+from .open_run import OpenedRun, open_run
+from .replay import replayed_views
+from .request import Extension, Refinement, Request
+
+START_SHARE = 0.6
+"""Share of the run's schedule of learning rates that has passed when its continuation begins."""
+DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
+"""Density control of a continuation, whose budget is a tenth of a training's."""
+MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
+"""How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
+MIN_GROUP_VIEWS = 4
+"""Evaluation views of a group at least, where it has so many."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that can be trained: its capture of all takes, and timestep -> triangles to train, where they are given."""
+
+    run: Run
+    capture: Capture
+    selection: dict[int, np.ndarray] | None
+
+
+def prepare(wanted: Request, device: str, flame: Path | None = None) -> Prepared:
+    """Check what is asked for, and decide what is trained. Raises StgaError."""
+    if isinstance(wanted, Refinement):
+        return prepare_refinement(wanted, device, flame)
+    return prepare_extension(wanted, device, flame)
+
+
+def prepare_refinement(wanted: Refinement, device: str, flame: Path | None = None) -> Prepared:
+    """Check what is asked for. Raises StgaError where the run, the region or the frames do not exist."""
+    opened = open_run(wanted.parent, flame=flame)
+    capture = with_refined_tracking(opened.capture, wanted.parent)
+    region = find_region(capture, wanted.region)
+    face = read_avatar(wanted.parent / "avatar.npz").splats.face
+    count = int(region[face].sum())
+    if not count:
+        raise StgaError(f"region '{wanted.region}': the avatar has no splats there")
+    settings = continued_settings(
+        opened.run.settings, "refine", wanted.growth * count / len(face), wanted.seconds, wanted.iterations, wanted.seed
+    )
+    frames = wanted.frames or (min(capture.timesteps), max(capture.timesteps))
+    if not any(frames[0] <= view.timestep <= frames[1] for view in capture.views.get("train", ())):
+        raise StgaError(f"{wanted.parent}: its capture has no training views from timestep {frames[0]} to {frames[1]}")
+    run = replace(
+        opened.run,
+        settings=settings,
+        device=device,
+        identity=None,
+        continuation=Continuation(wanted.parent.resolve(), file_digest(wanted.parent / "avatar.npz"), *frames),
+    )
+    return Prepared(run, capture, {capture.timesteps[0]: region})
+
+
+def prepare_extension(wanted: Extension, device: str, flame: Path | None = None) -> Prepared:
+    """Check the takes, and select what they need: the triangles that move, and those that look different than before.
+
+    Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
+    in the run already.
+    """
+    opened = open_run(wanted.parent, flame=flame)
+    run, new = opened.run, [_open_new_take(opened, path) for path in wanted.captures]
+    everything = [*opened.takes, *new]
+    capture = with_refined_tracking(join_takes(everything), wanted.parent)
+    starts = first_timesteps(everything)[len(opened.takes) :]
+    added = [
+        Take(take.root, start, identity_of(take, run.flame, run.principal_point, run.settings))
+        for take, start in zip(new, starts, strict=True)
+    ]
+    continuation = Continuation(
+        wanted.parent.resolve(), file_digest(wanted.parent / "avatar.npz"), starts[0], max(capture.timesteps)
+    )
+    selection = select_for_takes(continuation, capture, run.settings)
+    face = read_avatar(wanted.parent / "avatar.npz").splats.face
+    share = float(np.any(list(selection.values()), axis=0)[face].mean())
+    settings = continued_settings(
+        run.settings, "extend", wanted.growth * share, wanted.seconds, wanted.iterations, wanted.seed
+    )
+    run = replace(
+        run, settings=settings, device=device, identity=None, takes=(*run.takes, *added), continuation=continuation
+    )
+    return Prepared(run, capture, selection)
+
+
+def select_for_takes(continuation: Continuation, capture: Capture, settings: TrainingSettings) -> dict[int, np.ndarray]:
+    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old takes.
+
+    A triangle looks different where the avatar's residual in a few views of the new takes is larger than in a few of
+    the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
+    """
+    views = capture.views["train"]
+    avatar, correct = read_avatar(continuation.parent / "avatar.npz"), exposure_correction(settings)
+    old, new = (
+        triangle_residuals(avatar, capture, replayed_views(capture, members), correct, RESIDUAL_SCALE).mean()
+        for members in (
+            [view for view in views if not continuation.includes(view.timestep)],
+            [view for view in views if continuation.includes(view.timestep)],
+        )
+    )
+    known, now = np.nan_to_num(old), np.nan_to_num(new)
+    differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
+    timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
+    moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
+    return {timestep: faces | differs for timestep, faces in moving.items()}
+
+
+def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
+    run = opened.run
+    take = open_capture(path, run.flame, run.principal_point)
+    require_same_head(opened.capture, take)
+    if not take.views.get("train"):
+        raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
+    if any(take.root == old.root for old in opened.takes):
+        raise StgaError(f"{take.root}: is a take of this run already")
+    return take
+
+
+def starting_state(continuation: Continuation) -> TrainState:
+    """The parent's avatar as a state of training.
+
+    The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
+    Raises StgaError where the avatar is not the one that the continuation was made for.
+    """
+    folder = continuation.parent
+    if file_digest(folder / "avatar.npz") != continuation.avatar:
+        raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
+    splats = read_avatar(folder / "avatar.npz").splats
+    if (folder / CHECKPOINT).exists():
+        state = read_checkpoint(folder).state
+        kept = state.averaged()
+        if all(np.array_equal(array, getattr(kept, name)) for name, array in vars(splats).items()):
+            parameters = Parameters(*(tensor.clone() for tensor in state.average))
+            zero = torch.zeros(len(state))
+            return replace(state, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
+    return new_state(splats)
+
+
+def late_rates(rates: Rates, share: float) -> Rates:
+    """The rates of a schedule of which this share has passed; they end where the schedule ends."""
+    names = [name for name in vars(rates) if name not in ("position_end", "end")]
+    ends = {name: rates.position_end if name == "xyz" else rates.end for name in names}
+    now = {name: getattr(rates, name) * ends[name] ** share for name in names}
+    rest = {"position_end": rates.position_end ** (1 - share), "end": rates.end ** (1 - share)}
+    return replace(rates, **now, **rest)
+
+
+def continued_settings(
+    settings: TrainingSettings,
+    strategy: str,
+    growth: float,
+    seconds: float | None,
+    iterations: int | None,
+    seed: int,
+) -> TrainingSettings:
+    """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a value not allowed."""
+    continued = replace(
+        settings,
+        strategy=strategy,
+        seconds=seconds,
+        iterations=iterations,
+        seed=seed,
+        rates=late_rates(settings.rates, START_SHARE),
+        views_per_visit=1,
+        warm_up_share=0.0,
+        sh_steps=(0.0,) * settings.sh_degree,
+        coarse_share=0.0,
+        density_interval=DENSITY_INTERVAL if growth else 0,
+        density_span=DENSITY_SPAN,
+        growth=growth,
+        target_psnr=None,
+        stop_when_flat=False,
+        tracking=False,
+        effects=None,
+    )
+    validate(continued)
+    return continued
+
+
+def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | None) -> list[EvaluationView]:
+    """Evaluation views of a run that continues another, in groups: by take, or frames that are refined and others.
+
+    region (F,) bool: its visible pixels become the views' region "region"; None for an extension.
+    """
+    groups: dict[str, list[View]] = {}
+    for view in capture.views.get("val", ()):
+        groups.setdefault(_group(run, view.timestep), []).append(view)
+    limit, chosen = max(MIN_GROUP_VIEWS, MAX_EVALUATION_VIEWS // max(1, len(groups))), []
+    for group, members in groups.items():
+        for view in spread_views(members, limit):
+            found = replace(read_evaluation_view(capture, view), group=group)
+            pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
+            if pixels.sum() >= MIN_REGION_PIXELS:
+                found = replace(found, regions={**found.regions, "region": pixels})
+            chosen.append(found)
+    return chosen
+
+
+def _group(run: Run, timestep: int) -> str:
+    assert run.continuation is not None
+    if run.settings.strategy == "extend":
+        return f"take_{1 + sum(take.start <= timestep for take in run.takes)}"
+    return "frames" if run.continuation.includes(timestep) else "other_frames"

@@ -1,0 +1,132 @@
+"""Refine and Extend from Blender: what is painted or selected reaches the worker, and the preview stays in place."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import write_mesh_capture  # noqa: E402
+
+from stga_addon.avatar.file import read_avatar  # noqa: E402
+from stga_addon.files import read_npz  # noqa: E402
+from stga_addon.training.run.folder import read_run  # noqa: E402
+
+from .test_operators import write_ball_avatar  # noqa: E402
+
+
+@pytest.fixture
+def head(extension, tmp_path):
+    """The head of a mesh capture, with a painted vertex group of forty triangles."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    head = bpy.context.scene.stga.head
+    corners = np.array([polygon.vertices[:] for polygon in head.data.polygons])
+    group = head.vertex_groups.new(name="cheek")
+    group.add(np.unique(corners[:40]).tolist(), 0.8, "REPLACE")
+    head.vertex_groups.new(name="faint").add(np.unique(corners[:40]).tolist(), 0.3, "REPLACE")
+    return head
+
+
+@pytest.fixture
+def jobs(extension, monkeypatch):
+    """Operators that write the job and train nothing."""
+    train = extension.operators.train
+    monkeypatch.setattr(train, "_train_here", lambda context, run: run / "avatar.npz")
+    monkeypatch.setattr(train, "missing_packages", list)
+    return extension.stga_addon.jobs.training_job
+
+
+@pytest.fixture
+def run(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_ball_avatar(folder / "avatar.npz")
+    return folder
+
+
+def test_painted_group_becomes_the_region(head, jobs, run):
+    """Catches a region of other triangles than those painted, and settings of the panel that are lost."""
+    assert bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, seconds=7, growth=0.5) == {
+        "FINISHED"
+    }
+    new = run.with_name("run_2")
+    wanted = jobs.read_job(new).continues
+    assert (wanted.parent, wanted.frames, wanted.seconds, wanted.growth) == (run, (1, 3), 7, 0.5)
+    weights = read_npz(Path(wanted.region))["weights"]
+    assert weights[:40] == pytest.approx(0.8)
+    assert (weights >= 0.5).sum() < 80
+    assert bpy.context.scene.stga.run_folder == str(new)
+
+
+def test_faces_selected_in_edit_mode_become_the_region(head, jobs, run):
+    """Catches a selection as it was before Edit Mode, and a vertex group used although faces are selected."""
+    head.hide_set(False)
+    bpy.context.view_layer.objects.active = head
+    for polygon in head.data.polygons:
+        polygon.select = polygon.index in (3, 5, 8)
+    bpy.context.tool_settings.mesh_select_mode = (False, False, True)
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert bpy.ops.stga.refine(directory=str(run), seconds=3) == {"FINISHED"}
+    weights = read_npz(Path(jobs.read_job(run.with_name("run_2")).continues.region))["weights"]
+    assert np.flatnonzero(weights).tolist() == [3, 5, 8]
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_splats_of_the_run_before_show_the_new_one(head, jobs, run, extension):
+    """Catches a preview in a second object over the first one."""
+    assert bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz")) == {"FINISHED"}
+    shown = bpy.context.scene.stga.splats
+    assert bpy.ops.stga.refine(directory=str(run), region="mouth", seconds=3) == {"FINISHED"}
+    new = run.with_name("run_2")
+    assert jobs.read_job(new).continues.region == "mouth"
+    assert shown[extension.stga_addon.scene.tags.RUN] == str(new)
+
+
+def test_mistakes_are_sentences(head, jobs, run, tmp_path):
+    """Catches tracebacks, and folders begun for what cannot be trained."""
+    for operator, arguments, sentence in (
+        (bpy.ops.stga.refine, {"group": "chin"}, "has no vertex group 'chin'"),
+        (bpy.ops.stga.refine, {"group": "faint"}, "no triangle has all its corners in the vertex group 'faint'"),
+        (bpy.ops.stga.refine, {"directory": str(tmp_path / "none"), "group": "cheek"}, "holds no trained avatar"),
+        (bpy.ops.stga.extend, {"take": str(tmp_path / "none")}, "is not a folder"),
+        (bpy.ops.stga.extend, {"take": ""}, "take: no path given"),
+    ):
+        with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
+            operator(**{"directory": str(run), **arguments})
+    assert not run.with_name("run_2").exists()
+
+
+def test_residuals_are_shown_on_the_head(head, run, extension):
+    """Catches a heat map of other triangles than those with the error, and unknown ones that are shown as bad."""
+    residual = np.full(len(head.data.polygons), 0.01, np.float32)
+    residual[7], residual[9] = 0.2, np.nan
+    extension.stga_addon.training.run.residual_file.write_residuals(run, residual)
+    assert bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run)) == {"FINISHED"}
+    shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])
+    assert shown.argmax() == 7
+    assert shown[9] == 0
+    red = np.array([item.color[0] for item in head.data.attributes["stga_heat"].data]).reshape(-1, 3)
+    assert red[7] == pytest.approx(0.9, abs=0.01)
+    assert bpy.ops.stga.heat_map(show=False) == {"FINISHED"}
+    assert not {"stga_residual", "stga_heat"} & set(head.data.attributes.keys())
+    with pytest.raises(RuntimeError, match=r"^Error: .*residuals\.npz"):
+        bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run.parent))
+
+
+@pytest.mark.slow
+def test_refine_and_extend_end_to_end(head, tmp_path):
+    """Catches a job that the worker does not understand, and an avatar that is not that of the continued run."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    assert bpy.ops.stga.train(directory=str(run), iterations=6, device="cpu") == {"FINISHED"}
+    assert bpy.ops.stga.refine(directory=str(run), group="cheek", iterations=4, python=sys.executable) == {"FINISHED"}
+    before, after = (read_avatar(tmp_path / name / "avatar.npz").splats for name in ("run", "run_2"))
+    same = (before.sh == after.sh).all((1, 2))
+    assert not same.all()
+    assert same[before.face >= 80].all()
+    take = write_mesh_capture(tmp_path / "take")
+    assert bpy.ops.stga.extend(directory=str(tmp_path / "run_2"), take=str(take), iterations=4) == {"FINISHED"}
+    assert len(read_run(tmp_path / "run_3").takes) == 1
+    assert bpy.context.scene.stga.avatar == str(tmp_path / "run_3" / "avatar.npz")

@@ -1,0 +1,53 @@
+"""Enabling the extension in a Python that has what Blender's own has: bpy and numpy."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("bpy")
+
+ROOT = Path(__file__).resolve().parents[2]
+MAX_ENABLE_S = 0.3
+ENABLE = """
+import importlib.util, json, sys, time
+import bpy, numpy, bpy_extras.io_utils
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"torch", "numba", "wgpu", "scipy", "PIL", "av", "matplotlib"}:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Refuse())
+root = sys.argv[1]
+sys.path[:] = [folder for folder in sys.path if folder not in ("", root)]
+begin = time.process_time()
+spec = importlib.util.spec_from_file_location("stga", f"{root}/__init__.py", submodule_search_locations=[root])
+module = sys.modules["stga"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+module.register()
+took = time.process_time() - begin
+panels = [name for name in dir(bpy.types) if name.startswith("STGA_PT_")]
+module.unregister()
+print("RESULT " + json.dumps([took, panels]))
+"""
+
+
+def test_enabling_needs_numpy_alone_and_no_time() -> None:
+    """Catches an import that a plain Blender cannot satisfy, and one that makes every start of Blender slower.
+
+    The time is that of the processor: a busy machine does not count. The first start compiles bytecode.
+    """
+    times = []
+    for _ in range(3):
+        command = [sys.executable, "-c", ENABLE, str(ROOT)]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "tests")
+        line = next((line for line in done.stdout.splitlines() if line.startswith("RESULT ")), None)
+        assert line is not None, done.stderr[-2000:]
+        took, panels = json.loads(line.removeprefix("RESULT "))
+        assert "STGA_PT_show" in panels
+        times.append(took)
+    print(f"enabling took {min(times):.3f} s of processor time")
+    assert min(times) < MAX_ENABLE_S

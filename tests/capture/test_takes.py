@@ -1,0 +1,62 @@
+"""Several takes of one head as one capture."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.model import Capture
+from stga_addon.capture.takes import first_timesteps, join_takes
+from stga_addon.errors import StgaError
+
+
+def moved(capture: Capture, offset: float) -> Capture:
+    """Another take: the same head, elsewhere."""
+    return replace(capture, root=Path("other"), mesh=lambda timestep: capture.mesh(timestep) + offset)
+
+
+def test_timesteps_follow_each_other(toy: Capture) -> None:
+    """Catches a mesh or an image of one take shown at a timestep of another."""
+    other = moved(toy, 0.1)
+    joined = join_takes([toy, other])
+    (start,) = first_timesteps([toy, other])[1:]
+    assert start == max(toy.timesteps) + 1
+    assert joined.timesteps == (*toy.timesteps, *(start + timestep for timestep in toy.timesteps))
+    for timestep in toy.timesteps:
+        np.testing.assert_array_equal(joined.mesh(timestep), toy.mesh(timestep))
+        np.testing.assert_array_equal(joined.mesh(start + timestep), toy.mesh(timestep) + 0.1)
+        np.testing.assert_array_equal(
+            joined.expression_mesh(start + timestep, "head"), toy.expression_mesh(timestep, "head")
+        )
+    for split, views in toy.views.items():
+        both = joined.views[split]
+        assert both[: len(views)] == views
+        assert [view.image for view in both[len(views) :]] == [view.image for view in views]
+        assert [view.timestep - start for view in both[len(views) :]] == [view.timestep for view in views]
+
+
+def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
+    """Catches exposure of one camera corrected in the images of another that merely has its number."""
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    views = tuple(
+        replace(v, camera=replace(v.camera, world_to_camera=turned @ v.camera.world_to_camera))
+        if v.camera_index == 1
+        else v
+        for v in toy.views["train"]
+    )
+    joined = join_takes([toy, replace(toy, views={"train": views})])
+    new = joined.views["train"][len(views) :]
+    before = {view.camera_index for members in toy.views.values() for view in members}
+    kept = {old.camera_index: view.camera_index for old, view in zip(views, new, strict=True)}
+    assert kept[0] == 0
+    assert kept[1] not in before
+
+
+def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
+    """Catches one person's expressions trained into another's avatar."""
+    with pytest.raises(StgaError, match=r"^other: its neutral mesh is up to 1\.7 mm from that of"):
+        join_takes([toy, replace(toy, root=Path("other"), neutral=toy.neutral + 0.001)])
+    with pytest.raises(StgaError, match=r"^other: its mesh has other triangles than"):
+        join_takes([toy, replace(toy, root=Path("other"), faces=toy.faces[::-1])])
+    join_takes([toy, replace(toy, neutral=toy.neutral + 1e-6)])

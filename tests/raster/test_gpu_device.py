@@ -1,0 +1,140 @@
+"""The WebGPU device: buffers, uploads, dispatches and what is said when something fails."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from raster import gpu_device
+from stga_addon.errors import StgaError
+from stga_addon.raster.gpu import device as device_module
+from stga_addon.raster.gpu.device import Device, Kernel, Readback, adapters
+
+NUMBERS = """
+override STEP: u32 = 1u;
+@group(0) @binding(0) var<storage, read_write> numbers: array<u32>;
+@compute @workgroup_size(WORKGROUP)
+fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
+        @builtin(local_invocation_index) local: u32) {
+  let n = thread_number(group, groups, local);
+  if n < arrayLength(&numbers) { numbers[n] += STEP * n; }
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return gpu_device.device()
+
+
+@pytest.fixture
+def numbers(device: Device, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Kernel]:
+    """A kernel that adds STEP times its index to every word."""
+    source = device_module._source
+    monkeypatch.setattr(device_module, "_source", lambda name: NUMBERS if name == "numbers" else source(name))
+    return lambda **constants: device.kernel("numbers", **constants)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int32])
+@pytest.mark.parametrize("count", [1, 3, 4, 1021])
+def test_arrays_arrive_whole(device: Device, dtype: type, count: int) -> None:
+    """Catches the last bytes of an image that is no multiple of a word left behind."""
+    values = (np.arange(count) * 7 % 251).astype(dtype)
+    buffer = device.upload(f"values {np.dtype(dtype)}", values)
+    np.testing.assert_array_equal(device.read(buffer, values.shape, dtype), values)
+
+
+def test_every_thread_of_a_long_dispatch_runs_once(
+    device: Device, numbers: Callable[..., Kernel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches threads beyond the longest row of workgroups that are lost or run twice."""
+    monkeypatch.setattr(device_module, "MAX_GROUPS", 7)
+    count = 100 * 256 + 10
+    assert device.groups(count)[1] > 10
+    buffer = device.buffer("many", count)
+    with device.record() as work:
+        work.clear(buffer)
+        work.dispatch(numbers(), device.groups(count), numbers=buffer)
+    expected = np.arange(count, dtype=np.uint32)
+    np.testing.assert_array_equal(device.read(buffer, (count,), np.uint32), expected)
+
+
+def test_recorded_work_runs_in_order_in_one_submit(device: Device, numbers: Callable[..., Kernel]) -> None:
+    """Catches a dispatch that does not see what an earlier dispatch, copy or constant did."""
+    words, submits = 1000, device.submits
+    source, target = device.upload("source", np.full(words, 5, np.uint32)), device.buffer("target", words)
+    one, three, groups = numbers(), numbers(STEP=3), device.groups(words)
+    with device.record() as work:
+        work.copy(source, target, words)
+        work.dispatch(one, groups, numbers=target)
+        work.dispatch(three, groups, numbers=target)
+    assert device.submits == submits + 1
+    assert work.dispatches == 2
+    np.testing.assert_array_equal(device.read(target, (words,), np.uint32), 5 + 4 * np.arange(words))
+
+
+def test_an_upload_does_not_change_work_submitted_before(device: Device) -> None:
+    """Catches an iteration that trains on the next one's image."""
+    first = device.upload("image", np.full(1 << 20, 1, np.uint32))
+    kept = device.buffer("kept", 1 << 20)
+    with device.record() as work:
+        work.copy(first, kept, 1 << 20)
+    device.upload("image", np.full(1 << 20, 2, np.uint32))
+    assert (device.read(kept, (1 << 20,), np.uint32) == 1).all()
+
+
+def test_groups_from_the_device(device: Device, numbers: Callable[..., Kernel]) -> None:
+    """Catches an indirect dispatch at the wrong offset."""
+    groups, target = device.upload("groups", np.uint32([9, 9, 9, 2, 1, 1]), "indirect"), device.buffer("two", 1024)
+    with device.record() as work:
+        work.clear(target)
+        work.dispatch(numbers(), (groups, 12), numbers=target)
+    found = device.read(target, (1024,), np.uint32)
+    np.testing.assert_array_equal(found, np.where(np.arange(1024) < 512, np.arange(1024), 0))
+
+
+def test_results_arrive_late(device: Device) -> None:
+    """Catches a readback that shows another submit's words."""
+    readbacks = [Readback(device, 4) for _ in range(3)]
+    for n, readback in enumerate(readbacks):
+        words = device.upload("words", np.full(4, n, np.uint32))
+        with device.record() as work:
+            readback.copy_from(work, (words, 3), (words, 1))
+        readback.start()
+    for n, readback in enumerate(readbacks):
+        assert readback.result().tolist() == [n] * 4
+
+
+def test_a_buffer_grows_and_begins_with_zeros(device: Device) -> None:
+    """Catches a buffer that is too small, and a new one at every request."""
+    small = device.buffer("growing", 100)
+    assert device.buffer("growing", 50) is small
+    large = device.buffer("growing", 200)
+    assert large.size >= 4 * 225
+    assert device.buffer("growing", 220) is large
+    assert not device.read(large, (200,)).any()
+
+
+def test_what_the_user_is_told(device: Device) -> None:
+    """Catches a traceback of the driver's instead of a sentence."""
+    with pytest.raises(StgaError, match=r"no such adapter; there are: .*\("):
+        Device("Voodoo 2")
+    with pytest.raises(StgaError, match=r"allows buffers of \d+ MiB .* for rows"):
+        device.buffer("rows", device.max_bytes)
+    with pytest.raises(StgaError, match=r"memory of .* is full"), device.errors():
+        raise gpu_device.wgpu.GPUOutOfMemoryError("")
+    with pytest.raises(StgaError, match=r"was lost .* resume the run"), device.errors():
+        raise gpu_device.wgpu.GPUValidationError("Parent device is lost")
+
+
+def test_missing_bindings_are_refused(device: Device, numbers: Callable[..., Kernel]) -> None:
+    """Catches a dispatch with a buffer too many, which would be ignored."""
+    buffer = device.buffer("few", 4)
+    with pytest.raises(TypeError, match=r"numbers\.main binds"):
+        device.record().dispatch(numbers(STEP=2), (1, 1, 1), numbers=buffer, others=buffer)
+
+
+def test_adapters_have_names_of_their_own() -> None:
+    """Catches two equal cards of which only one can be chosen."""
+    assert len(adapters()) == len(set(adapters()))
+    assert all(name.strip() for name in adapters())

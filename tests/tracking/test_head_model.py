@@ -1,0 +1,191 @@
+"""Head models from GLB files, against trimesh, Blender's exporter and the model that they were made from."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.errors import StgaError
+from stga_addon.tracking.head_model import read_head_model, shape_arrays, write_linear_model
+
+MESH = synthetic_flame(0)
+SHAPES = MESH.shapedirs[:, :, [0, 1, -1, -2, -3]]
+NAMES = ("identity 0", "identity 1", "jawOpen", "smile", "brow")
+ICT = Path("/work/shared/data/ict_facekit_light.npz")
+
+
+def glb(document, data):
+    """Bytes of a GLB."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+
+
+def simple(**changes):
+    """A triangle with one morph target, and what is changed of its document."""
+    corners, moved = np.eye(3, dtype="<f4"), 0.1 * np.ones((3, 3), "<f4")
+    data = corners.tobytes() + moved.tobytes()
+    views = [{"buffer": 0, "byteOffset": 36 * k, "byteLength": 36} for k in range(2)]
+    accessors = [{"bufferView": k, "componentType": 5126, "count": 3, "type": "VEC3"} for k in range(2)]
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": 72}],
+    }
+    return glb(document | changes, data)
+
+
+def blender_head(mesh, faces, names, shapes):
+    """A mesh object with shape keys, in Blender's axes, of a model with y up."""
+    bpy = pytest.importorskip("bpy", reason="bpy is not installed")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    turned = [array[:, [0, 2, 1]] * [1, -1, 1] for array in (mesh, *(mesh + s for s in np.moveaxis(shapes, 2, 0)))]
+    data = bpy.data.meshes.new("Head")
+    data.from_pydata(turned[0].tolist(), [], faces.tolist())
+    head = bpy.data.objects.new("Head", data)
+    bpy.context.scene.collection.objects.link(head)
+    bpy.context.view_layer.objects.active = head
+    for name, points in zip(("Basis", *names), turned, strict=True):
+        head.shape_key_add(name=name, from_mix=False).data.foreach_set("co", points.astype(np.float32).ravel())
+    return head
+
+
+def export(path, **options):
+    import bpy
+
+    bpy.ops.export_scene.gltf(filepath=str(path), export_format="GLB", export_morph=True, **options)
+
+
+def assert_same_surface(found, mean, faces, shapes, tolerance=2e-6):
+    """The same triangles with the same displacements, in whatever order the vertices are."""
+    from scipy.spatial import cKDTree
+
+    expected = np.concatenate([mean[..., None], shapes], axis=2)[faces].mean(1)  # (F, 3, 1 + K) at the centers
+    there = np.concatenate([found.v_template[..., None], found.shapedirs], axis=2)[found.faces].mean(1)
+    distance, row = cKDTree(there[..., 0]).query(expected[..., 0])
+    assert len(there) == len(expected) == len(set(row.tolist()))
+    assert distance.max() < 2 * tolerance
+    np.testing.assert_allclose(there[row], expected, atol=tolerance)
+
+
+@pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
+def test_a_glb_that_blender_exports(tmp_path, sparse):
+    """Catches wrong axes, units or sparse accessors, and vertices that stay split at the seams of normals."""
+    head = blender_head(MESH.v_template, MESH.faces, NAMES, SHAPES)
+    head.scale = (10, 10, 10)  # the exporter writes it as the node's transform
+    head.data.transform(__import__("mathutils").Matrix.Scale(0.1, 4), shape_keys=True)
+    for polygon in head.data.polygons:
+        polygon.use_smooth = False
+    export(tmp_path / "head.glb", export_try_sparse_sk=sparse, export_try_omit_sparse_sk=False)
+    found = read_head_model(tmp_path / "head.glb")
+    assert found.layout == "mesh"
+    assert (found.model.n_identity, found.model.n_expression) == (2, 3)
+    assert len(found.model.v_template) == len(np.unique(MESH.faces))
+    assert len(found.model.faces) == len(MESH.faces)
+    assert_same_surface(found.model, MESH.v_template, MESH.faces, SHAPES)
+
+
+def test_a_glb_agrees_with_trimesh(tmp_path):
+    """Catches a scene whose nodes are placed otherwise than another reader places them."""
+    trimesh = pytest.importorskip("trimesh")
+    blender_head(MESH.v_template, MESH.faces, NAMES, SHAPES).rotation_euler = (0.3, -0.2, 0.5)
+    export(tmp_path / "head.glb")
+    scene = trimesh.load(tmp_path / "head.glb", process=False)
+    theirs = scene.to_geometry().vertices
+    found = read_head_model(tmp_path / "head.glb").model.v_template
+    np.testing.assert_allclose([found.min(0), found.max(0)], [theirs.min(0), theirs.max(0)], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_real_head_with_57_expressions(tmp_path):
+    """Catches limits that a model of real size exceeds: ICT-FaceKit's, through Blender's exporter and back."""
+    if not ICT.exists():
+        pytest.skip("ict_facekit_light.npz is missing")
+    ict = np.load(ICT)
+    mean, shapes = 0.01 * ict["neutral"], 0.01 * np.moveaxis(ict["expr"], 0, 2)
+    blender_head(mean, ict["tris"], ict["expr_names"].tolist(), shapes)
+    export(tmp_path / "head.glb")
+    found = read_head_model(tmp_path / "head.glb").model
+    assert (found.n_identity, found.n_expression) == (0, 57)
+    assert_same_surface(found, mean.astype(float), ict["tris"], shapes.astype(float), 1e-5)
+
+
+def test_seams_are_merged_and_kept_where_a_target_parts_them(tmp_path):
+    """Catches lips that are glued where they touch."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0], [0, -1, 0]], "<f4")
+    moved = np.zeros((6, 3), "<f4")
+    moved[3:, 1] = [0, -0.1, -0.1]
+    data = corners.tobytes() + moved.tobytes()
+    views = [{"buffer": 0, "byteOffset": 72 * k, "byteLength": 72} for k in range(2)]
+    accessors = [{"bufferView": k, "componentType": 5126, "count": 6, "type": "VEC3"} for k in range(2)]
+    primitive = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}
+    meshes = [{"primitives": [primitive], "extras": {"targetNames": ["part"]}}]
+    document = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": meshes, "accessors": accessors}
+    (tmp_path / "a.glb").write_bytes(glb(document | {"bufferViews": views, "buffers": [{"byteLength": 144}]}, data))
+    found = read_head_model(tmp_path / "a.glb").model
+    assert len(found.v_template) == 5  # the first corner is one, the second parts
+    assert found.faces.tolist() == [[0, 1, 2], [0, 3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        (b"", "is not a readable GLB"),
+        (b"glTF" + bytes(40), "is not a readable GLB"),
+        (simple(meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}]), "neither identity nor expression"),
+        (simple(extensionsRequired=["KHR_draco_mesh_compression"]), "export it without compression"),
+        (simple(buffers=[{"uri": "../../etc/passwd", "byteLength": 72}]), "refers to other files"),
+        (simple(scenes=[{"nodes": []}]), "no triangle mesh"),
+        (simple(nodes=[{"children": [0]}]), "no triangle mesh"),
+        (simple(nodes=[{"mesh": 9}]), "is not a readable GLB"),
+        (simple(nodes=[{"mesh": 0, "scale": [99, 99, 99]}]), "measures"),
+        (simple(accessors=[{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}] * 2), "not a readable GLB"),
+        (simple(bufferViews=[{"buffer": 0, "byteOffset": 60, "byteLength": 36}] * 2), "beyond the file"),
+    ],
+)
+def test_wrong_glbs_are_named(tmp_path, data, expected):
+    """Catches a traceback, a hang or gigabytes of memory for a file that is damaged or hostile."""
+    (tmp_path / "a.glb").write_bytes(data)
+    with pytest.raises(StgaError, match=f"a.glb: .*{expected}"):
+        read_head_model(tmp_path / "a.glb")
+
+
+def test_a_small_glb_is_read(tmp_path):
+    """Catches the errors above that come from the file they start with."""
+    (tmp_path / "a.glb").write_bytes(simple())
+    found = read_head_model(tmp_path / "a.glb").model
+    np.testing.assert_array_equal(found.v_template, np.eye(3))
+    np.testing.assert_allclose(found.shapedirs, 0.1, atol=1e-8)
+
+
+def test_shape_keys_become_a_linear_model(tmp_path):
+    """Catches shape keys in Blender's axes or object space, and those relative to others, in the model's file."""
+    pytest.importorskip("bpy", reason="bpy is not installed")
+    from stga_addon.scene.shape_keys import shape_key_model
+
+    head = blender_head(MESH.v_template, MESH.faces, NAMES, SHAPES)
+    head.location = (0, 0, 0.3)
+    blocks = head.data.shape_keys.key_blocks
+    added = blocks["jawOpen"].data
+    offsets = np.empty(3 * len(added))
+    added.foreach_get("co", offsets)
+    both = head.shape_key_add(name="both", from_mix=False)
+    both.data.foreach_set("co", offsets)
+    both.relative_key = blocks["jawOpen"]  # so that it moves nothing by itself
+    __import__("bpy").context.view_layer.update()
+    write_linear_model(tmp_path / "head.npz", shape_arrays(*shape_key_model(head)))
+    found = read_head_model(tmp_path / "head.npz").model
+    np.testing.assert_allclose(found.v_template, MESH.v_template + np.array([0, 0.3, 0]), atol=1e-6)
+    np.testing.assert_array_equal(found.faces, MESH.faces)
+    assert (found.n_identity, found.n_expression) == (2, 4)
+    np.testing.assert_allclose(found.shapedirs[:, :, :5], SHAPES, atol=1e-6)
+    np.testing.assert_allclose(found.shapedirs[:, :, 5], 0, atol=1e-6)

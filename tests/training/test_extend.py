@@ -1,0 +1,162 @@
+"""Extending a finished run by further takes: what is selected, what is remembered, and resumption to the same bits."""
+
+import json
+import shutil
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture import factory
+from PIL import Image
+
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.errors import StgaError
+from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
+from stga_addon.training.run.continuation import prepare_extension
+from stga_addon.training.run.folder import Run, read_run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.open_run import open_run
+from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.replay import continued_order
+from stga_addon.training.run.request import Extension
+
+from .test_run import assert_same_state
+from .toys import quick_settings
+
+ITERATIONS = 15
+CAP_PX = 8
+"""Height above the ball's center, in pixels, from which it is yellow in the second take: about 4 cm."""
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two takes of one ball; in the second one's images its upper part is yellow."""
+    folder = tmp_path_factory.mktemp("takes")
+    old = factory.write_mesh_capture(folder / "old", (0, 1, 3), range(4))
+    new = Path(shutil.copytree(old, folder / "new"))
+    top = factory.silhouette() & (np.arange(factory.HEIGHT)[:, None] < factory.CY - CAP_PX)
+    for path in sorted((new / "images").rglob("*.png")):
+        with Image.open(path) as image:
+            changed = np.where(top[..., None], [255, 230, 0], np.asarray(image)).astype(np.uint8)
+        Image.fromarray(changed).save(path)
+    return old, new
+
+
+@pytest.fixture(scope="module")
+def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("parent") / "run"
+    capture = open_capture(takes[0])
+    settings = quick_settings("global", iterations=60, lattice=1, strain_color=True, density_interval=0)
+    train(capture, out, Run(capture.root, None, "vhap", settings))
+    return out
+
+
+def extend(parent: Path, take: Path, out: Path, stop: int | None = None) -> Path:
+    prepared = prepare_extension(Extension(parent, (take,), iterations=ITERATIONS), "cpu")
+
+    def report(progress: Progress) -> bool:
+        return progress.iteration == stop
+
+    train(prepared.capture, out, prepared.run, prepared.selection, report=report)
+    return out
+
+
+def test_the_run_remembers_its_takes(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches an extended run that opens without its new take, or with one whose images were exchanged."""
+    before = {path.name: path.read_bytes() for path in parent.iterdir()}
+    moved = Path(shutil.copytree(takes[1], tmp_path / "new"))
+    out = extend(parent, moved, tmp_path / "extended")
+    assert {path.name: path.read_bytes() for path in parent.iterdir()} == before
+    opened = open_run(out)
+    assert opened.capture.timesteps == (0, 1, 3, 4, 5, 7)
+    assert [take.start for take in opened.run.takes] == [4]
+    assert opened.run.continuation is not None
+    assert (opened.run.continuation.first, opened.run.continuation.last) == (4, 7)
+    with pytest.raises(StgaError, match="is a take of this run already"):
+        prepare_extension(Extension(out, (moved,), iterations=1), "cpu")
+    again = prepare_extension(Extension(out, (takes[1],), iterations=1), "cpu")
+    assert [take.start for take in again.run.takes] == [4, 8]
+    path = moved / "transforms_train.json"
+    values = json.loads(path.read_text())
+    values["frames"] = values["frames"][1:]
+    path.write_text(json.dumps(values))
+    with pytest.raises(StgaError, match=r"was extended with .*new .* but it now has other images"):
+        open_run(out)
+
+
+def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches a selection by motion alone, which would not learn a changed skin, and one of the whole head."""
+    prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
+    capture = prepared.capture
+    height = capture.mesh(4)[capture.faces].mean(1)[:, 1]
+    front = capture.neutral[capture.faces].mean(1)[:, 2] > 0.03
+    selected = prepared.selection[4]
+    assert selected[front & (height > 0.055)].mean() > 0.8
+    assert selected[front & (height < 0)].mean() < 0.1
+
+
+def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches what was forgotten hidden in a mean, and an extension that does not learn the new take."""
+    first, *_, last = read_metrics(extend(parent, takes[1], tmp_path / "extended"))
+    assert first["iteration"] == 0
+    assert last["psnr_take_2"] > first["psnr_take_2"] + 0.1
+    assert last["psnr_take_1"] != last["psnr_take_2"]
+
+
+def test_a_stopped_extension_is_continued_to_the_same_bits(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+) -> None:
+    """Catches an order, a selection or a take that a resumed extension does not find again."""
+    whole = extend(parent, takes[1], tmp_path / "whole")
+    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7)
+    opened = open_run(stopped)
+    train(opened.capture, stopped, opened.run, resume=True)
+    assert_same_state(stopped, whole)
+    assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
+
+
+def test_old_and_new_views_take_turns(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches an extension that forgets because it sees the new take only."""
+    prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
+    assert prepared.run.continuation is not None
+    views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
+    assert sum(view.timestep < 4 for view in views) == 10
+
+
+def test_every_so_often_all_splats_are_trained() -> None:
+    """Catches an extension whose global iterations are lost, or are all there is."""
+    region = np.array([True, False])
+    strategy = ExtendStrategy(region)
+    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(2 * (EXTEND_GLOBAL_INTERVAL + 1))]
+    assert kinds == 2 * [*EXTEND_GLOBAL_INTERVAL * [False], True]
+    assert ExtendStrategy(~region & region).triangles(0, 0, 0, 0.0) is None
+
+
+@pytest.mark.parametrize("change", ["shape", "images", "folder"])
+def test_takes_that_do_not_fit(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches another head, or a take without images, that is found out after minutes of training."""
+    from stga_addon.training.run import continuation
+
+    def changed(path: Path, *rest: Any) -> Capture:
+        capture = open_capture(path, *rest)
+        if change == "shape":
+            return replace(capture, neutral=capture.neutral * 1.1)
+        return replace(capture, views={}) if change == "images" else capture
+
+    monkeypatch.setattr(continuation, "open_capture", changed)
+    sentences = {
+        "shape": "must be of the same head",
+        "images": "has no training views",
+        "folder": "is not a folder",
+    }
+    take = tmp_path / "missing" if change == "folder" else takes[1]
+    with pytest.raises(StgaError, match=sentences[change]):
+        prepare_extension(Extension(parent, (take,), iterations=1), "cpu")
+    assert read_run(parent).takes == ()

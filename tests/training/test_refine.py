@@ -1,0 +1,209 @@
+"""Refining a region of a finished run: nothing else changes, and a stopped refinement is continued to the same bits."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
+from stga_addon.training.optimize.state import TrainState, tensors_of
+from stga_addon.training.run import continuation as module
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.continuation import late_rates, prepare_refinement
+from stga_addon.training.run.folder import Continuation, Run, read_run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.replay import continued_order, distinct_timesteps, replayed_views, views_of_region
+from stga_addon.training.run.request import Refinement
+from stga_addon.training.schedule import learning_rates
+from stga_addon.training.settings import Rates
+
+from .test_run import assert_same_state
+from .toys import quick_settings
+
+ITERATIONS = 16
+
+
+@pytest.fixture(scope="module")
+def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with strain color, density control and hull points; its avatar is that of the last iteration."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    settings = quick_settings(
+        "global", iterations=12, strain_color=True, lattice=1, density_interval=10, density_span=(0.0, 1.0),
+        stray_reset_interval=4, stray_limit=0.3, hull_points=True,
+    )  # fmt: skip
+    without_held_out = replace(toy, views={"train": toy.views["train"]})
+    train(without_held_out, out, Run(toy.root, None, "vhap", settings))
+    return out
+
+
+@pytest.fixture
+def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the finished run, whose density control comes often when it is refined."""
+    monkeypatch.setattr(module, "DENSITY_INTERVAL", 4)
+    monkeypatch.setattr(module, "open_run", opening(toy))
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def opening(toy: Capture) -> Callable[..., Any]:
+    """`open_run` for the capture without held-out views, which is a file of its own to nobody but this test."""
+    from stga_addon.training.run.open_run import OpenedRun
+
+    capture = replace(toy, views={"train": toy.views["train"]})
+    return lambda folder, flame=None: OpenedRun(read_run(folder), capture, (capture,))
+
+
+def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> Path:
+    wanted = Refinement(parent, "mouth", iterations=ITERATIONS, **{"growth": 0.5, **changes})
+    prepared = prepare_refinement(wanted, "cpu")
+
+    def report(progress: Progress) -> bool:
+        return progress.iteration == stop
+
+    train(prepared.capture, out, prepared.run, prepared.selection, report=report)
+    return out
+
+
+def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
+    """Bytes of every tensor at the rows; without gradients and statistics, which no avatar holds."""
+    skipped = ("gradients", "screen_gradient", "gradient_count")
+    kept = {name: tensor for name, tensor in tensors_of(state).items() if not name.startswith(skipped)}
+    return {name: np.ascontiguousarray(tensor.numpy()[keep]).view(np.uint8) for name, tensor in kept.items()}
+
+
+def test_nothing_outside_the_region_changes_by_one_bit(parent: Path, toy: Capture, tmp_path: Path) -> None:
+    """Catches momentum, averaging, density control or stray resets that reach splats beyond the region, and a
+    refinement that does nothing."""
+    before, region = read_avatar(parent / "avatar.npz"), toy.regions["mouth"]
+    after = read_avatar(refine(parent, tmp_path / "refined") / "avatar.npz")
+    outside = [~region[avatar.splats.face] for avatar in (before, after)]
+    assert 0 < outside[0].sum() < len(before.splats)
+    for name, old in vars(before.splats).items():
+        new = getattr(after.splats, name)
+        np.testing.assert_array_equal(old[outside[0]].tobytes(), new[outside[1]].tobytes(), err_msg=name)
+    inside = before.splats.rows(~outside[0]), after.splats.rows(~outside[1])
+    assert len(inside[1]) > len(inside[0])
+    assert set(np.unique(inside[1].face)) == set(np.unique(inside[0].face))
+    for name in ("xyz", "sh", "opacity", "strain_color"):
+        assert not np.array_equal(getattr(inside[0], name), getattr(inside[1], name)[: len(inside[0])]), name
+    states = [read_checkpoint(folder).state for folder in (parent, tmp_path / "refined")]
+    kept = [rows_of(state, ~region[state.face.numpy()]) for state in states]
+    for name, old in kept[0].items():
+        if not name.startswith("parameters"):  # which start from the average
+            np.testing.assert_array_equal(kept[1][name], old, err_msg=name)
+
+
+def test_a_stopped_refinement_is_continued_to_the_same_bits(parent: Path, toy: Capture, tmp_path: Path) -> None:
+    """Catches an order of views, a region or a rate that a resumed refinement does not find again."""
+    whole = refine(parent, tmp_path / "whole", frames=(1, 3))
+    stopped = refine(parent, tmp_path / "stopped", stop=7, frames=(1, 3))
+    capture = replace(toy, views={"train": toy.views["train"]})
+    train(capture, stopped, read_run(stopped), resume=True)
+    assert_same_state(stopped, whole)
+    assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
+
+
+def test_the_run_before_is_left_alone(parent: Path, tmp_path: Path) -> None:
+    """Catches a refinement that overwrites the avatar it started from."""
+    before = {path.name: path.read_bytes() for path in parent.iterdir()}
+    run = read_run(refine(parent, tmp_path / "refined"))
+    assert {path.name: path.read_bytes() for path in parent.iterdir()} == before
+    assert run.continuation is not None
+    assert run.continuation.parent == parent.resolve()
+
+
+def test_the_avatar_before_is_the_first_evaluation(parent: Path, toy: Capture, tmp_path: Path) -> None:
+    """Catches a report without what it is compared with, and a region that is not measured apart."""
+    prepared = prepare_refinement(Refinement(parent, "mouth", (1, 3), iterations=ITERATIONS), "cpu")
+    train(toy, tmp_path / "refined", prepared.run, prepared.selection)
+    first, *_, last = read_metrics(tmp_path / "refined")
+    assert (first["iteration"], last["iteration"]) == (0, ITERATIONS)
+    assert {"psnr_region", "psnr_frames", "psnr_region_frames", "psnr_other_frames"} <= set(last)
+    assert last["psnr_region"] > first["psnr_region"]
+
+
+def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
+    """Catches a refinement of another avatar than the one that its run.json names."""
+    prepared = prepare_refinement(Refinement(parent, "mouth", iterations=ITERATIONS), "cpu")
+    (parent / "avatar.npz").write_bytes(b"")
+    with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
+        train(prepared.capture, tmp_path / "refined", prepared.run, prepared.selection)
+
+
+def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent: Path, toy: Capture, tmp_path: Path) -> None:
+    """Catches a refinement that needs optimizer moments, or takes those of another state than the avatar's."""
+    (parent / "checkpoint.npz").unlink()
+    after = read_avatar(refine(parent, tmp_path / "refined", growth=0.0) / "avatar.npz").splats
+    before = read_avatar(parent / "avatar.npz").splats
+    outside = ~toy.regions["mouth"][before.face]
+    assert np.array_equal(after.xyz[outside], before.xyz[outside])
+    assert not np.array_equal(after.xyz[~outside], before.xyz[~outside])
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"region": "chin"}, r"region 'chin': is neither a region of the capture \(.*mouth.*\) nor"),
+        ({"frames": (7, 9)}, "no training views from timestep 7 to 9"),
+        ({"growth": 1000.0}, "setting growth"),
+    ],
+)
+def test_what_is_refused(parent: Path, changes: dict[str, Any], sentence: str) -> None:
+    """Catches a traceback, or a folder begun, for what cannot be refined."""
+    with pytest.raises(StgaError, match=sentence):
+        prepare_refinement(replace(Refinement(parent, "mouth", iterations=1), **changes), "cpu")
+
+
+def test_late_rates_are_the_rest_of_the_schedule() -> None:
+    """Catches rates that jump where a continuation begins, or end elsewhere than a training's."""
+    rates = Rates()
+    for share in (0.0, 0.6, 1.0):
+        for progress in (0.0, 0.3, 1.0):
+            expected = learning_rates(rates, share + (1 - share) * progress)
+            assert learning_rates(late_rates(rates, share), progress) == pytest.approx(expected)
+
+
+def test_order_of_views_continues_and_replays(toy: Capture) -> None:
+    """Catches a resumed order that starts anew, and other frames that are forgotten or trained too often."""
+    continuation = Continuation(Path(), "", 1, 1)
+    whole = list(islice(continued_order(continuation, toy, None, 5), 40))
+    assert list(islice(continued_order(continuation, toy, None, 5, start=13), 27)) == whole[13:]
+    assert sum(view.timestep == 1 for view in whole) == 30
+    assert {view.timestep for view in whole} == {0, 1, 3}
+    alone = islice(continued_order(Continuation(Path(), "", 0, 9), toy, None, 5), 20)
+    assert {view.timestep for view in alone} == {0, 1, 3}
+
+
+def test_replayed_timesteps_differ_most(toy: Capture) -> None:
+    """Catches a replay of neighbors that all look alike, and one that grows with the length of the takes."""
+    offsets = {0: 0.0, 1: 0.001, 2: 0.05, 3: 0.051, 4: -0.04}
+    capture = replace(toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep])
+    assert distinct_timesteps(capture, list(offsets), 3) == [0, 3, 4]
+    views = [replace(toy.views["train"][0], timestep=t, camera_index=c) for t in range(5) for c in range(16)]
+    kept = replayed_views(capture, views)
+    assert len(kept) == 20
+    assert len({view.camera_index for view in kept}) > 4
+
+
+def test_views_that_see_the_region(toy: Capture) -> None:
+    """Catches a region that is refined in views from behind, which do not show it: a triangle's winding in pixels is
+    the opposite of that seen from outside."""
+    views = toy.views["train"]
+    for view in views[:3]:
+        mesh = toy.mesh(view.timestep)
+        pose = view.camera.world_to_camera
+        center = -(pose[:3, :3].T @ pose[:3, 3])
+        corners = mesh[toy.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        toward = ((center - corners.mean(1)) * normal).sum(1)
+        toward /= np.linalg.norm(center - corners.mean(1), axis=1) * np.linalg.norm(normal, axis=1)
+        assert views_of_region(toy, [view], toward > 0.5) == [view]
+        assert views_of_region(toy, [view], toward < -0.5) == []
