@@ -7,7 +7,7 @@ import bpy
 
 from ..operators import ids, track
 from ..operators.common import register_classes, unregister_classes
-from ..operators.train import device_property, preset_property, strategy_property
+from ..operators.train import adapter_property, device_property, preset_property, strategy_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
@@ -121,6 +121,7 @@ class SceneSettings(bpy.types.PropertyGroup):
     strategy: strategy_property()
     preset: preset_property(update=_take_minutes)
     device: device_property()
+    adapter: adapter_property()
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
     analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the analysis failed

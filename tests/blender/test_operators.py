@@ -131,7 +131,7 @@ def test_every_operator_explains_itself(extension):
 
 
 SET_BY_PANEL = {
-    "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "effects"},
+    "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "adapter", "effects"},
     "apply_motion": {"filter_glob"},
     "show_avatar": {"hide_head", "filter_glob"},
     "export_avatar": {"format", "filter_glob", "check_existing", "motion_only"},
@@ -384,7 +384,10 @@ def test_more_bounces_where_cycles_needs_them(extension):
     scene.cycles.transparent_max_bounces = 8
     assert "8 layers" in hints.transparent_bounces_hint(scene)
     bpy.ops.stga.more_bounces()
-    assert scene.cycles.transparent_max_bounces == 64
+    assert (scene.cycles.transparent_max_bounces, scene.cycles.min_transparent_bounces) == (64, 64)
+    scene.cycles.min_transparent_bounces = 0
+    assert "noise" in hints.transparent_bounces_hint(scene)
+    bpy.ops.stga.more_bounces()
     assert hints.transparent_bounces_hint(scene) is None
     scene.cycles.transparent_max_bounces = 200
     bpy.ops.stga.more_bounces()

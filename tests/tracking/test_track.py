@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
@@ -20,7 +21,7 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
-from stga_addon.tracking.mesh_image import rasterize, shaded_image
+from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.track import track
 
 from .test_fit import frame_at, places_on
