@@ -20,11 +20,12 @@ from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.teeth import TEETH_VERTICES
 from stga_addon.tracking.correspondence import nearest_points
+from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import read_head_model
-from stga_addon.tracking.landmarks import PLACES_FILE, read_places
-from stga_addon.tracking.track import LANDMARKS_FOLDER, track
+from stga_addon.tracking.landmarks import read_places
+from stga_addon.tracking.track import track
 
 FACE_RADIUS_M = 0.09
 

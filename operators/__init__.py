@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from . import analyze, ids, monitor, render_video
+from . import analyze, ids, monitor, render_video, track
 from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
@@ -13,6 +13,7 @@ from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
 from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .export_cameras import ExportCameras
+from .export_head_model import ExportHeadModel
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
@@ -23,9 +24,18 @@ from .preview_images import PreviewImages
 from .render_video import CancelVideo, DismissVideo, RenderVideo
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .show import MoreBounces, ShowAvatar, StandardView
+from .track import CancelTracking, DismissTracking, TrackFootage
+from .track_correct import MarkKey, SolveAgain, ViewFootage
 from .train import CancelTraining, DismissTraining, Train
 
 CLASSES = (
+    TrackFootage,
+    CancelTracking,
+    DismissTracking,
+    ViewFootage,
+    MarkKey,
+    SolveAgain,
+    ExportHeadModel,
     ImportCapture,
     ImportMotion,
     ImportMeshes,
@@ -73,6 +83,7 @@ def _import_menu(menu: Any, context: Any) -> None:
 def _export_menu(menu: Any, context: Any) -> None:
     menu.layout.operator(ids.EXPORT_AVATAR, text="Gaussian Head Avatar (STGA)")
     menu.layout.operator(ids.EXPORT_CAMERAS, text="Cameras for Tracking (STGA)")
+    menu.layout.operator(ids.EXPORT_HEAD_MODEL, text="Head Model for Tracking (STGA)")
 
 
 def register() -> None:
@@ -80,9 +91,11 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
     monitor.register()
+    track.register()
 
 
 def unregister() -> None:
+    track.unregister()
     monitor.unregister()
     analyze.stop()
     render_video.unregister()

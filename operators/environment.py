@@ -10,7 +10,8 @@ import bpy
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import (
-    SIZES_GB,
+    PYPI_SIZE_GB,
+    SIZE_GB,
     TRACKING_GB,
     check_arguments,
     find_training_python,
@@ -72,15 +73,6 @@ class MakeEnvironment(bpy.types.Operator):
     bl_label = "Make Training Environment"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    device: bpy.props.EnumProperty(
-        name="Device",
-        description="Device that the environment supports",
-        items=(
-            ("auto", "Automatic", "An NVIDIA GPU where its driver is found, else the CPU"),
-            ("cpu", "CPU", "Smaller; trains on every machine"),
-            ("cuda", "CUDA", "For NVIDIA GPUs, by the package warp-lang"),
-        ),
-    )
     wheels: bpy.props.StringProperty(
         name="Wheels",
         description="Folder of wheel files to install from without a network; empty: download them",
@@ -110,14 +102,13 @@ class MakeEnvironment(bpy.types.Operator):
     def draw(self, context: Any) -> None:
         layout = self.layout
         layout.use_property_split = True
-        for name in ("device", "tracking", "wheels", "python"):
+        for name in ("tracking", "wheels", "python"):
             layout.prop(self, name)
         column = layout.column(align=True)
-        cpu, cuda = (SIZES_GB[device] + self.tracking * TRACKING_GB for device in ("cpu", "cuda"))
-        column.label(text=f"Takes about {cpu:.1f} GB for the CPU, {cuda:.1f} GB for CUDA, in")
+        column.label(text=f"Takes about {SIZE_GB + self.tracking * TRACKING_GB:.1f} GB in")
         column.label(text=str(environment_folder()))
         if not self.wheels and sys.platform == "linux":
-            column.label(text=f"Where pytorch.org cannot be reached: {SIZES_GB['pypi']:.1f} GB")
+            column.label(text=f"Where pytorch.org cannot be reached: {PYPI_SIZE_GB:.1f} GB")
         if not self.wheels:
             source = "Downloads from PyPI and pytorch.org" if sys.platform == "linux" else "Downloads from PyPI"
             offline = not bpy.app.online_access
@@ -132,7 +123,7 @@ class MakeEnvironment(bpy.types.Operator):
             raise StgaError(f"{wheels}: is not a folder; expected one of wheel files")
         folder = environment_folder(create=True)
         base = bpy.path.abspath(self.python) if self.python else sys.executable
-        return _run(self, folder, make_arguments(folder, base, self.device, wheels, self.tracking))
+        return _run(self, folder, make_arguments(folder, base, wheels, self.tracking))
 
 
 class TestEnvironment(bpy.types.Operator):

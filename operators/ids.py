@@ -1,5 +1,12 @@
 """Identifiers that this extension registers."""
 
+TRACK_FOOTAGE = "stga.track_footage"
+CANCEL_TRACKING = "stga.cancel_tracking"
+DISMISS_TRACKING = "stga.dismiss_tracking"
+VIEW_FOOTAGE = "stga.view_footage"
+MARK_KEY = "stga.mark_key"
+SOLVE_AGAIN = "stga.solve_again"
+EXPORT_HEAD_MODEL = "stga.export_head_model"
 IMPORT_CAPTURE = "stga.import_capture"
 IMPORT_MOTION = "stga.import_motion"
 IMPORT_MESHES = "stga.import_meshes"

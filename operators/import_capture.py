@@ -14,6 +14,7 @@ from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.scene.viewports import frame_head
+from ..stga_addon.tracking.folder import is_tracked
 from . import ids
 from .common import FileImport, file_path, flame_model_path, flame_property, reporting, scene_settings
 
@@ -100,6 +101,7 @@ def bring_in(
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(model or "")
     head[tags.PRINCIPAL_POINT] = principal_point
+    head[tags.TRACKED] = is_tracked(capture.root)
     scene_settings(context).head = head
     _show_first_frame(context.scene, capture)
     _select_only(context, head)

@@ -21,12 +21,12 @@ from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effect_plan import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
-from ..stga_addon.worker.environment import missing_packages
+from ..stga_addon.worker.environment import missing_packages, stored_adapters
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import failure_report, inspect_worker, request_cancel
 from . import ids, monitor
 from .common import file_path, head_of, needs_head, reporting
-from .environment import training_python
+from .environment import environment_folder, training_python
 
 
 def strategy_property() -> Any:
@@ -59,10 +59,25 @@ def device_property() -> Any:
         name="Device",
         description="Device that trains. Auto resumes a run on the device that it was trained on",
         items=(
-            ("auto", "Auto", "An NVIDIA GPU if one works, else the CPU"),
+            ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
             ("cpu", "CPU", "The processor"),
-            ("cuda", "GPU", "An NVIDIA GPU; training fails if none works"),
+            ("gpu", "GPU", "A GPU; training fails if none works"),
         ),
+    )
+
+
+def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
+    """The GPUs that the last test of the training environment found, in its order."""
+    return stored_adapters(environment_folder())
+
+
+def adapter_property() -> Any:
+    """GPU that trains where the device is one: of the operator, and of the panel that calls it."""
+    return bpy.props.StringProperty(
+        name="GPU",
+        description="Name of the GPU; empty: the first. The list is that of the last test of the training environment",
+        search=list_adapters,
+        search_options={"SUGGESTION"},
     )
 
 
@@ -119,6 +134,7 @@ class Train(bpy.types.Operator):
     strategy: strategy_property()
     preset: preset_property()
     device: device_property()
+    adapter: adapter_property()
     seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
@@ -156,7 +172,8 @@ class Train(bpy.types.Operator):
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
         flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
-        return TrainingJob(capture, flame, principal_point, settings, self.device)
+        device = f"gpu:{self.adapter}" if self.device == "gpu" and self.adapter else self.device
+        return TrainingJob(capture, flame, principal_point, settings, device)
 
 
 def python_of(operator: Any, context: Any) -> str | None:

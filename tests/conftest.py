@@ -33,20 +33,16 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture(params=["cpu", "warp", "gpu"])
+@pytest.fixture(params=["cpu", "gpu"])
 def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The kernels that a test's `render_differentiable` runs: Numba's, Warp's on its CPU device, and WebGPU's on the
-    first adapter."""
-    if request.param == "warp":
-        pytest.importorskip("warp")
-        from stga_addon.raster.gpu import autograd
-    elif request.param == "gpu":
-        from raster import webgpu
+    """The kernels that a test's `render_differentiable` runs: Numba's, and WebGPU's on the first adapter."""
+    if request.param == "gpu":
+        from raster import gpu_device
 
-        webgpu.device()
-        from stga_addon.raster.webgpu import autograd
-    if request.param != "cpu":
+        gpu_device.device()  # or skip
+        from stga_addon.raster.gpu.autograd import render_differentiable
+
         for module in (request.module, sys.modules["raster.test_kernels"]):
             if hasattr(module, "render_differentiable"):
-                monkeypatch.setattr(module, "render_differentiable", autograd.render_differentiable)
+                monkeypatch.setattr(module, "render_differentiable", render_differentiable)
     return str(request.param)

@@ -14,7 +14,7 @@ SOURCES = sorted(
     path for name in SHIPPED for path in ([ROOT / name] if name.endswith(".py") else (ROOT / name).rglob("*.py"))
 )
 BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
-HEAVY = {"torch", "numba", "warp", "wgpu"}
+HEAVY = {"torch", "numba", "wgpu"}
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
@@ -130,7 +130,7 @@ BLOCKED = """
 import sys
 class Block:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"torch", "numba", "warp", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "bpy", "smplx"}:
+        if name.split(".")[0] in {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "bpy", "smplx"}:
             raise ModuleNotFoundError(f"blocked: {name}", name=name)
 sys.meta_path.insert(0, Block())
 import importlib

@@ -1,4 +1,4 @@
-"""The sidebar tab: Capture → Select → Train → Show → Motion."""
+"""The sidebar tab: Track → Capture → Select → Train → Show → Motion."""
 
 from typing import Any
 
@@ -23,6 +23,7 @@ from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
 from .sidebar import SidebarPanel
 from .text import draw_text
+from .track_panel import TrackCheckPanel, TrackOptionsPanel, TrackPanel
 from .train_panel import TrainOptionsPanel, TrainPanel
 
 DISPLAY_INPUTS = (
@@ -109,6 +110,9 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
 
 CLASSES = (
     NextStepPanel,
+    TrackPanel,
+    TrackOptionsPanel,
+    TrackCheckPanel,
     CapturePanel,
     SelectedFrames,
     SelectPanel,

@@ -5,9 +5,9 @@ from typing import Any
 
 import bpy
 
-from ..operators import ids
+from ..operators import ids, track
 from ..operators.common import register_classes, unregister_classes
-from ..operators.train import device_property, preset_property, strategy_property
+from ..operators.train import adapter_property, device_property, preset_property, strategy_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
@@ -64,6 +64,21 @@ class SceneSettings(bpy.types.PropertyGroup):
         type=bpy.types.Object,
         update=_forget_rows,
     )
+    footage: track.footage_property()
+    footage_cameras: track.cameras_property()
+    head_model: track.model_property()
+    capture_folder: track.path_property(
+        "Capture", "Folder for the tracked capture", "DIR_PATH", default="//stga_capture"
+    )
+    detector: track.detector_property()
+    focal: track.focal_property()
+    footage_start: track.frame_property("Start", "First frame of the footage, counted from 0", min=0)
+    footage_stop: track.frame_property("Stop", "Frame to stop before; 0: all", min=0)
+    footage_step: track.frame_property("Step", "Use every nth frame", min=1, default=1)
+    tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last tracking
+    tracking_model: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of its head model
+    tracking_pending: bpy.props.BoolProperty(options={"HIDDEN"})  # it is to be imported when it is done
+    tracking_error: bpy.props.StringProperty(options={"HIDDEN"})  # why it could not be imported
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: bpy.props.IntProperty(options={"HIDDEN"})
     motion_source: bpy.props.PointerProperty(
@@ -106,6 +121,7 @@ class SceneSettings(bpy.types.PropertyGroup):
     strategy: strategy_property()
     preset: preset_property(update=_take_minutes)
     device: device_property()
+    adapter: adapter_property()
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
     analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the analysis failed

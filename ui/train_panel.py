@@ -62,6 +62,7 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     )
     train.directory, train.minutes, train.resume = settings.run_folder, settings.minutes, resume
     train.strategy, train.preset, train.device = settings.strategy, settings.preset, settings.device
+    train.adapter = settings.adapter
     train.effects = " ".join(chosen_effects(settings))
 
 
@@ -78,7 +79,10 @@ class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         settings = scene_settings(context)
-        for name in ("strategy", "device", "show_result", "live_preview"):
+        names = ["strategy", "device", "show_result", "live_preview"]
+        if settings.device == "gpu":
+            names.insert(2, "adapter")
+        for name in names:
             self.layout.prop(settings, name)
 
 

@@ -34,6 +34,8 @@ class Avatar:
     background  red, green, blue in 0 to 1 that it was trained against
     antialiased  whether it was trained with opacity compensation (`render_forward`), and is rendered so
     principal_point  convention of the capture that it was trained on (`read_transforms`)
+    strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors follow (`avatar.strain`);
+                None: the same for all, ±MAX_STRAIN
     """
 
     splats: Splats
@@ -45,6 +47,7 @@ class Avatar:
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     antialiased: bool = False
     principal_point: str = "vhap"
+    strain_range: np.ndarray | None = None
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
         """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colors follow it."""
@@ -56,7 +59,8 @@ class Avatar:
 
     @cached_property
     def _strain(self) -> StrainBasis | None:
-        return strain_basis(self.neutral, self.faces) if self.splats.strain_color.shape[1] else None
+        strained = self.splats.strain_color.shape[1] > 0
+        return strain_basis(self.neutral, self.faces, self.strain_range) if strained else None
 
 
 def write_avatar(path: Path, avatar: Avatar) -> None:
@@ -78,6 +82,8 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     arrays = {name: getattr(avatar.splats, name) for name in _SPLAT_FIELDS}
     arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
     arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
+    if avatar.strain_range is not None:
+        arrays["strain_range"] = avatar.strain_range
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -103,6 +109,7 @@ def read_avatar(path: Path) -> Avatar:
         background=tuple(header["background"]),
         antialiased=header["antialiased"],
         principal_point=header["principal_point"],
+        strain_range=arrays.get("strain_range"),
     )
     _check(path, avatar)
     return avatar
@@ -169,6 +176,8 @@ def _check(path: Path, avatar: Avatar) -> None:
     if avatar.splats.strain_color.shape[1] not in (0, STRAIN_COMPONENTS):
         size = avatar.splats.strain_color.shape[1]
         raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAIN_COMPONENTS}")
+    if avatar.strain_range is not None:
+        _check_array(path, "strain_range", avatar.strain_range, "float32", (len(avatar.faces), 2, STRAIN_COMPONENTS))
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))

@@ -1,5 +1,6 @@
 """Strain of triangles, on which splat colors may depend: wrinkles darken where skin is compressed."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,9 @@ STRAIN_COMPONENTS = 3
 """Stretch along two directions of the triangle's plane, and the shear between them."""
 STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
 """Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
+RANGE_MARGIN = 1.2
+"""A triangle's range of strain, as a multiple of what was seen: training may have seen a few timesteps more than were
+measured, and refined tracking moves them."""
 MIN_SQUARED_NORMAL = 1e-24
 """Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
 
@@ -20,6 +24,7 @@ class StrainBasis:
     to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
     to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear.
     touching (V,): how many triangles touch a vertex, at least one.
+    range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
     """
 
     faces: np.ndarray
@@ -27,10 +32,14 @@ class StrainBasis:
     to_tensor: np.ndarray
     to_plane: np.ndarray
     touching: np.ndarray
+    range: np.ndarray
 
 
-def strain_basis(neutral: np.ndarray, faces: np.ndarray) -> StrainBasis:
-    """The basis of a neutral mesh: neutral (V, 3) meters, faces (F, 3). A triangle without area stays unstrained."""
+def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None) -> StrainBasis:
+    """The basis of a neutral mesh: neutral (V, 3) meters, faces (F, 3). A triangle without area stays unstrained.
+
+    strain_range: (F, 2, 3) `StrainBasis.range`; None: ±MAX_STRAIN.
+    """
     d1, d2 = _edges(neutral, faces)
     normal = np.cross(d1, d2)
     square = _dot(normal, normal)
@@ -49,11 +58,30 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray) -> StrainBasis:
             twice * np.stack([_product(along, along), _product(across, across), _product(along, across)], 1)
         ),
         touching=np.maximum(np.bincount(faces.ravel(), minlength=len(neutral)), 1),
+        range=_by_component(full_range(len(faces)) if strain_range is None else strain_range),
     )
 
 
+def full_range(count: int) -> np.ndarray:
+    """(count, 2, 3) float32: −MAX_STRAIN and MAX_STRAIN, for every triangle and component."""
+    ends = np.array([-MAX_STRAIN, MAX_STRAIN], np.float32)[:, None]
+    return np.broadcast_to(ends, (count, 2, STRAIN_COMPONENTS)).copy()
+
+
+def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
+    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), times RANGE_MARGIN.
+
+    It includes 0, the neutral mesh. Colors fitted to a few expressions are not extrapolated to stronger ones.
+    """
+    seen = np.zeros((len(basis.faces), 2, STRAIN_COMPONENTS), np.float32)
+    for mesh in meshes:
+        strain = np.float32(RANGE_MARGIN) * face_strain(basis, mesh)
+        seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], strain), np.maximum(seen[:, 1], strain)
+    return np.clip(seen, -MAX_STRAIN, MAX_STRAIN)
+
+
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
-    """Strain (F, 3) float32 of every triangle of a posed mesh: clip(5·E, ±2), zero for the neutral mesh moved rigidly.
+    """Strain (F, 3) float32 of every triangle of a posed mesh: 5·E within its range; 0 for a mesh moved rigidly.
 
     vertices (V, 3) meters. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the posed mesh, averaged
     over the triangles that touch a triangle (each vertex's mean over its triangles, then the mean of its three
@@ -68,7 +96,8 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     at_vertex = [np.bincount(corners.ravel(), np.tile(row, 3), len(basis.touching)) for row in tensor]
     averaged = np.take(np.stack(at_vertex) / basis.touching, corners, axis=1).sum(1) / 3
     strain = np.einsum("df,kdf->kf", averaged, basis.to_plane.transpose(1, 2, 0))
-    return np.ascontiguousarray(np.clip(STRAIN_GAIN * strain, -MAX_STRAIN, MAX_STRAIN).T, np.float32)
+    lowest, highest = basis.range.transpose(1, 2, 0)
+    return np.ascontiguousarray(np.clip(STRAIN_GAIN * strain, lowest, highest).T, np.float32)
 
 
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

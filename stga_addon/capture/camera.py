@@ -65,6 +65,12 @@ class Camera:
         flat = local[:, :2] / np.maximum(depth, MIN_PROJECTION_DEPTH)[:, None]
         return flat * [self.fl_x, self.fl_y] + [self.cx, self.cy], depth
 
+    def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points (N, 3) in meters of pixel positions (N, 2) at depths (N,), both as `project` returns them."""
+        flat = (pixels - [self.cx, self.cy]) / [self.fl_x, self.fl_y]
+        local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) * depth[:, None]
+        return np.asarray((local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3])
+
     def scaled(self, factor: float) -> "Camera":
         """The same camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))

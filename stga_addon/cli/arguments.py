@@ -11,7 +11,7 @@ from typing import Any
 
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..jobs.delegate import OpenHead
-from ..training.settings import DEVICES
+from ..training.settings import is_device
 
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
@@ -50,10 +50,19 @@ def add_effects(command: argparse.ArgumentParser) -> None:
 def add_device(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--device",
-        choices=DEVICES,
+        type=device_name,
         default="auto",
-        help="cuda: an NVIDIA GPU; auto: the GPU where it works, else the CPU; warp-cpu: the GPU's code on the CPU",
+        metavar="{auto,cpu,gpu,gpu:NAME}",
+        help="gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto: a GPU if it is right "
+        "and faster than the CPU in a trial of a second, else the CPU",
     )
+
+
+def device_name(text: str) -> str:
+    """Raises argparse.ArgumentTypeError for what is no device."""
+    if not is_device(text):
+        raise argparse.ArgumentTypeError(f"'{text}' is not auto, cpu, gpu or gpu:NAME")
+    return text
 
 
 def usable_path(text: str) -> Path:

@@ -53,6 +53,8 @@ def run(options: Namespace) -> None:
 
 def training_options(options: Namespace, capture: Path, run_folder: Path) -> Namespace:
     """Those of `stga train` on the tracked capture; a run in the folder is continued."""
+    from ..tracking.folder import is_flame
+
     given = {
         "capture": capture,
         "flame": options.model if is_flame(capture) else None,
@@ -64,17 +66,10 @@ def training_options(options: Namespace, capture: Path, run_folder: Path) -> Nam
     return Namespace(**{**vars(options), **given})
 
 
-def is_flame(capture: Path) -> bool:
-    """Whether the tracked capture has FLAME's layout."""
-    from ..capture.flame_capture import CANONICAL_NAME
-
-    return (capture / CANONICAL_NAME).exists()
-
-
 def summary(out: Path, blend: Path | None) -> list[str]:
     """Lines on what `out` holds now."""
     from ..report.run_summary import CURVE, report_run
-    from ..tracking.track import REPORT_FILE, SHEET_FILE
+    from ..tracking.folder import REPORT_FILE, SHEET_FILE
 
     report = read_json(out / CAPTURE / REPORT_FILE)
     errors = report["reprojection_px"]
@@ -91,7 +86,7 @@ def summary(out: Path, blend: Path | None) -> list[str]:
 
 def _track(options: Namespace, capture: Path) -> None:
     """Track into the folder unless that was done. Raises StgaError where OUT began with other inputs."""
-    from ..tracking.write_capture import is_written
+    from ..tracking.folder import is_written
 
     path, inputs = options.out / INPUTS, _inputs(options)
     if path.exists():
@@ -132,6 +127,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     from ..capture.open import open_capture
     from ..scene.avatar_scene import set_up_head, show_on_head
     from ..scene.blend_file import empty_file, save_file
+    from ..tracking.folder import is_flame
 
     inputs = read_json(out / INPUTS)
     flame = Path(inputs["model"]) if is_flame(out / CAPTURE) else None

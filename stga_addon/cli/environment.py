@@ -13,7 +13,6 @@ from pathlib import Path
 from ..errors import StgaError
 from ..jobs.delegate import OpenHead
 from ..worker.environment import (
-    DEVICES,
     PYTHON_VARIABLE,
     check_python,
     find_training_python,
@@ -39,7 +38,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     make = actions.add_parser("make", help="make an environment with PyTorch, and use it")
-    make.add_argument("--device", choices=DEVICES, default="auto", help="device that it supports")
     make.add_argument("--wheels", type=usable_path, metavar="FOLDER", help="wheel files, to install without a network")
     make.add_argument("--tracking", action="store_true", help="with the landmark detector that `stga track` needs")
     make.add_argument("--python", default=sys.executable, metavar="PATH", help="Python 3.11 or newer to make it from")
@@ -61,7 +59,7 @@ def run(options: Namespace) -> None:
         line = store_choice(folder, python)
     else:
         python = find_training_python(folder)
-        line = check_python(python)
+        line = check_python(python, folder if folder.is_dir() else None)
     print(f"{python}: {line}")
     used = find_training_python(folder)
     if used != python:
@@ -83,7 +81,7 @@ def _make(folder: Path, options: Namespace) -> str:
     status, message = status_folder(folder), ""
     prepare_status_folder(status)
     wheels = options.wheels and options.wheels.absolute()
-    making = make_arguments(folder, options.python, options.device, wheels, options.tracking)
+    making = make_arguments(folder, options.python, wheels, options.tracking)
     worker = start_worker(status, sys.executable, making)
     try:
         while worker.poll() is None:

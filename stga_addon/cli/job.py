@@ -1,4 +1,4 @@
-"""Carry out the job that Blender's panel wrote into a folder: a training, or a video."""
+"""Carry out the job that Blender's panel wrote into a folder: a tracking, a training, or a video."""
 
 import sys
 from argparse import ArgumentParser, Namespace
@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from ..jobs.delegate import OpenHead
 from .arguments import usable_path
 
-NAME, HELP = "job", "carry out the job that Blender's panel wrote: a training, or a video"
+NAME, HELP = "job", "carry out the job that Blender's panel wrote: a tracking, a training, or a video"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -14,11 +14,15 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    from ..jobs.tracking_job import is_tracking_job, run_tracking_job
     from ..jobs.training_job import run_training_job
     from ..jobs.video_job import is_video_job, run_video_job
 
     if is_video_job(options.run_folder):
         run_video_job(options.run_folder)
+        return
+    if is_tracking_job(options.run_folder):
+        run_tracking_job(options.run_folder)
         return
     if not sys.stderr.isatty():  # started by Blender, which reads the status folder
         run_training_job(options.run_folder)

@@ -119,13 +119,18 @@ def background(facts: CaptureFacts) -> Verdict:
 
 
 def hull_points(facts: CaptureFacts) -> Verdict:
-    if facts.cameras == 1:
-        return Verdict(False, "a single camera does not show how far away something beside the mesh is", only=True)
     if np.isnan(facts.uncovered):
         return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
-    return Verdict(
-        facts.uncovered > MIN_UNCOVERED_SHARE, f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
-    )
+    reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
+    if facts.cameras == 1:
+        reason += "; a single camera does not show how far away, so that it becomes a flat layer"
+    return Verdict(facts.uncovered > MIN_UNCOVERED_SHARE, reason)
+
+
+def depth_limits(facts: CaptureFacts) -> Verdict:
+    if facts.cameras > 1:
+        return Verdict(False, f"{facts.cameras} cameras show how far away a splat is")
+    return Verdict(True, "a single camera does not show how far in front of or behind the mesh a splat is")
 
 
 def density(facts: CaptureFacts) -> Verdict:
@@ -217,6 +222,12 @@ EFFECTS = (
         hull_points,
         on={"hull_points": True},
         off={"hull_points": False},
+    ),
+    Effect(
+        "depth-limits",
+        "none: splats are smaller and nearer to their triangles",
+        depth_limits,
+        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20},
     ),
     Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
     Effect(

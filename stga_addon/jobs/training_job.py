@@ -26,7 +26,7 @@ from ..training.optimize.device import choose_device
 from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
 from ..training.run.request import Request, request_from_json, request_to_json
-from ..training.settings import DEVICES, TrainingSettings, from_json, to_json
+from ..training.settings import TrainingSettings, from_json, is_device, to_json
 from ..worker.launch import prepare_status_folder
 from ..worker.status import StatusWriter, remove_status_folder, status_writer
 
@@ -45,7 +45,7 @@ class TrainingJob:
     """What to train.
 
     settings  None to resume the run in the folder, or to continue another one
-    device    one of DEVICES; "auto" resumes a run on the device that it was trained on
+    device    as `settings.is_device` allows; "auto" resumes a run on the device that it was trained on
     continues what is asked of a run that continues another one, which the folder is to hold
     """
 
@@ -114,7 +114,7 @@ def read_job(run: Path) -> TrainingJob:
         raise StgaError(f"{path}: is not a job that this version reads (format '{FORMAT}', version {VERSION})")
     try:
         flame, settings, device = values["flame"], values["settings"], values["device"]
-        if device not in DEVICES:
+        if not is_device(device):
             raise ValueError(f"device is {shorten(device)}")
         return TrainingJob(
             Path(values["capture"]),

@@ -9,9 +9,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ..capture.camera import Camera
+from ..capture.mesh_raster import rasterize
 from ..files import replacing
 from .footage.model import Footage
-from .mesh_image import rasterize, vertex_normals
+from .mesh_image import vertex_normals
 
 COLUMNS, ROWS = 4, 5
 PICTURE = 200, 250

@@ -11,10 +11,10 @@ import numpy as np
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .detectors import Detector
+from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .posed_points import SurfacePoints
 
-PLACES_FILE = "head_model.npz"
 MIN_BARYCENTRIC = -1e-3
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""
@@ -127,6 +127,15 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
 
 def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
     write_npz(path, {"face": np.where(used, places.face, -1), "barycentric": places.barycentric})
+
+
+def write_landmarks(
+    folder: Path, found: Mapping[str, CameraLandmarks], places: SurfacePoints, used: np.ndarray
+) -> None:
+    """Write all files that `read_landmarks` and `read_places` read."""
+    for name, camera in found.items():
+        write_camera(landmark_file(folder, name), camera)
+    write_places(folder / PLACES_FILE, places, used)
 
 
 def timesteps_with_landmarks(found: Mapping[str, CameraLandmarks]) -> set[int]:

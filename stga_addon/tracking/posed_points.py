@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..flame.forward import axis_angle_matrices
+from ..flame.forward import FlameFrame, axis_angle_matrices
 from ..flame.model import FlameModel
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
@@ -26,6 +26,11 @@ class SurfacePoints:
     def on(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Their positions (N, 3), or other values (N, …) interpolated, from those of the vertices (V, …)."""
         return np.asarray(np.einsum("nk,nk...->n...", self.barycentric, vertices[faces[self.face]]))
+
+
+def parameters_of(frame: FlameFrame) -> np.ndarray:
+    """(E + 18,) expression, pose and translation of a FLAME frame."""
+    return np.concatenate([frame.expr, frame.pose.ravel(), frame.translation])
 
 
 class PosedPoints:

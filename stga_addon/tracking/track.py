@@ -10,26 +10,27 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_json, write_json
+from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
 from .fit import HeadFit, TimestepLandmarks, fit_head
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
 from .footage.model import Footage, FootageCamera
 from .head_model import read_head_model
 from .landmarks import (
-    PLACES_FILE,
     CameraLandmarks,
     Report,
     detect_landmarks,
     read_landmarks,
     read_places,
     timesteps_with_landmarks,
+    write_landmarks,
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
-from .write_capture import is_written, posed_mesh, write_capture
+from .write_capture import posed_mesh, write_capture
 
-REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER = "tracking.json", "contact_sheet.png", "landmarks"
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the others, and by this share
 of the face's size."""
@@ -98,7 +99,7 @@ def track(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, found, fit),
+        _warnings(footage, found, fit) + scale_warnings(fit, places, reliable, footage, found),
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -111,6 +112,8 @@ def track(
         fit.head.model.faces,
         result.reprojection_px,
     )
+    if landmarks is not None:  # what a correction of the capture starts from
+        write_landmarks(out / LANDMARKS_FOLDER, found, places, reliable)
     write_capture(out, footage, fit, parameters, meshes, report)
     return result
 

@@ -13,12 +13,12 @@ from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
 from ..files import replacing, write_json, write_npz
 from ..flame.forward import FlameFrame, flame_forward
 from .fit import HeadFit
+from .folder import SPLIT_FILES
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 from .posed_points import RIGID_SIZE
 
 MIN_CAMERAS_TO_HOLD_OUT = 4
-SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 
 
 def write_capture(
@@ -42,11 +42,6 @@ def write_capture(
     top = _write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)
     for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):  # train last: see is_written
         write_json(out / name, {**top, "frames": entries})
-
-
-def is_written(out: Path) -> bool:
-    """Whether a folder holds a whole capture; an interrupted `write_capture` leaves none."""
-    return any((out / name).exists() for name in (SPLIT_FILES[0], "transforms.json"))
 
 
 def posed_mesh(fit: HeadFit, parameters: np.ndarray) -> np.ndarray:

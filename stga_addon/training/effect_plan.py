@@ -13,6 +13,7 @@ EFFECTS = (
     "antialiasing",
     "background",
     "hull-points",
+    "depth-limits",
     "density",
     "selection",
     "strain-color",

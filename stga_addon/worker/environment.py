@@ -36,17 +36,14 @@ from .status import StatusWriter, log_lines, status_writer
 PYTHON_VARIABLE = "STGA_PYTHON"
 """Environment variable that names the interpreter that trains, above every other choice: for render farms."""
 CHOICE_FILE = "choice.json"
-DEVICES = ("auto", "cpu", "cuda")
+ADAPTERS_FILE = "adapters.json"
 MIN_PYTHON = 3, 11
-SIZES_GB = {"cpu": 1.5, "cuda": 2.0, "pypi": 6.0}
-"""Measured size of an environment: for the CPU; with the package warp-lang, all that a GPU needs in addition; and with
-the CUDA build of torch that PyPI has for Linux."""
+SIZE_GB, PYPI_SIZE_GB = 1.5, 6.0
+"""Measured size of an environment; and with the CUDA build of torch that PyPI has for Linux."""
 TRACKING_GB = 0.3
 """Measured size of what tracking needs in addition."""
-MIN_CUDA_VERSION = 12
-"""Of the driver, for warp-lang."""
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-"""PyTorch's CPU build serves GPUs as well, since the kernels are Warp's; the CUDA build, which PyPI has for Linux,
+"""PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which PyPI has for Linux,
 takes gigabytes. Everything else comes from PyPI, or the mirror that pip is configured for."""
 FAILURE_REASONS = {
     "No space left on device": "the disk is full",
@@ -109,9 +106,18 @@ def store_choice(folder: Path, python: str) -> str:
             (folder / CHOICE_FILE).unlink()
         return ""
     python = os.path.abspath(python)
-    line = check_python(python)
+    line = check_python(python, folder)
     write_json(folder / CHOICE_FILE, {"python": python})
     return line
+
+
+def stored_adapters(folder: Path) -> list[str]:
+    """The GPUs that the interpreter which was checked last can train on, as `--device gpu:NAME` names them."""
+    try:
+        names = read_json(folder / ADAPTERS_FILE)
+    except StgaError:
+        return []
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
 
 
 def status_folder(folder: Path) -> Path:
@@ -136,9 +142,10 @@ def missing_packages() -> list[str]:
 # Checking
 
 
-def check_python(python: str) -> str:
+def check_python(python: str, folder: Path | None = None) -> str:
     """One line on an interpreter that can train: versions and device.
 
+    folder: of the environment, where the GPUs are stored for `stored_adapters`.
     Raises StgaError where it cannot be started or lacks something, which the sentence names.
     """
     with start_python(
@@ -151,7 +158,11 @@ def check_python(python: str) -> str:
             child.kill()
             raise StgaError(f"{python}: did not answer within {CHECK_TIMEOUT_S:.0f} s") from error
     try:
-        return describe_check(python, json.loads(output.strip().splitlines()[-1]))
+        report = json.loads(output.strip().splitlines()[-1])
+        line = describe_check(python, report)
+        if folder is not None:
+            write_json(folder / ADAPTERS_FILE, report["adapters"])
+        return line
     except (ValueError, IndexError, KeyError, TypeError) as error:
         with suppress(OSError):  # the stream may be closed
             print(output + errors, file=sys.stderr, flush=True)
@@ -177,7 +188,7 @@ def check_in_worker(folder: Path, python: str) -> str:
     """`check_python`, with its status in the environment folder."""
     with status_writer(status_folder(folder)) as writer:
         writer.update(0.0, "Testing")
-        line = check_python(python)
+        line = check_python(python, folder)
         writer.update(1.0, line)
     return line
 
@@ -190,37 +201,11 @@ def check_arguments(folder: Path, python: str) -> list[str]:
 # Making and removing
 
 
-def make_arguments(folder: Path, python: str, device: str, wheels: Path | None, tracking: bool = False) -> list[str]:
+def make_arguments(folder: Path, python: str, wheels: Path | None, tracking: bool = False) -> list[str]:
     """What a worker runs after `python -m` for `make_environment`."""
     more = ["--wheels", str(wheels)] if wheels else []
     more += ["--tracking"] if tracking else []
-    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, "--device", device, *more]
-
-
-def choose_device(device: str, nvidia_smi: str | None) -> str:
-    """The device to install for: "cpu", or "cuda" where the driver that `nvidia-smi` reports is new enough.
-
-    device: "auto" takes what there is. nvidia_smi: its output, None where there is none.
-    Raises StgaError where CUDA was chosen and the driver cannot do it.
-    """
-    if device == "cpu":
-        return "cpu"
-    reported = re.search(r"CUDA Version:\s*((\d+)\.\d+)", nvidia_smi or "")
-    if reported and int(reported[2]) >= MIN_CUDA_VERSION:
-        return "cuda"
-    if device == "auto":
-        return "cpu"
-    found = f"the NVIDIA driver supports CUDA {reported[1]}" if reported else "nvidia-smi finds no NVIDIA GPU"
-    raise StgaError(f"{found}, training needs CUDA {MIN_CUDA_VERSION} or newer: update the driver or choose the CPU")
-
-
-def nvidia_smi() -> str | None:
-    """What nvidia-smi prints; None where it is missing or finds no GPU."""
-    try:
-        done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=20, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout if done.returncode == 0 else None
+    return ["stga_addon.worker.environment", "make", str(folder), "--python", python, *more]
 
 
 @dataclass(frozen=True)
@@ -233,12 +218,11 @@ class InstallStep:
 
 
 def install_steps(
-    venv: Path, python: str, device: str, wheels: Path | None, system: str = sys.platform, tracking: bool = False
+    venv: Path, python: str, wheels: Path | None, system: str = sys.platform, tracking: bool = False
 ) -> list[InstallStep]:
     """The commands that make an environment; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-    packages = [*REQUIREMENTS.values(), *([GPU_REQUIREMENT] if device == "cuda" else [])]
-    packages += TRACKING_REQUIREMENTS if tracking else ()
+    packages = [*REQUIREMENTS.values(), *(TRACKING_REQUIREMENTS if tracking else ())]
     too_old = f"sys.version_info < {MIN_PYTHON} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
     first = [
         InstallStep("Checking the Python version", [python, "-c", f"import sys; sys.exit({too_old})"]),
@@ -246,8 +230,11 @@ def install_steps(
     ]
     if wheels is not None:
         pip += ["--no-index", "--find-links", str(wheels)]
-    detector = InstallStep("Installing the landmark detector", [*pip, "--no-deps", *DETECTOR_REQUIREMENTS])
-    last = [detector] if tracking else []
+    # A wheel or nothing: its source would have to be built.
+    gpu = [*pip, "--only-binary", "wgpu", GPU_REQUIREMENT]
+    last = [InstallStep("Installing GPU support", gpu, optional=True)]
+    if tracking:
+        last.append(InstallStep("Installing the landmark detector", [*pip, "--no-deps", *DETECTOR_REQUIREMENTS]))
     if wheels is not None:
         return [*first, InstallStep("Installing from the folder of wheels", [*pip, *packages]), *last]
     torch = [*pip, "--no-deps", "--index-url", TORCH_CPU_INDEX, REQUIREMENTS["torch"]]
@@ -257,9 +244,7 @@ def install_steps(
     return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest, *last]
 
 
-def make_environment(
-    folder: Path, python: str, device: str = "auto", wheels: Path | None = None, tracking: bool = False
-) -> str:
+def make_environment(folder: Path, python: str, wheels: Path | None = None, tracking: bool = False) -> str:
     """Make an environment in `folder` from the interpreter `python`; returns the line of `check_python`.
 
     tracking: with what `stga track` needs, the landmark detector included.
@@ -268,21 +253,20 @@ def make_environment(
     Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
     """
     with status_writer(status_folder(folder)) as writer:
-        device = choose_device(device, nvidia_smi())
         free = shutil.disk_usage(folder).free / 1e9
-        needed = SIZES_GB[device] + (TRACKING_GB if tracking else 0)
+        needed = SIZE_GB + (TRACKING_GB if tracking else 0)
         if free < needed:
             raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {needed:.1f} GB")
         numbers = [_number(venv) for venv in _environments(folder)]
         venv = folder / f"venv-{max(numbers, default=0) + 1}"
-        steps = install_steps(venv, python, device, wheels, sys.platform, tracking)
+        steps = install_steps(venv, python, wheels, sys.platform, tracking)
         try:
             for number, step in enumerate(steps):
                 if not _run(writer, number / (len(steps) + 1), step):
                     shutil.rmtree(venv, ignore_errors=True)
                     return ""
             writer.update(len(steps) / (len(steps) + 1), "Testing")
-            line = check_python(str(venv_python(venv)))
+            line = check_python(str(venv_python(venv)), folder)
         except StgaError:
             shutil.rmtree(venv, ignore_errors=True)
             raise
@@ -374,7 +358,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     make = commands.add_parser("make")
     make.add_argument("folder", type=Path)
     make.add_argument("--python", default=sys.executable)
-    make.add_argument("--device", choices=DEVICES, default="auto")
     make.add_argument("--wheels", type=Path)
     make.add_argument("--tracking", action="store_true")
     options = vars(top.parse_args(arguments))

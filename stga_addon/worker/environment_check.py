@@ -16,25 +16,29 @@ def main() -> None:
             versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
         except Exception as error:  # a library that fails to load raises what it likes
             failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
+    names, device = _adapters()
     report = {
         "python": platform.python_version(),
         "versions": versions,
         "failures": failures,
-        "device": _device(),
+        "device": device,
+        "adapters": names,
     }
     print(json.dumps(report))
 
 
-def _device() -> str:
-    """The GPU that warp-lang finds, or the CPU."""
+def _adapters() -> tuple[list[str], str]:
+    """The GPUs that can train, as `--device gpu:NAME` names them, and what trains by itself: the first, or the CPU.
+
+    The module that knows is imported by name, like the packages: it fails to load where one of them is missing.
+    """
+    cpu = f"CPU with {os.cpu_count()} threads"
     try:
-        warp = importlib.import_module("warp")
-        warp.config.quiet = True
-        if warp.is_cuda_available():
-            return str(warp.get_cuda_device().name)
-    except Exception:  # the package is missing, or its driver fails: the CPU trains
-        pass
-    return f"CPU with {os.cpu_count()} threads"
+        device = importlib.import_module("..raster.gpu.device", __package__)
+        found = device.adapters()
+    except Exception:  # the package is missing, or a driver fails: the CPU trains
+        return [], cpu
+    return list(found), next((name for name, adapter in found.items() if not device.is_software(adapter)), cpu)
 
 
 if __name__ == "__main__":

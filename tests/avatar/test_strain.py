@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.strain import face_strain, strain_basis
+from stga_addon.avatar.strain import MAX_STRAIN, RANGE_MARGIN, face_strain, seen_range, strain_basis
 from stga_addon.capture.camera import Camera
+from stga_addon.errors import StgaError
 from stga_addon.raster.render import render, render_avatar
 
 FACES = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]], np.int32)
@@ -92,6 +93,41 @@ def test_broken_triangles_stay_finite(broken: str) -> None:
     assert np.abs(strain).max() <= 2
     if broken in ("point", "line"):
         assert not strain[1].any()
+
+
+def test_strain_stays_within_what_was_seen() -> None:
+    """Catches colors extrapolated beyond the trained expressions, a range of another triangle or component, and one
+    that leaves out the neutral mesh or clips what was trained."""
+    neutral, rng = sheet(), np.random.default_rng(2)
+    basis = strain_basis(neutral, FACES)
+    seen = [neutral + rng.normal(0, 1e-4, neutral.shape) for _ in range(3)]
+    strains = np.stack([face_strain(basis, mesh) for mesh in seen])
+    limits = seen_range(basis, seen)
+    np.testing.assert_allclose(limits[:, 0], RANGE_MARGIN * np.minimum(strains.min(0), 0), atol=1e-6)
+    np.testing.assert_allclose(limits[:, 1], RANGE_MARGIN * np.maximum(strains.max(0), 0), atol=1e-6)
+    limited = strain_basis(neutral, FACES, limits)
+    for mesh, strain in zip(seen, strains, strict=True):
+        np.testing.assert_array_equal(face_strain(limited, mesh), strain)
+    stronger = neutral + 4 * (seen[0] - neutral)
+    free = face_strain(basis, stronger)
+    np.testing.assert_array_equal(face_strain(limited, stronger), np.clip(free, limits[:, 0], limits[:, 1]))
+    assert (np.abs(free) > np.abs(face_strain(limited, stronger)) + 0.01).any()
+    assert np.abs(seen_range(basis, [30 * neutral])).max() <= MAX_STRAIN
+
+
+def test_the_range_is_in_the_file_and_in_renderings(tmp_path: Path) -> None:
+    """Catches a range lost in the file, one that frames ignore, and one of another shape that is not refused."""
+    neutral = sheet()
+    stretched = (1.1 * neutral).astype(np.float32)
+    limits = np.zeros((len(FACES), 2, 3), np.float32)
+    avatar = replace(colored(neutral), strain_range=limits)
+    write_avatar(tmp_path / "a.npz", avatar)
+    found = read_avatar(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.strain_range, limits)
+    assert np.abs(colored(neutral).frames(stretched).strain).max() > 0.1
+    assert not found.frames(stretched).strain.any()
+    with pytest.raises(StgaError, match="strain_range is float32 \\(3, 2, 3\\), expected float32 \\(4, 2, 3\\)"):
+        write_avatar(tmp_path / "b.npz", replace(avatar, strain_range=limits[1:]))
 
 
 def test_the_file_keeps_it_and_reads_avatars_without(tmp_path: Path) -> None:

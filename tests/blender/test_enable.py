@@ -17,7 +17,7 @@ import bpy, numpy, bpy_extras.io_utils
 
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"torch", "numba", "warp", "scipy", "PIL", "av", "matplotlib"}:
+        if name.split(".")[0] in {"torch", "numba", "wgpu", "scipy", "PIL", "av", "matplotlib"}:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Refuse())

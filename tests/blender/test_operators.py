@@ -32,6 +32,13 @@ from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 from .captures import closure  # noqa: E402
 
 OPERATORS = (
+    "track_footage",
+    "cancel_tracking",
+    "dismiss_tracking",
+    "view_footage",
+    "mark_key",
+    "solve_again",
+    "export_head_model",
     "import_capture",
     "import_motion",
     "import_meshes",
@@ -124,7 +131,7 @@ def test_every_operator_explains_itself(extension):
 
 
 SET_BY_PANEL = {
-    "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "effects"},
+    "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "adapter", "effects"},
     "apply_motion": {"filter_glob"},
     "show_avatar": {"hide_head", "filter_glob"},
     "export_avatar": {"format", "filter_glob", "check_existing", "motion_only"},
@@ -377,7 +384,10 @@ def test_more_bounces_where_cycles_needs_them(extension):
     scene.cycles.transparent_max_bounces = 8
     assert "8 layers" in hints.transparent_bounces_hint(scene)
     bpy.ops.stga.more_bounces()
-    assert scene.cycles.transparent_max_bounces == 64
+    assert (scene.cycles.transparent_max_bounces, scene.cycles.min_transparent_bounces) == (64, 64)
+    scene.cycles.min_transparent_bounces = 0
+    assert "noise" in hints.transparent_bounces_hint(scene)
+    bpy.ops.stga.more_bounces()
     assert hints.transparent_bounces_hint(scene) is None
     scene.cycles.transparent_max_bounces = 200
     bpy.ops.stga.more_bounces()

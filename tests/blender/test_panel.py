@@ -87,7 +87,9 @@ def draw(extension) -> list[str]:
         scene=bpy.context.scene,
         region=SimpleNamespace(width=10_000),
         preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0), addons=bpy.context.preferences.addons),
-        space_data=SimpleNamespace(shading=SimpleNamespace(type="SOLID")),
+        space_data=SimpleNamespace(
+            shading=SimpleNamespace(type="SOLID"), region_3d=SimpleNamespace(view_perspective="PERSP")
+        ),
         view_layer=bpy.context.view_layer,
         screen=SimpleNamespace(is_animation_playing=False),
     )

@@ -17,7 +17,14 @@ from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import ELLIPSOIDS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT  # noqa: E402
 from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats, get_input, set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.display.splat_object import (  # noqa: E402
+    evaluated_splats,
+    get_input,
+    set_input,
+    show_avatar,
+    show_world_splats,
+    stored_avatar,
+)
 
 FRAMES = (1, 5, 9)
 
@@ -213,6 +220,27 @@ def test_colors_follow_the_active_camera(degree):
     np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + 0.28209479177387814 * sh[:, 0]), atol=2e-6)
 
 
+def test_colors_follow_a_moving_camera():
+    """Catches colors that stay those of the first frame while the camera moves, in playback and in renders."""
+    avatar = avatar_of("stga", 100)
+    sh = np.random.default_rng(3).normal(0, 0.3, (100, 4, 3)).astype(np.float32)
+    avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
+    shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    camera, scene = active_camera((0.3, -0.9, 1.2)), bpy.context.scene
+    expected = {}
+    for frame, place in ((1, (0.3, -0.9, 1.2)), (5, (-0.8, 0.5, 0.9))):
+        camera.location = place
+        scene.frame_set(frame)
+        expected[frame] = displayed_colors(shown)
+    assert np.abs(expected[1] - expected[5]).max() > 0.1
+    for frame, place in ((1, (0.3, -0.9, 1.2)), (5, (-0.8, 0.5, 0.9))):
+        camera.location = place
+        camera.keyframe_insert("location", frame=frame)
+    for frame in (1, 5, 1):
+        scene.frame_set(frame)
+        np.testing.assert_allclose(displayed_colors(shown), expected[frame], atol=1e-6)
+
+
 def test_colors_follow_strain():
     """Catches strain of another triangle, in other axes or not averaged, against numpy on the deformed mesh."""
     avatar = avatar_of("stga", 1500)
@@ -221,13 +249,18 @@ def test_colors_follow_strain():
     flat = avatar.neutral.copy()
     flat[avatar.faces[7, 2]] = flat[avatar.faces[7, 1]]  # triangles without area have no strain
     avatar = replace(avatar, splats=splats, neutral=flat)
+    limits = np.random.default_rng(5).uniform(0, 0.8, (len(avatar.faces), 2, 3)).astype(np.float32)
+    avatar = replace(avatar, strain_range=limits * np.array([[-1], [1]], np.float32))
     head = animated_head(flat, avatar.faces)
     shown = show_avatar(avatar, head)
+    np.testing.assert_array_equal(stored_avatar(shown).strain_range, avatar.strain_range)
     seen = {}
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        frames = avatar.frames(evaluated_vertices(head))
+        posed = evaluated_vertices(head)
+        frames, free = avatar.frames(posed), replace(avatar, strain_range=None).frames(posed)
         assert np.abs(frames.strain).max() > 0.5
+        assert np.abs(free.strain - frames.strain).max() > 0.2
         seen[frame] = displayed_colors(shown)
         expected = 0.5 + 0.28209479177387814 * to_world(splats, frames).sh[:, 0]
         np.testing.assert_allclose(seen[frame], linear(expected), atol=1e-3)

@@ -120,6 +120,31 @@ def test_device_reaches_the_job(head, tmp_path, monkeypatch, extension):
     assert extension.stga_addon.jobs.training_job.read_job(tmp_path / "run").device == "cpu"
 
 
+@pytest.mark.parametrize(
+    ("device", "adapter", "wanted"),
+    [("gpu", "", "gpu"), ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"), ("cpu", "Card", "cpu")],
+)
+def test_named_gpu_reaches_the_job(device, adapter, wanted, head, tmp_path, monkeypatch, extension):
+    """Catches a GPU chosen by name that another one trains instead of, and a name that moves the CPU's training."""
+    monkeypatch.setattr(extension.operators.train, "run_training_job", lambda run, also: run / "avatar.npz")
+    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
+    folder = str(tmp_path / "run")
+    assert bpy.ops.stga.train(directory=folder, device=device, adapter=adapter) == {"FINISHED"}
+    assert extension.stga_addon.jobs.training_job.read_job(tmp_path / "run").device == wanted
+
+
+def test_gpus_are_those_of_the_last_test(tmp_path, monkeypatch, extension):
+    """Catches a list of another environment's GPUs, and a traceback in the panel where it is missing or damaged."""
+    train = extension.operators.train
+    monkeypatch.setattr(train, "environment_folder", lambda: tmp_path)
+    assert train.list_adapters(None, None, "") == []
+    (tmp_path / "adapters.json").write_text('["Card (Vulkan)", "Card (Vulkan) #2"]')
+    assert train.list_adapters(None, None, "") == ["Card (Vulkan)", "Card (Vulkan) #2"]
+    for damaged in ("{", '{"a": 1}', "[1, null]"):
+        (tmp_path / "adapters.json").write_text(damaged)
+        assert train.list_adapters(None, None, "") == []
+
+
 def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
     """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
     monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)
@@ -335,5 +360,5 @@ def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "none"))
     (tmp_path / "wheels").mkdir()
     with pytest.raises(RuntimeError, match=r"Installing from the folder of wheels failed: .*No matching distribution"):
-        bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), device="cpu", python=sys.executable)
+        bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), python=sys.executable)
     assert not bpy.ops.stga.cancel_environment.poll()

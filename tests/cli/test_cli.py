@@ -259,11 +259,15 @@ def test_export_refuses_what_does_not_fit(
     assert "--timestep cannot be combined with --format usd" in message
     message = refused(capsys, "export", trained, "--format", "ply", "--motion-only", *out)
     assert "--motion-only cannot be combined with --format ply, only with web" in message
+    message = refused(capsys, "export", trained, "--format", "spz", "--fps", "30", *out)
+    assert "--fps cannot be combined with --format spz, only with usd, web" in message
+    message = refused(capsys, "export", trained, "--format", "usd", "--out", tmp_path / "o.usda")
+    assert "o.usda: expected a name that ends in .usdc or .usdz" in message
     message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)
     assert "has no timestep from 7 to 9" in message
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
-    message = refused(capsys, "export", trained, "--format", "ply-sequence", *out)
-    assert "1.0 kB are free there" in message
+    for words in (["ply-sequence", *out], ["web", "--out", tmp_path / "o.html"]):
+        assert "1.0 kB are free there" in refused(capsys, "export", trained, "--format", *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -284,7 +288,7 @@ def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.C
 
 WITHOUT_TORCH = """
 import sys
-sys.modules.update(dict.fromkeys(("torch", "numba", "warp")))  # importing one of them fails
+sys.modules.update(dict.fromkeys(("torch", "numba", "wgpu")))  # importing one of them fails
 from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -350,7 +354,7 @@ def test_an_avatar_without_capture(
     assert "give --capture" in message
     message = refused(capsys, "export", avatar, "--format", "ply-sequence", "--out", tmp_path / "o")
     assert "give --capture" in message
-    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o")
+    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o.ply")
     assert "give --capture" in message
     assert not (tmp_path / "o").exists()
 
@@ -495,7 +499,7 @@ def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 WITH_NUMPY_ALONE = """
 import sys
-missing = ("torch", "numba", "warp", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
+missing = ("torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "matplotlib", "platformdirs", "bpy")
 sys.modules.update(dict.fromkeys(missing))  # importing one of them fails
 from stga_addon.cli.main import main
 sys.exit(main(sys.argv[1:]))

@@ -25,7 +25,7 @@ def passing(tmp_path):
     """An interpreter that passes the test: a script that prints its report."""
     script = tmp_path / "python"
     versions = ", ".join(f'"{name}": "1.0"' for name in ("torch", "numba"))
-    report = f'{{"python": "3.12.0", "versions": {{{versions}}}, "failures": {{}}, "device": "CPU"}}'
+    report = f'{{"python": "3.12.0", "versions": {{{versions}}}, "failures": {{}}, "device": "CPU", "adapters": []}}'
     script.write_text(f"#!/bin/sh\necho '{report}'\n")
     script.chmod(0o755)
     return script
@@ -59,7 +59,7 @@ def test_mistakes_are_sentences(stga, arguments, tmp_path, capsys):
 def test_failed_make_names_the_reason(stga, tmp_path, capsys):
     """Catches a failure of pip that is reported without its reason, and half an environment that stays."""
     (tmp_path / "wheels").mkdir()
-    assert stga("make", "--device", "cpu", "--wheels", tmp_path / "wheels") == 2
+    assert stga("make", "--wheels", tmp_path / "wheels") == 2
     seen = capsys.readouterr()
     assert "Creating the virtual environment" in seen.out
     assert "Installing from the folder of wheels failed: ERROR: No matching distribution" in seen.err

@@ -58,7 +58,7 @@ def photograph(folder: Path, scene: Scene) -> Capture:
     vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int32)
     rng = np.random.default_rng(scene.seed)
     place = vertices[faces].mean(1) / 0.1
-    colors = 120 + 40 * np.sin(place @ rng.normal(0, 4, (3, 3))) + rng.uniform(-8, 8, (len(faces), 1))
+    colors = _own_colors(place, rng)
     meshes = {t: _deform(vertices, t, scene.deformed) for t in range(scene.timesteps)}
     basis = strain_basis(vertices, faces)
     views = []
@@ -87,6 +87,15 @@ def photograph(folder: Path, scene: Scene) -> Capture:
         mesh=meshes.__getitem__,
         expression_mesh=lambda timestep, zero_pose: meshes[timestep],
     )
+
+
+def own_colors(capture: Capture, seed: int = 0) -> np.ndarray:
+    """Levels (F, 3) of a painted capture's triangles, before whatever else colors depend on."""
+    return _own_colors(capture.neutral[capture.faces].mean(1) / 0.1, np.random.default_rng(seed))
+
+
+def _own_colors(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.asarray(120 + 40 * np.sin(place @ rng.normal(0, 4, (3, 3))) + rng.uniform(-8, 8, (len(place), 1)))
 
 
 def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:

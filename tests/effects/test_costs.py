@@ -124,7 +124,13 @@ def test_no_splats_on_teeth(painted):
     faces = np.concatenate([capture.faces, teeth_faces(vertices)])
     masks = {"teeth": np.arange(vertices, vertices + 120)}
     flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
-    toothed = replace(capture, faces=faces, neutral=np.concatenate([capture.neutral, rows]), flame=flame)
+    toothed = replace(
+        capture,
+        faces=faces,
+        neutral=np.concatenate([capture.neutral, rows]),
+        mesh=lambda timestep: np.concatenate([capture.mesh(timestep), rows]),
+        flame=flame,
+    )
     for kept in (True, False):
         splats = initial_splats.initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
         on_teeth = (splats.face >= len(capture.faces)).sum()

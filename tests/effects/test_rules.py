@@ -75,8 +75,9 @@ def test_cameras_of_different_exposure(painted):
 def test_one_camera(painted):
     """Catches effects that one camera cannot tell anything about."""
     plan, settings = planned(painted(cameras=1, paint=gloss))
-    assert on(plan) == {"antialiasing", "background", "density"}
-    for name in ("view-color", "exposure", "hull-points"):
+    assert on(plan) == {"antialiasing", "background", "density", "depth-limits"}
+    assert (settings.scale_limit, settings.stray_limit) == (1.5, 0.5)
+    for name in ("view-color", "exposure"):
         with pytest.raises(StgaError, match=f"--effect {name}=on: is not possible, because a single camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
     assert settings.sh_steps == ()
@@ -119,6 +120,15 @@ def test_something_beside_the_mesh(painted):
     plan, settings = planned(replace(capture, faces=low))
     assert plan["hull-points"].on
     assert settings.hull_points
+
+
+def test_something_beside_the_mesh_of_one_camera(painted):
+    """Catches hair that a single camera shows and nothing is trained for, and depth that is promised from it."""
+    capture = painted(cameras=1)
+    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]  # the ball's top is cut off
+    plan, settings = planned(replace(capture, faces=low))
+    assert settings.hull_points
+    assert "becomes a flat layer" in plan["hull-points"].reason
 
 
 def test_different_pixels(painted):

@@ -17,7 +17,7 @@ from stga_addon.avatar.embedding import WORLD
 from stga_addon.capture.camera import Camera
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.layout import MEAN_X, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, Parameters
+from stga_addon.raster.cpu.layout import MEAN_X, OPACITY, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 
 from .test_kernels import NAMES
@@ -66,9 +66,10 @@ def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
         parameters, face = Parameters(*(DATA[name] for name in NAMES)), np.zeros(24, np.int32)
         output = render_forward(parameters, face, frames_in_camera(WORLD, CAMERA), 3, antialiased=antialiased)
         return output.projection.columns
-    from .test_warp import Raw
+    from .test_gpu_rasterize import Raw
 
-    return Raw(scene(), antialiased=antialiased).forward().projected.numpy()
+    raw = Raw(scene(), antialiased=antialiased)
+    return raw.read(raw.forward().projected, 24, PROJECTED)
 
 
 def scene():

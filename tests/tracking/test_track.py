@@ -1,5 +1,6 @@
 """`stga track` from footage to a capture that opens, with landmark files and with the real detector."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
@@ -14,11 +16,12 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import calibrate, nearest_points
+from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel, read_head_model
-from stga_addon.tracking.landmarks import PLACES_FILE, detect_landmarks, landmark_file, read_camera, write_places
-from stga_addon.tracking.mesh_image import rasterize, shaded_image
+from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
+from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.track import track
 
 from .test_fit import frame_at, places_on
@@ -160,6 +163,25 @@ def test_a_camera_that_does_not_fit_is_named(recorded, capsys):
     assert "camera cam3" in message
     assert "timestep" in message
     assert not (folder / "out/transforms_train.json").exists()
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.05])
+def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
+    """Catches a camera whose focal length is 5 % off, which moves landmarks less than a detector's own errors."""
+    folder, _ = recorded
+    path = folder / "footage/transforms.json"
+    written = read_json(path)
+    for entry in written["frames"]:
+        if entry["camera_id"] == "cam1":
+            entry["fl_x"], entry["fl_y"] = factor * entry["fl_x"], factor * entry["fl_y"]
+    write_json(path, written)
+    assert command(folder) == 0
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: camera")]
+    assert len(warnings) == 1
+    size = "larger" if factor < 1 else "smaller"
+    assert re.search(
+        rf"camera cam1: shows the head [45]\.\d% {size} .* timestep \d; check its focal length", warnings[0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
     front = capture.neutral[capture.faces].mean(1)[:, 2] > 0.03
     selected = prepared.selection[4]
     assert selected[front & (height > 0.055)].mean() > 0.8
-    assert not selected[front & (height < 0)].any()
+    assert selected[front & (height < 0)].mean() < 0.1
 
 
 def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:

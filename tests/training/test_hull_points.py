@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.training.optimize.hull_points import MIN_MESH_DISTANCE_M, VOXEL_SIZE_M, hull_points
+from stga_addon.training.optimize.hull_points import MIN_MESH_DISTANCE_M, VOXEL_SIZE_M, flat_points, hull_points
 
 SIZE, FOCAL, FAR = 120, 300.0, 1.0
 CENTRE, RADIUS = np.array([0.06, 0.075, 0.02]), 0.03
@@ -152,3 +152,36 @@ def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None
     """Catches a grid of 4 mm laid through a mesh of 100 m: 10^13 points."""
     huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
     assert len(hull_points(huge, beside.views["train"], "stga", 0)) < 100_000
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, convention: str) -> None:
+    """Catches points off their pixels' rays, holes in the layer, and a layer in front of or behind the head."""
+    view = next(view for view in beside.views["train"] if _gap(view.camera) > 0.02)
+    world = in_world(beside, flat_points(beside, view, convention, 1), convention)
+    pixels, depth = view.camera.project(world.xyz.astype(np.float64))
+    mask = silhouette(view.camera, CENTRE, RADIUS)
+    columns, rows = np.floor(pixels + 1e-3).astype(int).T
+    assert mask[rows, columns].all()
+    _, mesh_depth = view.camera.project(beside.mesh(TIMESTEP))
+    assert mesh_depth.min() < depth.min()
+    assert depth.max() < mesh_depth.max()
+    step = VOXEL_SIZE_M * FOCAL / FAR
+    inner = silhouette(view.camera, CENTRE, RADIUS - 2 * VOXEL_SIZE_M)
+    wanted = np.argwhere(inner & ~silhouette(view.camera, beside.mesh(TIMESTEP).mean(0), 1.1 * 0.06 + 0.01))[:, ::-1]
+    assert len(wanted) > 50
+    assert np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
+    assert world.unbound.all()
+    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
+
+
+def _gap(camera: Camera) -> float:
+    """Distance in meters between head and ball as the camera sees them, without the depth."""
+    rotation = camera.world_to_camera[:2, :3]
+    return float(np.linalg.norm(rotation @ CENTRE)) - 1.1 * 0.06 + RADIUS / 2
+
+
+def test_no_layer_where_nothing_lies_beside_the_mesh(tmp_path: Path) -> None:
+    """Catches a crash on a single camera that sees nothing but the mesh."""
+    capture = scene(tmp_path, CENTRE, 0.0)
+    assert len(flat_points(capture, capture.views["train"][0], "stga", 1)) == 0

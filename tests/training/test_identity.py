@@ -21,6 +21,7 @@ from stga_addon.errors import StgaError
 from stga_addon.jobs.training_job import TrainingJob, run_training_job, write_job
 from stga_addon.training.optimize import device as device_choice
 from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.run import open_run as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, read_run, write_run
 from stga_addon.training.run.identity import difference, identity_of
@@ -255,20 +256,23 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
     """Catches a run begun on the CPU that moves to a GPU, where refined tracking cannot be resumed."""
     run = read_run(copy)
     assert run.device == "cpu"
-    monkeypatch.setattr(device_choice, "_find_gpu", lambda: ("cuda:0", "Card"))
+    monkeypatch.setattr(
+        open_run_module, "choose_device", lambda wanted: (wanted if wanted == "cpu" else "gpu:Card", "why")
+    )
     assert device_of(run)[0] == "cpu"
-    assert device_of(run, "cuda")[0] == "cuda:0"
+    assert device_of(run, "gpu")[0] == "gpu:Card"
     with pytest.raises(StgaError, match="refines the tracking, which works on the CPU only"):
-        device_of(replace(run, settings=replace(run.settings, tracking=True)), "cuda")
-    monkeypatch.setattr(device_choice, "_find_gpu", lambda: (None, "no driver"))
-    with pytest.raises(StgaError, match=r"trained on cuda: .*no driver; give --device cpu"):
-        device_of(replace(run, device="cuda:0"))
+        device_of(replace(run, settings=replace(run.settings, tracking=True)), "gpu")
+    monkeypatch.undo()
+    monkeypatch.setattr(device_choice, "find_spec", lambda name: None)
+    with pytest.raises(StgaError, match=r"trained on gpu: .*wgpu .* is not installed; give --device cpu"):
+        device_of(replace(run, device="gpu:Card"))
     assert device_of(replace(run, device="cuda:0"), "cpu")[0] == "cpu"
 
 
 def test_a_resumed_job_keeps_the_device(copy: Path, toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a worker that always trains on what this machine offers."""
-    monkeypatch.setattr(device_choice, "_find_gpu", lambda: ("cuda:0", "Card"))
+    monkeypatch.setattr(device_choice, "_fastest", lambda: ("gpu:Card", "why"))
     write_job(copy, TrainingJob(toy.root, None, "vhap", None))
     run_training_job(copy)
     assert read_run(copy).device == "cpu"

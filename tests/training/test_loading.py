@@ -32,7 +32,8 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
     train(capture, tmp_path / "loaded", run)
     assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view
-    assert not any(on_training_thread for _, on_training_thread in read)
+    # Splats are placed, and given colors, on the first mesh before training.
+    assert [timestep for timestep, on_training_thread in read if on_training_thread] == [timesteps[0]]
 
     def without_meshes(*arguments: Any, **options: Any) -> ViewLoader:
         return ViewLoader(*arguments, **{**options, "mesh": None})
@@ -40,6 +41,6 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
     read.clear()
     monkeypatch.setattr(loop, "ViewLoader", without_meshes)
     train(capture, tmp_path / "unloaded", run)
-    assert len(read) == len(timesteps) - 1
+    assert len(read) == len(timesteps)  # the first one twice
     assert all(on_training_thread for _, on_training_thread in read)
     assert_same_state(tmp_path / "loaded", tmp_path / "unloaded")

@@ -342,10 +342,10 @@ def test_where_it_cannot_work(toy: Capture, lost: Made, tmp_path: Path, capsys: 
         Trainer(toy, quick_settings("global", tracking=True), {})
     with pytest.raises(StgaError, match="needs the embedding convention 'stga'"):
         Trainer(lost[0], quick_settings("gaussian-avatars", tracking=True), {})
-    with pytest.raises(StgaError, match=r"effect tracking=on: .* on the CPU only, not on warp-cpu"):
-        Trainer(lost[0], quick_settings("global", tracking=True), {}, device="warp-cpu")
+    with pytest.raises(StgaError, match=r"effect tracking=on: .* on the CPU only, not on gpu"):
+        Trainer(lost[0], quick_settings("global", tracking=True), {}, device="gpu")
     root = lost[0].root
-    train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "warp-cpu", "--iterations", "2"]
+    train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "gpu", "--iterations", "2"]
     assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2
     assert "FLAME's parameters are refined on the CPU only" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

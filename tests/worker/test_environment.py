@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -10,12 +11,12 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.worker import environment
 from stga_addon.worker.environment import (
+    ADAPTERS_FILE,
     CHOICE_FILE,
     PYTHON_VARIABLE,
     InstallStep,
     check_arguments,
     check_python,
-    choose_device,
     describe_check,
     find_training_python,
     install_steps,
@@ -24,6 +25,7 @@ from stga_addon.worker.environment import (
     remove_environment,
     status_folder,
     store_choice,
+    stored_adapters,
     stored_choice,
     venv_python,
 )
@@ -32,64 +34,42 @@ from stga_addon.worker.launch import prepare_status_folder, start_worker
 from stga_addon.worker.requirements import DETECTOR_REQUIREMENTS, GPU_REQUIREMENT, REQUIREMENTS, TRACKING_REQUIREMENTS
 from stga_addon.worker.status import LOG_FILE, WorkerState, inspect_worker, log_lines, read_status
 
-SMI = "| NVIDIA-SMI 575.57.08   Driver Version: 575.57.08   CUDA Version: {} |"
 FOUND = {
     "python": "3.11.7",
     "versions": dict.fromkeys(REQUIREMENTS, "1.0"),
     "failures": {},
     "device": "CPU with 4 threads",
+    "adapters": ["Card (Vulkan)"],
 }
-
-
-@pytest.mark.parametrize(
-    ("device", "driver", "chosen"),
-    [
-        ("cpu", "13.2", "cpu"),
-        ("auto", None, "cpu"),
-        ("auto", "11.4", "cpu"),
-        ("auto", "12.6", "cuda"),
-        ("cuda", "12.0", "cuda"),
-        ("cuda", "14.1", "cuda"),
-    ],
-)
-def test_device_fits_the_driver(device, driver, chosen):
-    """Catches GPU packages where the driver is too old for them, and none where there is a GPU."""
-    assert choose_device(device, SMI.format(driver) if driver else None) == chosen
-
-
-def test_unusable_cuda_is_refused():
-    """Catches gigabytes downloaded for a GPU that cannot be used."""
-    with pytest.raises(StgaError, match=r"supports CUDA 11\.4, training needs CUDA 12 or newer"):
-        choose_device("cuda", SMI.format("11.4"))
-    with pytest.raises(StgaError, match="finds no NVIDIA GPU"):
-        choose_device("cuda", None)
 
 
 def test_install_steps(tmp_path):
     """Catches pip's configured index ignored, offline steps that need a network, and packages left out."""
-    looking, making, small, rest = install_steps(tmp_path, "/python", "cuda", None, "linux")
+    looking, making, small, rest, gpu = install_steps(tmp_path, "/python", None, "linux")
     assert making.command == ["/python", "-m", "venv", str(tmp_path)]
     assert rest.command[0] == small.command[0] == str(venv_python(tmp_path))
     assert small.command[-3:] == ["--index-url", "https://download.pytorch.org/whl/cpu", "torch>=2.4,<3"]
     assert small.optional  # where pytorch.org cannot be reached, there is PyPI
-    assert set(rest.command) >= {*REQUIREMENTS.values(), GPU_REQUIREMENT}
+    assert set(rest.command) >= set(REQUIREMENTS.values())
     assert not rest.optional
     assert "--index-url" not in rest.command
-    assert install_steps(tmp_path, "/python", "cuda", None, "win32") == [looking, making, rest]
-    _, _, offline = install_steps(tmp_path, "/python", "cpu", tmp_path / "wheels", "linux")
-    assert "--no-index" in offline.command
-    assert str(tmp_path / "wheels") in offline.command
+    assert gpu.command[-1] == GPU_REQUIREMENT
+    assert gpu.optional  # the CPU trains everywhere
+    assert install_steps(tmp_path, "/python", None, "win32") == [looking, making, rest, gpu]
+    _, _, offline, offline_gpu = install_steps(tmp_path, "/python", tmp_path / "wheels", "linux")
+    for step in (offline, offline_gpu):
+        assert "--no-index" in step.command
+        assert str(tmp_path / "wheels") in step.command
     assert set(offline.command) >= set(REQUIREMENTS.values())
-    assert GPU_REQUIREMENT not in offline.command
 
 
 def test_install_steps_of_tracking(tmp_path):
     """Catches an environment that cannot detect landmarks, or 600 MB that the detector never imports."""
-    *_, rest, detector = install_steps(tmp_path, "/python", "cpu", None, "linux", tracking=True)
+    *_, rest, _, detector = install_steps(tmp_path, "/python", None, "linux", tracking=True)
     assert set(rest.command) >= {*REQUIREMENTS.values(), *TRACKING_REQUIREMENTS}
     assert detector.command[-3:] == ["--no-deps", *DETECTOR_REQUIREMENTS]
     assert not detector.optional
-    *_, offline = install_steps(tmp_path, "/python", "cpu", tmp_path / "wheels", "linux", tracking=True)
+    *_, offline = install_steps(tmp_path, "/python", tmp_path / "wheels", "linux", tracking=True)
     assert {"--no-index", "--no-deps", str(tmp_path / "wheels")} < set(offline.command)
 
 
@@ -97,7 +77,7 @@ def test_install_steps_of_tracking(tmp_path):
 def test_old_python_is_refused_first(newest, status, tmp_path, monkeypatch):
     """Catches gigabytes downloaded for a Python that cannot use them."""
     monkeypatch.setattr(environment, "MIN_PYTHON", newest)
-    looking = install_steps(tmp_path, sys.executable, "cpu", None)[0]
+    looking = install_steps(tmp_path, sys.executable, None)[0]
     done = subprocess.run(looking.command, capture_output=True, text=True)
     assert done.returncode == status
     assert ("ERROR: Python 3." in done.stderr) == bool(status)
@@ -145,13 +125,17 @@ def test_check_in_a_worker(tmp_path):
     seen = inspect_worker(folder, process)
     assert seen.state == WorkerState.FINISHED
     assert seen.status.message.startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert (tmp_path / ADAPTERS_FILE).exists()
+    if find_spec("wgpu") is not None:
+        from stga_addon.raster.gpu.device import adapters
+
+        assert stored_adapters(tmp_path) == list(adapters())
 
 
 @pytest.fixture
 def tiny(monkeypatch):
     """An installation of the virtual environment alone, without pip."""
-    monkeypatch.setattr(environment, "nvidia_smi", lambda: None)
-    monkeypatch.setattr(environment, "SIZES_GB", {"cpu": 0.0, "cuda": 0.0})
+    monkeypatch.setattr(environment, "SIZE_GB", 0.0)
     made = [sys.executable, "-m", "venv", "--without-pip"]
     monkeypatch.setattr(
         environment, "install_steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])]
@@ -160,7 +144,7 @@ def tiny(monkeypatch):
 
 def test_environment_is_made(tiny, tmp_path, monkeypatch):
     """Catches an environment used before it passed the check, or not found afterwards."""
-    monkeypatch.setattr(environment, "check_python", lambda python: f"good {Path(python).exists()}")
+    monkeypatch.setattr(environment, "check_python", lambda python, folder: f"good {Path(python).exists()}")
     python = venv_python(tmp_path / "venv-1")
     python.parent.mkdir(parents=True)
     python.touch()
@@ -184,7 +168,7 @@ def test_failed_environment_is_removed(tiny, tmp_path):
 def test_failed_attempt_keeps_the_environment(tiny, tmp_path, monkeypatch):
     """Catches a working environment lost when making a newer one fails."""
     with monkeypatch.context() as patched:
-        patched.setattr(environment, "check_python", lambda python: "good")
+        patched.setattr(environment, "check_python", lambda python, folder: "good")
         make_environment(tmp_path, sys.executable)
     before = made_python(tmp_path)
     with pytest.raises(StgaError, match="lacks numpy, torch"):
@@ -224,7 +208,7 @@ def test_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypa
 
 def test_optional_step_may_fail(tiny, tmp_path, monkeypatch):
     """Catches a failure where pytorch.org cannot be reached, but PyPI can."""
-    monkeypatch.setattr(environment, "check_python", lambda python: "good")
+    monkeypatch.setattr(environment, "check_python", lambda python, folder: "good")
     failing = InstallStep("failing", [sys.executable, "-c", "raise SystemExit(1)"], optional=True)
     making = environment.install_steps
     monkeypatch.setattr(environment, "install_steps", lambda *given: [*making(*given), failing])
@@ -266,7 +250,7 @@ def test_check_prints_json():
 def chosen(tmp_path, monkeypatch):
     """An environment folder and a check that every interpreter passes."""
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
-    monkeypatch.setattr(environment, "check_python", lambda python: "good")
+    monkeypatch.setattr(environment, "check_python", lambda python, folder: "good")
     return tmp_path / "environment"
 
 
@@ -348,7 +332,7 @@ def test_environment_is_removed(chosen, tiny):
 def test_installation_does_not_see_other_packages(tiny, tmp_path, monkeypatch):
     """Catches pip that takes packages on the worker's path for installed ones."""
     monkeypatch.setenv("PYTHONPATH", "/bundled")
-    monkeypatch.setattr(environment, "check_python", lambda python: "good")
+    monkeypatch.setattr(environment, "check_python", lambda python, folder: "good")
     code = "import os, sys; sys.exit('PYTHONPATH' in os.environ)"
     making = environment.install_steps
     step = InstallStep("looking", [sys.executable, "-c", code])

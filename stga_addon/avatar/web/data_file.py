@@ -26,6 +26,7 @@ COLOR_STEP = 0.008
 """Of the constant SH coefficient, which a color has 0.28 times."""
 SH_STEP = 0.008
 STRAIN_STEP = 0.008
+"""Of colors per unit of strain, and of a triangle's range of strain."""
 VERTEX_STEP_M = 2.0**-24
 """Of base and neutral mesh: so fine that no thin triangle becomes a line, or the reverse."""
 BASIS_STEP_M = 2e-6
@@ -117,7 +118,11 @@ def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh_arrays(avatar: Avatar, splats: Splats) -> Arrays:
+    limits: Arrays = {}
+    if splats.strain_color.shape[1] and avatar.strain_range is not None:
+        limits["strain_range"] = FixedPoint(avatar.strain_range.reshape(len(avatar.faces), -1), STRAIN_STEP)
     return {
+        **limits,
         "faces": avatar.faces,
         "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
         "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),

@@ -42,6 +42,7 @@ COLUMNS = {
     "val_lpips": ("LPIPS", 4),
     "test_psnr": ("test", 2),
     "test_psnr_moving": ("moving", 2),
+    "test_lpips": ("LPIPS", 4),
 }
 """Figure -> heading and decimals. PSNR in dB on held-out views (val) and unseen expressions (test)."""
 

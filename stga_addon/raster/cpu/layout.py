@@ -2,8 +2,7 @@
 
 Stages: `project` (splats to the screen), `tiles` (which splats reach which tile), `blend` (tiles to pixels), and
 `image_loss`; each forward and, but for `tiles`, backward. The kernels take one tuple of arrays per concern, float32
-unless said; the Warp kernels in `gpu/` take the same arrays one by one (a Warp struct of arrays would have to be
-filled anew whenever a buffer moves), with an array of vectors where there is a last axis of fixed length here.
+unless said; `gpu/layout.py` says what of it the GPU's tables hold.
 
 N splats, F triangles, K = (degree + 1)² SH coefficients, S components of strain, P (tile, splat) pairs, image H × W.
 Gradients of a scalar have the name of the quantity after `v_`.
@@ -25,12 +24,11 @@ PROJECTED = 9
 
 
 class Parameters(NamedTuple):
-    """What is trained of N splats, raw as in `Splats`: numpy arrays, in `autograd` torch tensors, in `gpu/` Warp
-    arrays.
+    """What is trained of N splats, raw as in `Splats`: numpy arrays, in `autograd` torch tensors.
 
     xyz (N, 3), rotation (N, 4) wxyz, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3); strain_color (N, S, 3), or
-    None
-    where colors do not follow strain. The triangles (N,) int32 that the splats are bound to are passed beside them.
+    None where colors do not follow strain. The triangles (N,) int32 that the splats are bound to are passed beside
+    them.
     """
 
     xyz: Any

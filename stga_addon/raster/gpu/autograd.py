@@ -1,16 +1,18 @@
-"""Differentiable rendering of torch tensors by the Warp kernels, which share the tensors' memory."""
+"""Differentiable rendering of torch tensors by the WebGPU kernels: copied to the device and back."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 
 from ...avatar.embedding import WORLD, FaceFrames
 from ...capture.camera import Camera
-from ..cpu.layout import Parameters
+from ..cpu.layout import CameraFrames, Parameters
 from ..cpu.rasterize import frames_in_camera
-from .rasterize import PARAMETER_TYPES, DeviceFrames, Rasterizer, device_camera
+from .device import Device
+from .layout import split_rows
+from .rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
 
 
 def render_differentiable(
@@ -21,69 +23,63 @@ def render_differentiable(
     degree: int = 3,
     antialiased: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Differentiable rendering of float32 torch tensors on a CUDA device, or on the CPU, whose memory is shared_arrays.
-
-    Everything else as in `cpu.autograd.render_differentiable`.
-    """
-    device = str(splats.xyz.device)
-    camera_frames, count = frames_in_camera(frames, camera), len(splats.xyz)
-    if splats.strain_color is None:
-        splats = splats._replace(strain_color=splats.xyz.new_zeros(count, 0, 3))
-    strains = min(camera_frames.strain.shape[1], splats.strain_color.shape[1])
-    origin, matrix, strain = (
-        wp.array(value, dtype=dtype, device=device)
-        for value, dtype in (
-            (camera_frames.origin, wp.vec3),
-            (camera_frames.matrix, wp.mat33),
-            (camera_frames.strain, wp.float32),
-        )
-    )
-    on_face = wp.array(np.zeros(count, np.int32) if face is None else face, dtype=wp.int32, device=device)
+    """Differentiable rendering on the first adapter; everything as in `cpu.autograd.render_differentiable`."""
+    face = np.zeros(len(splats.xyz), np.int32) if face is None else face
+    camera_frames = frames_in_camera(frames, camera)
+    strains = camera_frames.strain.shape[1]
+    given = [tensor for tensor in splats if tensor is not None]
     images = []
     for depth_as_color in (False, True):
-        lens = device_camera(camera, degree, strains, depth_as_color, antialiased)
-        images.append(_Blend.apply(DeviceFrames(origin, matrix, strain, lens), on_face, *splats))
+        options = ViewOptions(camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased)
+        images.append(_Blend.apply(options, camera_frames, face, *given))
     (rgb, transmittance), (depth, _) = images
     return rgb, 1 - transmittance, depth[0]
 
 
-def shared_arrays(tensors: Parameters) -> Parameters:
-    """Contiguous torch tensors as Warp arrays of `PARAMETER_TYPES` that share their memory."""
-    return Parameters(*(_share(tensor.detach(), kind) for tensor, kind in zip(tensors, PARAMETER_TYPES, strict=True)))
-
-
-def _share(tensor: torch.Tensor, kind: Any) -> wp.array:
-    if tensor.numel():
-        return wp.from_torch(tensor, dtype=kind)
-    # Nothing to share, and torch's strides of empty tensors are not what Warp expects.
-    return wp.empty(tuple(tensor.shape[: tensor.ndim - (kind is not wp.float32)]), kind, device=str(tensor.device))
-
-
-def _stream(device: torch.device) -> Any:
-    """Launch on torch's stream, so that its work and ours follow each other without the host."""
-    return wp.ScopedStream(wp.stream_from_torch(device) if device.type == "cuda" else None)
+@cache
+def _rasterizer() -> Rasterizer:
+    return Rasterizer(Device())
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, frames: DeviceFrames, face: wp.array, *tensors: torch.Tensor
+        ctx: Any, options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, *tensors: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        device = tensors[0].device
-        kept = [tensor.detach().contiguous() for tensor in tensors]
-        with _stream(device):
-            rasterizer, splats = Rasterizer(str(device)), shared_arrays(Parameters(*kept))
-            rendering = rasterizer.forward(splats, face, frames)
-        ctx.saved = kept, splats, face, rasterizer, rendering
-        return wp.to_torch(rendering.image), wp.to_torch(rendering.transmittance)
+        splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
+        ctx.saved = options, camera_frames, face, splats
+        image, transmittance, _ = _render(options, camera_frames, face, splats, None)
+        return torch.from_numpy(image), torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
-        kept, splats, face, rasterizer, rendering = ctx.saved
-        gradients = Parameters(*(torch.zeros_like(tensor) for tensor in kept))
-        with _stream(kept[0].device):
-            rasterizer.backward(
-                rendering, splats, face, wp.from_torch(v_image.contiguous()), shared_arrays(gradients),
-                wp.from_torch(v_transmittance.contiguous()),
-            )  # fmt: skip
-        return None, None, *gradients
+        cotangents = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
+        options, camera_frames, face, splats = ctx.saved
+        _, _, gradients = _render(options, camera_frames, face, splats, cotangents)
+        given = [gradient for gradient in gradients if gradient is not None]
+        return None, None, None, *(torch.from_numpy(g) for g in given[: len(ctx.needs_input_grad) - 3])
+
+
+def _render(
+    options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, splats: Parameters,
+    cotangents: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray, Parameters]:  # fmt: skip
+    """Image and transmittance, and the gradients where there are cotangents of these two."""
+    rasterizer = _rasterizer()
+    device, (height, width) = rasterizer.device, (options.camera.height, options.camera.width)
+    while True:
+        table, frames = upload_splats(device, splats, face), upload_frames(device, camera_frames)
+        gradients = device.upload("gradients", np.zeros((table.count, table.stride), np.float32))
+        v_images = [device.upload(f"v {n}", v) for n, v in enumerate(cotangents or ())]
+        with device.record() as work:
+            rendering = rasterizer.forward(work, table, frames, options, rasterizer.upload_view(table, options))
+            if cotangents is not None:
+                rasterizer.backward(work, rendering, table, v_images[0], gradients, v_images[1])
+        if rasterizer.pairs_fit():
+            break
+    pixels, rows = (
+        device.read(rendering.pixels, (height, width, 2)),
+        device.read(gradients, (table.count, table.stride)),
+    )
+    image = device.read(rendering.image, (3, height, width))
+    return image, pixels[..., 0].copy(), split_rows(rows, table.coefficients)

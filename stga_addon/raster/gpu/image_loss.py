@@ -1,156 +1,64 @@
-"""(1 − w)·L1 + w·(1 − SSIM) and its gradient; the counterpart of `cpu/image_loss.py`.
+"""(1 − w)·L1 + w·(1 − SSIM) of an image on the device, and its gradient."""
 
-Four passes with a thread a value: the window along rows, then along columns, once for the blurred moments and once
-for the slopes. Between them the maps stay in a GPU's second-level cache (7 MB each at 802×550).
-"""
+from typing import Any
 
 import numpy as np
-import warp as wp
 
-from ..cpu import image_loss as cpu
-from .rasterize import DeviceRenderOutput, Rasterizer
-from .tiles import TILE, UNMARKED
+from ..cpu.layout import TILE
+from .device import Device, Recording
 
-wp.set_module_options({"enable_backward": False})
-
-WINDOW_RADIUS_PX = wp.constant(cpu.WINDOW_RADIUS_PX)
-WINDOW_WIDTH_PX = 2 * cpu.WINDOW_RADIUS_PX + 1
-C1, C2 = wp.constant(float(cpu.C1)), wp.constant(float(cpu.C2))
-_half = [float(w) for w in (cpu.W0, cpu.W1, cpu.W2, cpu.W3, cpu.W4, cpu.W5)]
-Window = wp.types.vector(length=WINDOW_WIDTH_PX, dtype=wp.float32)
-WINDOW = wp.constant(Window(*_half, *_half[-2::-1]))
-BYTE = wp.constant(float(np.float32(1 / 255)))
+LOSS = np.dtype(
+    [("ssim_weight", np.float32), ("masked", np.uint32)] + [(f"change_{channel}", np.float32) for channel in "rgb"]
+)
+"""The uniform `loss` of image_loss.wgsl."""
 
 
-@wp.func
-def _moments(a: float, b: float) -> wp.vec4:
-    return wp.vec4(a, b, a * a + b * b, a * b)
+def upload_target(
+    device: Device, target: np.ndarray, ssim_weight: float, mask: np.ndarray | None = None, change: Any = (0, 0, 0)
+) -> None:
+    """Send the target (H, W, 3) uint8 of the next image, and how it is compared.
 
-
-@wp.kernel
-def blur_rows(
-    image: wp.array3d[wp.float32],
-    target: wp.array3d[wp.uint8],
-    tiles_x: wp.int32,
-    rendered: wp.array[wp.uint8],
-    out: wp.array3d[wp.vec4],
-):
-    """Image, target, sum of their squares and product, blurred along x; for the rendered tiles' pixels."""
-    c, y, x = wp.tid()
-    if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
-        return
-    total = wp.vec4()
-    for k in range(wp.static(WINDOW_WIDTH_PX)):
-        column = x + k - WINDOW_RADIUS_PX
-        if column >= 0 and column < image.shape[2]:
-            total += WINDOW[k] * _moments(image[c, y, column], float(target[y, column, c]) * BYTE)
-    out[c, y, x] = total
-
-
-@wp.kernel
-def find_slopes(
-    image: wp.array3d[wp.float32],
-    target: wp.array3d[wp.uint8],
-    blurred: wp.array3d[wp.vec4],
-    tiles_x: wp.int32,
-    rendered: wp.array[wp.uint8],
-    ssim_weight: wp.float32,
-    out: wp.array3d[wp.vec3],
-    loss: wp.array3d[wp.float32],
-):
-    """SSIM's derivatives by mean, sum of squares and product, holding the other blurred values fixed.
-
-    loss (3, H, W): what each value adds to the loss, before the mean.
+    mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's color is changed by
+    `change` (3,) in 0…255.
     """
-    c, y, x = wp.tid()
-    if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
-        return
-    m = wp.vec4()
-    for k in range(wp.static(WINDOW_WIDTH_PX)):
-        row = y + k - WINDOW_RADIUS_PX
-        if row >= 0 and row < image.shape[1]:
-            m += WINDOW[k] * blurred[c, row, x]
-    mxy, mm = m[0] * m[1], m[0] * m[0] + m[1] * m[1]
-    # As on the CPU: rounding must not make a variance negative, nor the covariance larger than it.
-    variance = wp.max(0.0, m[2] - mm)
-    covariance = wp.min(variance, wp.max(-variance, 2.0 * (m[3] - mxy)))
-    over_d, over_e = 1.0 / (mm + C1), 1.0 / (variance + C2)
-    luminance, structure = (2.0 * mxy + C1) * over_d, (covariance + C2) * over_e
-    ssim = luminance * structure
-    by_mean = 2.0 * m[1] * (structure * over_d - luminance * over_e) - 2.0 * m[0] * ssim * (over_d - over_e)
-    out[c, y, x] = wp.vec3(by_mean, -ssim * over_e, 2.0 * luminance * over_e)
-    difference = wp.abs(image[c, y, x] - float(target[y, x, c]) * BYTE)
-    loss[c, y, x] = (1.0 - ssim_weight) * difference + ssim_weight * (1.0 - ssim)
+    loss = np.zeros(1, LOSS)
+    loss["ssim_weight"], loss["masked"] = ssim_weight, mask is not None
+    loss["change_r"], loss["change_g"], loss["change_b"] = change
+    device.upload("loss", loss, "uniform")
+    device.upload("image_target", target)
+    if mask is not None:
+        device.upload("mask", mask)
 
 
-@wp.kernel
-def blur_slopes(
-    slopes: wp.array3d[wp.vec3], tiles_x: wp.int32, rendered: wp.array[wp.uint8], out: wp.array3d[wp.vec3]
-):  # fmt: skip
-    """The slopes blurred along x."""
-    c, y, x = wp.tid()
-    if rendered[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
-        return
-    total = wp.vec3()
-    for k in range(wp.static(WINDOW_WIDTH_PX)):
-        column = x + k - WINDOW_RADIUS_PX
-        if column >= 0 and column < slopes.shape[2]:
-            total += WINDOW[k] * slopes[c, y, column]
-    out[c, y, x] = total
+def image_loss(
+    work: Recording, width: int, height: int, *, view: Any, image: Any, touched: Any, whole: bool
+) -> tuple[Any, Any]:
+    """Record the gradient of the loss of an image (3, H, W) against the uploaded target.
 
-
-@wp.kernel
-def image_gradient(
-    image: wp.array3d[wp.float32],
-    target: wp.array3d[wp.uint8],
-    blurred: wp.array3d[wp.vec3],
-    tiles_x: wp.int32,
-    touched: wp.array[wp.uint8],
-    ssim_weight: wp.float32,
-    gradient: wp.array3d[wp.float32],
-):
-    """Gradient of the mean over all values of the loss with respect to the image, for the touched tiles' pixels."""
-    c, y, x = wp.tid()
-    if touched[(y // TILE) * tiles_x + x // TILE] == UNMARKED:
-        return
-    s = wp.vec3()
-    for k in range(wp.static(WINDOW_WIDTH_PX)):
-        row = y + k - WINDOW_RADIUS_PX
-        if row >= 0 and row < image.shape[1]:
-            s += WINDOW[k] * blurred[c, row, x]
-    a, b = image[c, y, x], float(target[y, x, c]) * BYTE
-    sign = wp.where(a > b, 1.0, wp.where(a < b, -1.0, 0.0))
-    slope = s[0] + 2.0 * a * s[1] + b * s[2]
-    share = 1.0 / float(3 * image.shape[1] * image.shape[2])
-    gradient[c, y, x] = share * ((1.0 - ssim_weight) * sign - ssim_weight * slope)
-
-
-@wp.kernel
-def change_background(
-    image: wp.array3d[wp.uint8], mask: wp.array2d[wp.uint8], change: wp.vec3, out: wp.array3d[wp.uint8]
-):  # fmt: skip
-    """As the CPU's; change: the color after less the one before, in 0…255."""
-    y, x = wp.tid()
-    clear = float(255 - int(mask[y, x])) * BYTE
-    for c in range(3):
-        value = float(image[y, x, c]) + clear * change[c]
-        out[y, x, c] = wp.uint8(wp.min(255.0, wp.max(0.0, value)) + 0.5)
-
-
-def image_loss_gradient(
-    rasterizer: Rasterizer, rendering: DeviceRenderOutput, target: wp.array, ssim_weight: float
-) -> tuple[wp.array, wp.array]:
-    """Gradient (3, H, W) of the image loss in the touched tiles, and what each value adds to the loss (3, H, W).
-
-    target (H, W, 3) uint8. The loss is the mean of the latter where every tile was rendered.
+    touched (tiles,): in which tiles the gradient is wanted; the image must be rendered LOSS_REACH_PX around them.
+    Returns the gradient (3, H, W), undefined in other tiles, and the loss (1,), which is computed if `whole`: every
+    tile is touched.
     """
-    shape, lens, array = rendering.image.shape, rendering.frames.lens, rasterizer.buffers.get
-    image, tiles_x, rendered = rendering.image, lens.tiles_x, rendering.rendered
-    moments, loss, v_image = array("moments", shape, wp.vec4), array("loss", shape), array("v_image", shape)
-    slopes, blurred = array("slopes", shape, wp.vec3), array("blurred_slopes", shape, wp.vec3)
-    launch = rasterizer.launch
-    launch(blur_rows, shape, image, target, tiles_x, rendered, moments)
-    launch(find_slopes, shape, image, target, moments, tiles_x, rendered, ssim_weight, slopes, loss)
-    launch(blur_slopes, shape, slopes, tiles_x, rendered, blurred)
-    launch(image_gradient, shape, image, target, blurred, tiles_x, rendering.touched, ssim_weight, v_image)
-    return v_image, loss
+    device = work.device
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    buffers = {
+        "view": view,
+        "loss": device.buffer("loss", LOSS.itemsize // 4, "uniform"),
+        "image": image,
+        "image_target": device.buffer("image_target", 0),
+        "mask": device.buffer("mask", 0),
+        "touched": touched,
+        "v_image": device.buffer("v_image", 3 * width * height),
+        "sums": device.buffer("loss sums", 6 * columns * rows),
+        "result": device.buffer("loss result", 1),
+    }
+    work.dispatch(device.kernel("image_loss", "gradient"), (columns, rows, 3), **buffers)
+    if whole:
+        work.dispatch(device.kernel("image_loss", "total"), (1, 1, 1), **buffers)
+    return buffers["v_image"], buffers["result"]
+
+
+def compile_kernels(device: Device) -> None:
+    """Compile what this module dispatches."""
+    for entry in ("gradient", "total"):
+        device.kernel("image_loss", entry)

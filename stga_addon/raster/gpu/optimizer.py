@@ -1,193 +1,99 @@
-"""Optimizer kernels, the counterpart of `cpu/optimizer.py`; the rows to step are marked in `wanted`."""
+"""Adam on the wanted rows only, with the limits of size and distance, on the device."""
 
-import warp as wp
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-from ..cpu import optimizer as cpu
-from .tiles import UNMARKED
+import numpy as np
 
-wp.set_module_options({"enable_backward": False})
+from ..cpu.layout import Parameters
+from .device import Device, Recording
+from .layout import WORKGROUP
 
-MAX_GRADIENT = wp.constant(float(cpu.MAX_GRADIENT))
+INCLUDE = ("numbers", "optimizer")
+RATES = (*Parameters._fields, "sh_rest")
+"""Learning rates in the order of the kernels; the last is that of the harmonics above the constant one."""
+STEP = np.dtype(
+    [("rates", np.float32, 8)]
+    + [(name, np.float32) for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "newest")]
+    + [(name, np.float32) for name in ("scale_weight", "distance_weight", "opacity_weight")]
+    + [("statistics", np.uint32), ("unused", np.uint32, 2)]
+)
+"""The uniform `step` of optimizer.wgsl."""
 
 
-@wp.kernel
-def mark_focus(face: wp.array[wp.int32], selected: wp.array[wp.uint8], focus: wp.array[wp.uint8]):
-    """focus (N,): whether the splat's triangle is selected (F,)."""
-    i = wp.tid()
-    focus[i] = selected[face[i]]
+class OptimizerTables(NamedTuple):
+    """Tables of N splats in training, on the device.
 
-
-@wp.kernel
-def count_steps(
-    wanted: wp.array[wp.uint8],
-    log_beta1: wp.float64,
-    log_beta2: wp.float64,
-    newest: wp.float32,
-    steps: wp.array[wp.int32],
-    correct: wp.array[wp.vec3],
-):
-    """Add a step to the wanted rows, and write what corrects their first and second moment's bias and how much the
-    step counts in their running average: `newest`, or more in the beginning.
-
-    In float64, because 1 − βⁿ cancels.
+    first, second, average  shaped as the table of splats
+    history  (N, 3) steps uint32, sum of the screen gradients and number of summands float32
+    traits   (N, 2) float32: 1 for unbound splats, else 0; share of the cameras that did not see them
+    limits   (F, 3) float32: largest scale of bound and of unbound splats, largest distance
     """
-    i = wp.tid()
-    if wanted[i] == UNMARKED:
-        return
-    steps[i] = steps[i] + 1
-    n, one = wp.float64(steps[i]), wp.float64(1.0)
-    first, second = one / (one - wp.exp(n * log_beta1)), one / wp.sqrt(one - wp.exp(n * log_beta2))
-    correct[i] = wp.vec3(float(first), float(second), wp.max(newest, float(wp.float64(4.0) / (n + wp.float64(3.0)))))
+
+    first: Any
+    second: Any
+    average: Any
+    history: Any
+    traits: Any
+    limits: Any
 
 
-@wp.kernel
-def adam(
-    wanted: wp.array[wp.uint8],
-    correct: wp.array[wp.vec3],
-    parameter: wp.array2d[wp.float32],
-    gradient: wp.array2d[wp.float32],
-    first: wp.array2d[wp.float32],
-    second: wp.array2d[wp.float32],
-    average: wp.array2d[wp.float32],
-    rate: wp.float32,
-    rate_rest: wp.float32,
-    rest: wp.int32,
-    beta1: wp.float32,
-    beta2: wp.float32,
-    epsilon: wp.float32,
-):
-    """One step of a parameter's (N, D) wanted rows, a thread a value; `rate_rest` is for the columns from `rest` on.
+def upload_step(
+    device: Device,
+    rates: Mapping[str, float],
+    betas: tuple[float, float],
+    epsilon: float,
+    newest: float,
+    weights: tuple[float, float, float],
+    statistics: bool,
+) -> None:
+    """Send the numbers of the next step.
 
-    A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps its value and moments.
+    rates by name; newest: least share of a step in the running average; weights: of the limits of scale, distance and,
+    divided by the number of splats, opacity; statistics: collect the screen gradients.
     """
-    i, c = wp.tid()
-    if wanted[i] == UNMARKED:
-        return
-    for other in range(gradient.shape[1]):
-        if not (wp.abs(gradient[i, other]) < MAX_GRADIENT):
-            return
-    g = gradient[i, c]
-    m = beta1 * first[i, c] + (1.0 - beta1) * g
-    v = beta2 * second[i, c] + (1.0 - beta2) * g * g
-    first[i, c] = m
-    second[i, c] = v
-    step = wp.where(c < rest, rate, rate_rest) * m * correct[i][0] / (wp.sqrt(v) * correct[i][1] + epsilon)
-    value = parameter[i, c] - step
-    parameter[i, c] = value
-    average[i, c] = average[i, c] + correct[i][2] * (value - average[i, c])
+    step = np.zeros(1, STEP)
+    step["rates"][0, : len(RATES)] = [rates[name] for name in RATES]
+    step["beta1"], step["beta2"] = betas
+    step["log_beta1"], step["log_beta2"] = (math.log(beta) for beta in betas)
+    step["epsilon"], step["newest"], step["statistics"] = epsilon, newest, statistics
+    step["scale_weight"], step["distance_weight"], step["opacity_weight"] = weights
+    device.upload("step", step, "uniform")
 
 
-@wp.func
-def _over(value: float, limit: float) -> float:
-    return wp.max(0.0, value - limit)
+def optimize(
+    work: Recording, count: int, stride: int, tables: OptimizerTables, limited: bool, *, view: Any, splats: Any,
+    gradients: Any, face: Any, wanted: Any, screen: Any,
+) -> None:  # fmt: skip
+    """Record a step of the wanted rows of `count` splats of `stride` words, with the numbers uploaded last.
+
+    limited: whether a limit of scale or distance has a weight. screen (N,): of `project_backward`. The gradients are
+    changed by those of the limits.
+    """
+    device = work.device
+    shared = {"view": view, "wanted": wanted, "splats": splats}
+    step, corrections = device.buffer("step", STEP.itemsize // 4, "uniform"), device.buffer("corrections", 4 * count)
+    constant = {"face": face, "traits": tables.traits, "limits": tables.limits, "norms": device.buffer("norms", 2)}
+    if limited:
+        groups = -(-count // WORKGROUP)
+        buffers = {**shared, **constant, "excess": device.buffer("excess", 4 * groups)}
+        work.dispatch(device.kernel("limits", "measure", INCLUDE[:1]), device.groups(count), **buffers)
+        work.dispatch(device.kernel("limits", "total", INCLUDE[:1]), (1, 1, 1), **buffers)
+    work.dispatch(
+        device.kernel("rows", include=INCLUDE), device.groups(count), **shared, **constant, step=step, screen=screen,
+        gradients=gradients, history=tables.history, corrections=corrections,
+    )  # fmt: skip
+    work.dispatch(
+        device.kernel("adam", include=INCLUDE), device.groups(count * stride), **shared, step=step,
+        gradients=gradients, corrections=corrections, first=tables.first, second=tables.second,
+        average=tables.average,
+    )  # fmt: skip
 
 
-@wp.kernel
-def scale_excess(
-    wanted: wp.array[wp.uint8],
-    unbound: wp.array[wp.uint8],
-    log_scale: wp.array[wp.vec3],
-    face: wp.array[wp.int32],
-    limits: wp.array2d[wp.float32],
-    squares: wp.array[wp.float32],
-):
-    """‖ReLU(scale − limit)‖² of each row, 0 for rows that are not wanted; limits (2, F) of bound and unbound splats."""
-    i = wp.tid()
-    total = float(0.0)
-    if wanted[i] != UNMARKED:
-        for c in range(3):
-            over = _over(wp.exp(log_scale[i][c]), limits[int(unbound[i]), face[i]])
-            total += over * over
-    squares[i] = total
-
-
-@wp.kernel
-def scale_limit(
-    wanted: wp.array[wp.uint8],
-    unbound: wp.array[wp.uint8],
-    log_scale: wp.array[wp.vec3],
-    face: wp.array[wp.int32],
-    limits: wp.array2d[wp.float32],
-    weight: wp.float32,
-    square: wp.array[wp.float32],
-    gradient: wp.array[wp.vec3],
-):
-    """Add the gradient of weight · ‖ReLU(scale − limit)‖₂, whose square is given."""
-    i = wp.tid()
-    if wanted[i] == UNMARKED or not (square[0] > 0.0):
-        return
-    factor = weight / wp.sqrt(square[0])
-    v_log_scale = wp.vec3()
-    for c in range(3):
-        scale = wp.exp(log_scale[i][c])
-        v_log_scale[c] = factor * _over(scale, limits[int(unbound[i]), face[i]]) * scale
-    gradient[i] = gradient[i] + v_log_scale
-
-
-@wp.kernel
-def opacity_weight(
-    wanted: wp.array[wp.uint8],
-    opacity: wp.array[wp.float32],
-    share: wp.array[wp.float32],
-    weight: wp.float32,
-    gradient: wp.array[wp.float32],
-):
-    """Add the gradient of weight · Σ share · sigmoid(opacity)."""
-    i = wp.tid()
-    if wanted[i] == UNMARKED:
-        return
-    value = 1.0 / (1.0 + wp.exp(-opacity[i]))
-    gradient[i] = gradient[i] + weight * share[i] * value * (1.0 - value)
-
-
-@wp.kernel
-def distance_excess(
-    wanted: wp.array[wp.uint8],
-    unbound: wp.array[wp.uint8],
-    xyz: wp.array[wp.vec3],
-    face: wp.array[wp.int32],
-    limit: wp.array[wp.float32],
-    squares: wp.array[wp.float32],
-):
-    """ReLU(|xyz| − limit)² of each row, 0 for rows that are not wanted or unbound."""
-    i = wp.tid()
-    over = float(0.0)
-    if wanted[i] != UNMARKED and unbound[i] == UNMARKED:
-        over = _over(wp.length(xyz[i]), limit[face[i]])
-    squares[i] = over * over
-
-
-@wp.kernel
-def distance_limit(
-    wanted: wp.array[wp.uint8],
-    unbound: wp.array[wp.uint8],
-    xyz: wp.array[wp.vec3],
-    face: wp.array[wp.int32],
-    limit: wp.array[wp.float32],
-    weight: wp.float32,
-    square: wp.array[wp.float32],
-    gradient: wp.array[wp.vec3],
-):
-    """Add the gradient of weight · ‖ReLU(|xyz| − limit)‖₂, whose square is given."""
-    i = wp.tid()
-    if wanted[i] == UNMARKED or unbound[i] != UNMARKED or not (square[0] > 0.0):
-        return
-    length = wp.length(xyz[i])
-    over = _over(length, limit[face[i]])
-    if over > 0.0:
-        gradient[i] = gradient[i] + (weight / wp.sqrt(square[0]) * over / length) * xyz[i]
-
-
-@wp.kernel
-def accumulate_screen_gradient(
-    wanted: wp.array[wp.uint8],
-    screen: wp.array[wp.float32],
-    screen_gradient: wp.array[wp.float32],
-    gradient_count: wp.array[wp.float32],
-):
-    """What density control asks for: the sum of screen-space gradients, and how many."""
-    i = wp.tid()
-    if wanted[i] == UNMARKED:
-        return
-    screen_gradient[i] = screen_gradient[i] + screen[i]
-    gradient_count[i] = gradient_count[i] + 1.0
+def compile_kernels(device: Device) -> None:
+    """Compile what this module dispatches."""
+    for entry in ("measure", "total"):
+        device.kernel("limits", entry, INCLUDE[:1])
+    for name in ("rows", "adam"):
+        device.kernel(name, include=INCLUDE)

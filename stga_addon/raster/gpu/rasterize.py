@@ -1,229 +1,176 @@
-"""Rendering on a Warp device: splats and a camera to an image, and its gradient back to the splats."""
+"""Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the splats."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from ...capture.camera import Camera
-from ..cpu.layout import PIXELS, TILE, Parameters
-from ..cpu.rasterize import BLACK_BACKGROUND, tile_grid
-from . import blend
-from .buffers import DeviceBufferPool
-from .project import DeviceCamera, Projected, project_backward, project_forward
-from .tiles import count_pairs, dilate_tiles, fill_pairs, find_tiles, mark_tiles
+from ..cpu.layout import TILE, CameraFrames, Parameters
+from ..cpu.rasterize import tile_grid
+from .blend import blend_backward, blend_forward
+from .device import Device, Recording
+from .layout import COUNTS, NEEDED, OVERFLOWED, SH, VIEW, splat_rows
+from .project import project, project_backward
+from .tiles import PairLists, Tiles, choose_tiles, counts_buffer, list_pairs
 
 INITIAL_PAIR_CAPACITY = 1 << 18
-"""Pairs that a rasterizer has room for at first: 25 MB."""
-PARAMETER_TYPES = Parameters(wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3)
-"""What the kernels see in a row of each parameter, or, of the last two, in a coefficient."""
+"""Pairs that a rasterizer has room for at first: 17 MB."""
 
 
 @dataclass(frozen=True)
-class DeviceFrames:
-    """Camera-space frames and strain of the triangles, as in `CameraFrames`, with the camera and rendering options."""
+class SplatTable:
+    """N splats on the device.
 
-    origin: wp.array
-    matrix: wp.array
-    strain: wp.array
-    lens: DeviceCamera
-
-
-@dataclass(frozen=True)
-class DeviceRenderOutput:
-    """An image and what its backward pass needs; valid until the rasterizer's next one.
-
-    image (3, H, W) float32 over the background; transmittance (H, W) = 1 − alpha; undefined where no tile was rendered.
-    wanted (N,) uint8: the splats of the focus that are visible, whose gradient the backward pass writes.
-    touched, rendered (tiles,) uint8: tiles that a splat of the focus reaches, and those that were rendered.
+    rows, face  tables of `layout.py`: (N, stride) and the triangle (N,) of each
+    count, coefficients, strain_colors  N, K and S
     """
 
-    image: wp.array
-    transmittance: wp.array
-    wanted: wp.array
-    touched: wp.array
-    rendered: wp.array
-    projected: wp.array
-    rect: wp.array
-    last: wp.array
-    first: wp.array
-    past: wp.array
-    slot_start: wp.array
-    slot_count: wp.array
-    pair_splat: wp.array
-    pair_slot: wp.array
-    background: wp.vec3
-    frames: DeviceFrames
+    rows: Any
+    face: Any
+    count: int
+    coefficients: int
+    strain_colors: int
+
+    @property
+    def stride(self) -> int:
+        """Words per row."""
+        return SH + 3 * (self.coefficients + self.strain_colors)
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What a rendering depends on beside splats and frames; see `cpu.rasterize.render_forward`.
+
+    strains: columns of strain in the table of frames; focused: whether there is a focus.
+    """
+
+    camera: Camera
+    degree: int
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
+    strains: int = 0
+    depth_as_color: bool = False
+    antialiased: bool = False
+    focused: bool = False
+    reach: int = 0
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """An image and what its backward pass needs, tables of `layout.py`; valid until the device's next one.
+
+    image (3, H, W) over the background; pixels (H, W, 2) with the transmittance; undefined where nothing is rendered.
+    """
+
+    image: Any
+    pixels: Any
+    projected: Any
+    chosen: Tiles
+    lists: PairLists
+    view: Any
+    frames: Any
+    tiles: int
 
 
 class Rasterizer:
-    """Renders on one device, forward and backward, into buffers of its own.
+    """Renders on one device, forward and backward, with room for `capacity` pairs.
 
-    The host never waits for the device in `backward`, and in `forward` only with `wait`.
+    Where the pairs do not fit, nothing is rendered and no splat is wanted, now and later, until `make_room`.
     """
 
-    def __init__(self, device: str) -> None:
-        self.device = wp.get_device(device)
-        self.buffers = DeviceBufferPool(self.device)
-        self._capacity = INITIAL_PAIR_CAPACITY
-        self._pairs = wp.zeros(1, wp.int32, device="cpu", pinned=self.device.is_cuda)
-        self._counted = wp.Event(self.device) if self.device.is_cuda else None
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.capacity = INITIAL_PAIR_CAPACITY
 
     def forward(
-        self,
-        splats: Parameters,
-        face: wp.array,
-        frames: DeviceFrames,
-        background: np.ndarray = BLACK_BACKGROUND,
-        focus: wp.array | None = None,
-        reach: int = 0,
-        wait: bool = True,
-    ) -> DeviceRenderOutput:
-        """Render N embedded splats over a background color (3,); Warp arrays of `PARAMETER_TYPES`.
-
-        focus (N,) uint8 and reach: as the focus and reach of `raster.render.render_forward`.
-        Without `wait`, the image may lack everything because the pairs did not fit; `pairs_fit` tells.
-        """
-        n, lens, array = face.size, frames.lens, self.buffers.get
-        depth, order = array("depth", 2 * n), array("order", 2 * n, wp.int32)
-        projected, rect = array("projected", n, Projected), array("rect", n, wp.vec4i)
-        self.launch(
-            project_forward, n,
-            *splats, face, frames.origin, frames.matrix, frames.strain, lens, projected, depth, order, rect,
+        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any,
+        focus: Any | None = None,
+    ) -> Rendering:  # fmt: skip
+        """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if `options.focused`."""
+        size = options.camera.width, options.camera.height
+        columns, rows = tile_grid(*size)
+        tiles = columns * rows
+        shared = {"view": view, "focus": focus}
+        seen = project(work, splats.count, view=view, splats=splats.rows, face=splats.face, frames=frames)
+        chosen = choose_tiles(work, splats.count, tiles, rect=seen.rect, **shared)
+        lists = list_pairs(
+            work, splats.count, tiles, self.capacity, depth_key=seen.depth_key, rect=seen.rect, chosen=chosen, **shared
+        )
+        image, pixels = blend_forward(
+            work, size[0] * size[1], tiles, view=view, rendered=chosen.rendered, tile_range=chosen.tile_range,
+            pairs=lists.pairs, projected=seen.projected,
         )  # fmt: skip
-        touched, rendered = self._tiles(rect, focus, lens, -(-reach // TILE))
-        if focus is None:
-            focus = array("everything", n, wp.uint8)
-            focus.fill_(1)
-        count, end = array("count", n, wp.int32), array("end", n, wp.int32)
-        if n:
-            wp.utils.radix_sort_pairs(depth, order, n)
-            self.launch(count_pairs, n, order, rect, rendered, lens.tiles_x, count)
-            wp.utils.array_scan(count, end, inclusive=True)
-            wp.copy(self._pairs, end, src_offset=n - 1, count=1)
-        else:
-            self._pairs.zero_()
-        if self._counted is not None:
-            wp.get_stream(self.device).record_event(self._counted)
-        if wait:
-            self.pairs_fit()
-        pairs = self._fill(order, rect, rendered, count, end, focus, lens)
-        image = array("image", (3, lens.height, lens.width))
-        transmittance = array("transmittance", (lens.height, lens.width))
-        last = array("last", (lens.height, lens.width), wp.int32)
-        rendering = DeviceRenderOutput(
-            image, transmittance, touched=touched, rendered=rendered, projected=projected, rect=rect, last=last,
-            background=wp.vec3(*(float(c) for c in background)), frames=frames, **pairs,
-        )  # fmt: skip
-        self.launch(
-            blend.blend_forward, rendered.size * PIXELS,
-            lens.tiles_x, rendered, rendering.first, rendering.past, rendering.pair_splat, projected,
-            rendering.background, image, transmittance, last,
-        )  # fmt: skip
-        return rendering
-
-    def pairs_fit(self) -> bool:
-        """Wait for the last rendering's number of pairs; whether they fitted. If not, make room for next time."""
-        if self._counted is not None:
-            wp.synchronize_event(self._counted)
-        pairs = int(self._pairs.numpy()[0])
-        if pairs < 0:
-            raise MemoryError("more than 2³¹ pairs of a splat and a tile")
-        if pairs <= self._capacity:
-            return True
-        self._capacity = pairs + pairs // 4
-        return False
+        return Rendering(image, pixels, seen.projected, chosen, lists, view, frames, tiles)
 
     def backward(
-        self,
-        rendering: DeviceRenderOutput,
-        splats: Parameters,
-        face: wp.array,
-        v_image: wp.array,
-        gradients: Parameters,
-        v_transmittance: wp.array | None = None,
-    ) -> wp.array:
-        """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
+        self, work: Recording, rendering: Rendering, splats: SplatTable, v_image: Any, gradients: Any,
+        v_transmittance: Any | None = None,
+    ) -> Any:  # fmt: skip
+        """Record the gradient of a scalar with respect to the splats, from that with respect to the image.
 
-        v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the rows of `gradients` that the rendering
-        wants and leaves all others unchanged. Returns screen (N,): for those rows, the length of the gradient with
-        respect to the projected center in units of half the image.
+        v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of `gradients`. Returns
+        `screen`, see `project_backward`.
         """
-        array, lens = self.buffers.get, rendering.frames.lens
-        rows = array("rows", rendering.pair_splat.size * blend.WARPS_PER_TILE, Projected)
-        rows.zero_()
-        if v_transmittance is None:
-            v_transmittance = array("nothing", (0, 0))
-        self.launch(
-            blend.blend_backward, rendering.touched.size * blend.WARPS_PER_TILE * blend.WARP_LANES,
-            lens.tiles_x, rendering.touched, rendering.first, rendering.pair_splat, rendering.pair_slot,
-            rendering.wanted, rendering.projected, rendering.background, rendering.transmittance, rendering.last,
-            v_image, v_transmittance, rows,
+        lists, chosen = rendering.lists, rendering.chosen
+        shared = {"view": rendering.view, "projected": rendering.projected}
+        pair_gradients = blend_backward(
+            work, self.capacity, rendering.tiles, v_image=v_image, v_transmittance=v_transmittance,
+            touched=chosen.touched, tile_range=chosen.tile_range, pairs=lists.pairs, pixels=rendering.pixels, **shared,
         )  # fmt: skip
-        frames, screen = rendering.frames, array("screen", face.size)
-        self.launch(
-            project_backward, face.size,
-            *splats, face, frames.origin, frames.matrix, frames.strain, lens, rendering.projected, rendering.wanted,
-            rendering.slot_start, rendering.slot_count, blend.WARPS_PER_TILE, rows, *gradients, screen,
+        return project_backward(
+            work, splats.count, splats=splats.rows, face=splats.face, frames=rendering.frames, wanted=lists.wanted,
+            slots=lists.slots, pair_gradients=pair_gradients, gradients=gradients, **shared,
         )  # fmt: skip
-        return screen
 
-    def launch(self, kernel: wp.Kernel, threads: int | tuple[int, ...], *arguments: Any) -> None:
-        """Launch a kernel on this device, in blocks of a tile's pixels."""
-        wp.launch(kernel, threads, arguments, device=self.device, block_dim=PIXELS)
+    def pairs_fit(self) -> bool:
+        """Wait for the submitted work; whether its pairs fitted. If not, room for them is made."""
+        counts = self.device.read(counts_buffer(self.device), (COUNTS,), np.uint32)
+        if counts[OVERFLOWED]:
+            self.make_room(int(counts[NEEDED]))
+        return not counts[OVERFLOWED]
 
-    def _tiles(
-        self, rect: wp.array, focus: wp.array | None, lens: DeviceCamera, ring: int
-    ) -> tuple[wp.array, wp.array]:
-        """Tiles that the focus touches, and those at most `ring` tiles away; without focus, all."""
-        tiles = lens.tiles_x * lens.tiles_y
-        touched, rendered = self.buffers.get("touched", tiles, wp.uint8), self.buffers.get("rendered", tiles, wp.uint8)
-        if focus is None:
-            touched.fill_(1)
-            rendered.fill_(1)
-        else:
-            touched.zero_()
-            self.launch(mark_tiles, rect.size, rect, focus, lens.tiles_x, touched)
-            self.launch(dilate_tiles, tiles, touched, lens.tiles_x, lens.tiles_y, ring, rendered)
-        return touched, rendered
+    def make_room(self, needed: int) -> None:
+        """Hold at least so many pairs from now on, and a quarter to spare, and let renderings begin again."""
+        self.capacity = max(self.capacity, needed + needed // 4)
+        self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
 
-    def _fill(
-        self, order: wp.array, rect: wp.array, rendered: wp.array, count: wp.array, end: wp.array, focus: wp.array,
-        lens: DeviceCamera,
-    ) -> dict[str, wp.array]:  # fmt: skip
-        """Every rendered tile's list of splats; the fields of `DeviceRenderOutput` that come of it."""
-        n, tiles, capacity, array = rect.size, rendered.size, self._capacity, self.buffers.get
-        pair_tile, pair_slot = array("pair_tile", 2 * capacity, wp.int32), array("pair_slot", 2 * capacity, wp.int32)
-        slot_splat, pair_splat = array("slot_splat", capacity, wp.int32), array("pair_splat", capacity, wp.int32)
-        slot_start, slot_count = array("slot_start", n, wp.int32), array("slot_count", n, wp.int32)
-        wanted = array("wanted", n, wp.uint8)
-        first, past = array("first", tiles, wp.int32), array("past", tiles, wp.int32)
-        first.zero_()
-        past.zero_()
-        pair_tile.fill_(tiles)
-        self.launch(
-            fill_pairs, n,
-            order, rect, rendered, lens.tiles_x, count, end, focus, capacity, pair_tile, pair_slot, slot_splat,
-            slot_start, slot_count, wanted,
-        )  # fmt: skip
-        wp.utils.radix_sort_pairs(pair_tile, pair_slot, capacity, 0, tiles.bit_length())
-        self.launch(find_tiles, capacity, pair_tile, pair_slot, slot_splat, pair_splat, first, past)
-        return {
-            "wanted": wanted, "first": first, "past": past, "slot_start": slot_start, "slot_count": slot_count,
-            "pair_splat": pair_splat, "pair_slot": pair_slot,
-        }  # fmt: skip
+    def upload_view(self, splats: SplatTable, options: ViewOptions) -> Any:
+        """Send the uniform `view` of the next rendering."""
+        camera, view = options.camera, np.zeros((), VIEW)
+        columns, rows = tile_grid(camera.width, camera.height)
+        values = (
+            *(camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns, rows),
+            *camera.world_to_camera[:3, :3].T.ravel(),
+            *options.background,
+            splats.count,
+            splats.coefficients,
+            splats.strain_colors,
+            options.degree,
+            min(options.strains, splats.strain_colors),
+            options.strains,
+            options.depth_as_color,
+            options.antialiased,
+            options.focused,
+            -(-options.reach // TILE),
+            self.capacity,
+        )
+        view[...] = values
+        return self.device.upload("view", view, "uniform")
 
 
-def device_camera(
-    camera: Camera, degree: int, strains: int, depth_as_color: bool = False, antialiased: bool = False
-) -> DeviceCamera:
-    """The camera as the kernels take it; strains: columns of strain that both frames and splats have."""
-    lens = DeviceCamera()
-    lens.fx, lens.fy, lens.cx, lens.cy = camera.fl_x, camera.fl_y, camera.cx, camera.cy
-    lens.width, lens.height = camera.width, camera.height
-    lens.tiles_x, lens.tiles_y = tile_grid(camera.width, camera.height)
-    lens.to_world = wp.mat33(*camera.world_to_camera[:3, :3].T.ravel().tolist())
-    lens.degree, lens.strains = degree, strains
-    lens.depth_as_color, lens.antialiased = depth_as_color, antialiased
-    return lens
+def upload_splats(device: Device, splats: Parameters, face: np.ndarray) -> SplatTable:
+    """Numpy arrays of splats as a table on the device."""
+    rows = splat_rows(splats)
+    strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
+    return SplatTable(
+        device.upload("splats", rows), device.upload("face", face.astype(np.uint32)), len(rows), splats.sh.shape[1],
+        strain_colors,
+    )  # fmt: skip
+
+
+def upload_frames(device: Device, frames: CameraFrames) -> Any:
+    """Frames in camera space, computed on the CPU, as a table on the device."""
+    count = len(frames.origin)
+    parts = (frames.origin, frames.matrix.reshape(count, 9), frames.strain)
+    return device.upload("frames", np.concatenate(parts, axis=1, dtype=np.float32))

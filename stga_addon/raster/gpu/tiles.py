@@ -1,131 +1,103 @@
-"""Sorting of projected splats into tiles, front to back; the counterpart of `cpu/tiles.py`.
+"""Projected splats to tiles: the tiles to be rendered, and every tile's list of pairs, near to far.
 
-The splats are sorted by depth, write their (tile, splat) pairs in that order, and a stable sort by tile alone keeps
-it: two short sorts (32 bits of N depths, a dozen bits of the pairs) instead of a long one.
-
-How many pairs there are is known on the device only. The buffers for them have a fixed capacity, what does not fit is
-not written, and everything that follows then finds nothing to do, so that the host may ask later and repeat.
+The splats are sorted by depth, write their (tile, splat) pairs in that order, and a stable sort by tile alone keeps it.
+How many pairs there are is known on the device only, so everything that follows is dispatched indirectly.
 """
 
-import warp as wp
+from typing import Any, NamedTuple
 
-from ..cpu.layout import TILE as _TILE
+from .device import Device, Groups, Recording
+from .layout import COUNTS, DIGIT_BITS, PAIR_GROUPS, SORT_BLOCK, SORT_GROUPS, WORKGROUP
 
-wp.set_module_options({"enable_backward": False})
-
-TILE = wp.constant(_TILE)
-MARKED, UNMARKED = wp.constant(wp.uint8(1)), wp.constant(wp.uint8(0))
+DEPTH_BITS = 32
 
 
-@wp.kernel
-def mark_tiles(
-    rect: wp.array[wp.vec4i], focus: wp.array[wp.uint8], tiles_x: wp.int32, touched: wp.array[wp.uint8]
-):  # fmt: skip
-    """Set the tiles that a splat of focus (N,) reaches; all who write one write the same."""
-    i = wp.tid()
-    if focus[i] == UNMARKED:
-        return
-    r = rect[i]
-    for y in range(r[1], r[3]):
-        for x in range(r[0], r[2]):
-            touched[y * tiles_x + x] = MARKED
+class Tiles(NamedTuple):
+    """Which of the tiles are touched by the focus and rendered; tables as in `layout.py`."""
+
+    touched: Any
+    rendered: Any
+    tile_range: Any
 
 
-@wp.kernel
-def dilate_tiles(
-    touched: wp.array[wp.uint8], tiles_x: wp.int32, tiles_y: wp.int32, ring: wp.int32, rendered: wp.array[wp.uint8]
-):  # fmt: skip
-    """Mark the tiles with a touched one at most `ring` tiles away."""
-    n = wp.tid()
-    x, y = n % tiles_x, n // tiles_x
-    near = UNMARKED
-    for row in range(wp.max(0, y - ring), wp.min(tiles_y, y + ring + 1)):
-        for column in range(wp.max(0, x - ring), wp.min(tiles_x, x + ring + 1)):
-            near = wp.max(near, touched[row * tiles_x + column])
-    rendered[n] = near
+class PairLists(NamedTuple):
+    """The (tile, splat) pairs, by tile and by splat; tables as in `layout.py`."""
+
+    pairs: Any
+    slots: Any
+    wanted: Any
 
 
-@wp.kernel
-def count_pairs(
-    order: wp.array[wp.int32],
-    rect: wp.array[wp.vec4i],
-    rendered: wp.array[wp.uint8],
-    tiles_x: wp.int32,
-    count: wp.array[wp.int32],
-):
-    """How many rendered tiles the n-th splat in `order` touches."""
-    n = wp.tid()
-    r = rect[order[n]]
-    pairs = int(0)
-    for y in range(r[1], r[3]):
-        for x in range(r[0], r[2]):
-            pairs += int(rendered[y * tiles_x + x])
-    count[n] = pairs
+def counts_buffer(device: Device) -> Any:
+    """The counts of pairs, see `layout.py`."""
+    return device.buffer("counts", COUNTS, "indirect")
 
 
-@wp.kernel
-def fill_pairs(
-    order: wp.array[wp.int32],
-    rect: wp.array[wp.vec4i],
-    rendered: wp.array[wp.uint8],
-    tiles_x: wp.int32,
-    count: wp.array[wp.int32],
-    end: wp.array[wp.int32],
-    focus: wp.array[wp.uint8],
-    capacity: wp.int32,
-    pair_tile: wp.array[wp.int32],
-    pair_slot: wp.array[wp.int32],
-    slot_splat: wp.array[wp.int32],
-    slot_start: wp.array[wp.int32],
-    slot_count: wp.array[wp.int32],
-    wanted: wp.array[wp.uint8],
-):
-    """Write the n-th splat's pairs to its slots, end[n] − count[n] and on.
+def choose_tiles(work: Recording, count: int, tiles: int, *, view: Any, rect: Any, focus: Any | None) -> Tiles:
+    """Record which of `tiles` tiles are rendered of `count` splats; focus (N,): see `mark_focus`, None for all."""
+    device = work.device
+    chosen = Tiles(
+        device.buffer("touched", tiles), device.buffer("rendered", tiles), device.buffer("ranges", 2 * tiles)
+    )
+    given = {"view": view, "rect": rect, "focus": rect if focus is None else focus}
+    if focus is not None:
+        work.clear(chosen.touched, tiles)
+        work.dispatch(device.kernel("tiles", "mark"), device.groups(count), **given, **chosen._asdict())
+    work.dispatch(device.kernel("tiles", "choose"), device.groups(tiles), **given, **chosen._asdict())
+    return chosen
 
-    pair_tile and pair_slot (≥ capacity) are keys and values ready to be sorted; slot_start, slot_count (N,) are by
-    splat. wanted (N,): splats of focus (N,) that are visible. Where the last end exceeds the capacity nothing fits.
+
+def list_pairs(
+    work: Recording, count: int, tiles: int, capacity: int, *, view: Any, depth_key: Any, rect: Any,
+    chosen: Tiles, focus: Any | None,
+) -> PairLists:  # fmt: skip
+    """Record the lists of the chosen tiles, with room for `capacity` pairs, and fill `chosen.tile_range`."""
+    device, counts, groups = work.device, counts_buffer(work.device), work.device.groups(count)
+    kernel, buffer = device.kernel, device.buffer
+    _, order = sort_keys(work, depth_key, count, DEPTH_BITS, view=view)
+    counted = {
+        "view": view, "order": order, "rect": rect, "rendered": chosen.rendered, "counts": counts,
+        "pairs_until": buffer("pairs_until", count + -(-count // WORKGROUP)),
+    }  # fmt: skip
+    work.dispatch(kernel("count_pairs", "count"), groups, **counted)
+    work.dispatch(kernel("count_pairs", "total"), (1, 1, 1), **counted)
+    lists = PairLists(buffer("pairs", 2 * capacity), buffer("slots", 2 * count), buffer("wanted", count))
+    slot_tile, slot_splat = buffer("slot_tile", capacity), buffer("slot_splat", capacity)
+    work.dispatch(
+        kernel("fill_pairs"), groups, **counted, focus=rect if focus is None else focus, slots=lists.slots,
+        wanted=lists.wanted, slot_tile=slot_tile, slot_splat=slot_splat,
+    )  # fmt: skip
+    pair_tile, pair_slot = sort_keys(work, slot_tile, capacity, tiles.bit_length(), view=view, of_pairs=True)
+    work.dispatch(
+        kernel("tile_lists"), (counts, 4 * PAIR_GROUPS), view=view, counts=counts, pair_tile=pair_tile,
+        pair_slot=pair_slot, slot_splat=slot_splat, pairs=lists.pairs, tile_range=chosen.tile_range,
+    )  # fmt: skip
+    return lists
+
+
+def sort_keys(
+    work: Recording, keys: Any, room: int, bits: int, *, view: Any, of_pairs: bool = False
+) -> tuple[Any, Any]:
+    """Record sorting of the keys, of which the lowest `bits` count; equal keys keep their order.
+
+    There are as many keys as splats, or as pairs, and room for so many. Returns buffers of the sorted keys and of
+    their numbers before; `keys` may be overwritten.
     """
-    n = wp.tid()
-    i = order[n]
-    all_pairs = end[end.shape[0] - 1]
-    fits = all_pairs >= 0 and all_pairs <= capacity  # a count beyond 2³¹ has become negative
-    pairs = wp.where(fits, count[n], 0)
-    slot = end[n] - count[n]
-    slot_start[i] = wp.where(fits, slot, 0)
-    slot_count[i] = pairs
-    wanted[i] = wp.where(pairs > 0, focus[i], UNMARKED)
-    if pairs == 0:
-        return
-    r = rect[i]
-    for y in range(r[1], r[3]):
-        for x in range(r[0], r[2]):
-            tile = y * tiles_x + x
-            if rendered[tile] == MARKED:
-                pair_tile[slot] = tile
-                pair_slot[slot] = slot
-                slot_splat[slot] = i
-                slot += 1
-
-
-@wp.kernel
-def find_tiles(
-    pair_tile: wp.array[wp.int32],
-    pair_slot: wp.array[wp.int32],
-    slot_splat: wp.array[wp.int32],
-    pair_splat: wp.array[wp.int32],
-    first: wp.array[wp.int32],
-    past: wp.array[wp.int32],
-):
-    """From the sorted pairs: each pair's splat, and where each tile's list begins and ends.
-
-    Unused places at the end have a tile beyond the last. first, past (tiles,) are zero where a tile has no pairs.
-    """
-    j = wp.tid()
-    tile = pair_tile[j]
-    if tile >= first.shape[0]:
-        return
-    pair_splat[j] = slot_splat[pair_slot[j]]
-    if j == 0 or pair_tile[wp.max(j - 1, 0)] != tile:
-        first[tile] = j
-    if j + 1 == pair_splat.shape[0] or pair_tile[wp.min(j + 1, pair_splat.shape[0] - 1)] != tile:
-        past[tile] = j + 1
+    device, counts = work.device, counts_buffer(work.device)
+    buffer, kernel, blocks = device.buffer, device.kernel, -(-room // SORT_BLOCK)
+    groups: Groups = (counts, 4 * SORT_GROUPS) if of_pairs else (blocks, 1, 1)
+    name, values = "pair" if of_pairs else "splat", counts  # the first pass reads no values
+    targets = [(buffer(f"{name}_keys", room), buffer(f"{name}_numbers", room))]
+    targets.append((keys, buffer(f"{name}_numbers 2", room)))
+    for n, shift in enumerate(range(0, bits, DIGIT_BITS)):
+        constants: dict[str, Any] = {"SHIFT": shift, "FIRST": n == 0, "OF_PAIRS": of_pairs}
+        buffers = {
+            "view": view, "counts": counts, "keys": keys, "values": values, "sorted_keys": targets[n % 2][0],
+            "sorted_values": targets[n % 2][1], "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
+            "digit_totals": buffer("digit_totals", 1 << DIGIT_BITS),
+        }  # fmt: skip
+        work.dispatch(kernel("sort", "count", **constants), groups, **buffers)
+        work.dispatch(kernel("sort", "place", **constants), device.groups(1 << DIGIT_BITS), **buffers)
+        work.dispatch(kernel("sort", "scatter", **constants), groups, **buffers)
+        keys, values = targets[n % 2]
+    return keys, values

@@ -4,9 +4,9 @@ from math import pi, sqrt
 from typing import Any
 
 from ...avatar.splats import SH_C0
-from ...avatar.strain import MAX_STRAIN, STRAIN_COMPONENTS, STRAIN_GAIN
+from ...avatar.strain import STRAIN_COMPONENTS, STRAIN_GAIN
 from .node_builder import NodeGroup, Nodes
-from .splat_attributes import FACE, GRAM, PLANE, SH, STRAIN_COLOR, TENSOR, TENSOR_HALVES
+from .splat_attributes import FACE, GRAM, PLANE, RANGE, SH, STRAIN_COLOR, TENSOR, TENSOR_HALVES
 
 # Temporary attributes on the faces of the deformed neutral mesh.
 _GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
@@ -79,9 +79,10 @@ def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
     for index in range(STRAIN_COMPONENTS):
         plane = (nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES)
         products = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)]
-        strain = nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN)
-        strains.append(nodes.math("MAXIMUM", nodes.math("MINIMUM", strain, MAX_STRAIN), -MAX_STRAIN))
-    mesh = nodes.store(mesh, _STRAIN, nodes.combine(*strains), "FLOAT_VECTOR", "FACE")
+        strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
+    lowest, highest = (nodes.attribute(name, "FLOAT_VECTOR") for name in RANGE)
+    strain = nodes.vector("MAXIMUM", nodes.vector("MINIMUM", nodes.combine(*strains), highest), lowest)
+    mesh = nodes.store(mesh, _STRAIN, strain, "FLOAT_VECTOR", "FACE")
     return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
 
 
@@ -141,7 +142,7 @@ def _third_band(nodes: Nodes, direction: Any) -> Any:
 
 SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
 DEFORMED = NodeGroup("STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
-STRAIN = NodeGroup("STGA Strain", {"Deformed": "Geometry"}, "Vector", _sampled_strain)
+STRAIN = NodeGroup("STGA Strain in Range", {"Deformed": "Geometry"}, "Vector", _sampled_strain)
 SH_BANDS = tuple(
     NodeGroup(f"STGA Spherical Harmonics {degree}", {"Direction": "Vector"}, "Vector", build)
     for degree, build in enumerate((_first_band, _second_band, _third_band), 1)

@@ -29,6 +29,7 @@ NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²
 # On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
 GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
+RANGE = ("stga_strain_lowest", "stga_strain_highest")
 
 Attributes = dict[str, tuple[str, str, np.ndarray]]
 """Name -> (data type, name of the element's field, flat values)."""
@@ -52,7 +53,7 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     }
     neutral: Attributes = {}
     if avatar.splats.strain_color.shape[1]:
-        vectors = _strain_vectors(strain_basis(avatar.neutral, avatar.faces))
+        vectors = _strain_vectors(strain_basis(avatar.neutral, avatar.faces, avatar.strain_range))
         neutral = {name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors}
     return SplatAttributes(splats, neutral)
 
@@ -120,6 +121,13 @@ def read_splats(mesh: Any) -> Splats:
         )
 
 
+def read_strain_range(neutral: Any) -> np.ndarray | None:
+    """`Avatar.strain_range` as stored in a neutral mesh; None where it is not."""
+    if not all(name in neutral.attributes for name in RANGE):
+        return None
+    return np.stack([read_values(neutral.attributes[name].data, "vector", 3) for name in RANGE], 1)
+
+
 def _base_color(dc: np.ndarray) -> np.ndarray:
     """(N, 4) scene-linear RGBA, as color attributes are stored; the SH coefficients (N, 3) give sRGB."""
     linear = srgb_to_linear(np.clip(0.5 + SH_C0 * np.asarray(dc, np.float64), 0.0, 1.0))
@@ -129,6 +137,7 @@ def _base_color(dc: np.ndarray) -> np.ndarray:
 def _strain_vectors(basis: StrainBasis) -> Iterator[tuple[str, np.ndarray]]:
     """What the color nodes need to compute strain: name and vector (F, 3)."""
     yield GRAM, basis.gram
+    yield from zip(RANGE, basis.range.transpose(1, 0, 2), strict=True)
     for name, tensors in ((TENSOR, basis.to_tensor), (PLANE, basis.to_plane)):
         for index in range(STRAIN_COMPONENTS):
             for start, half in zip((0, 3), TENSOR_HALVES, strict=True):

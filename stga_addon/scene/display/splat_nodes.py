@@ -77,7 +77,7 @@ def _node_groups(convention: str | None, degree: int, strained: bool) -> list[No
 
 
 def _name(convention: str | None, degree: int, strained: bool) -> str:
-    return f"STGA Splats ({convention or 'world'}, SH {degree}{', strain' if strained else ''})"
+    return f"STGA Splats ({convention or 'world'}, SH {degree}{', strain in range' if strained else ''})"
 
 
 def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:

@@ -20,6 +20,7 @@ from .splat_attributes import (
     SplatAttributes,
     avatar_attributes,
     read_splats,
+    read_strain_range,
     splat_attributes,
     write_attributes,
     write_splats,
@@ -172,6 +173,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         neutral=mesh_vertices(neutral.data),
         faces=mesh_triangles(neutral.data),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
+        strain_range=read_strain_range(neutral.data),
     )
 
 

@@ -14,6 +14,7 @@ from ..animation import write_curve, write_triangle_curves
 from ..compat import action_curves
 from ..objects import Warn, log_warning
 from .names import (
+    EXPRESSION_KEY,
     PART_JOINTS,
     ROOT_LOCATION,
     expression_key,
@@ -25,6 +26,8 @@ from .names import (
     rotation_path,
 )
 
+UNCHANGED = 1e-6
+"""Change of a slider's value below which it is not keyframed."""
 MAX_SLIDER = 10.0
 """The widest range that Blender allows a shape key's value: -10 to 10."""
 
@@ -85,6 +88,22 @@ def key_zero_offsets(head: Any, rig: Any, frame: int) -> None:
         if offset_property(joint) in rig:
             for axis in range(3):
                 write_curve(action_curves(rig), property_path(offset_property(joint)), axis, at, zero)
+
+
+def key_current_pose(head: Any, rig: Any, frame: int) -> None:
+    """Keyframe the pose and expression that the head has now, set by hand or not, at `frame` alone."""
+    for bone in JOINTS:
+        rig.pose.bones[bone].keyframe_insert("rotation_quaternion", frame=frame)
+    rig.pose.bones["root"].keyframe_insert("location", frame=frame)
+    for curve in action_curves(head.data.shape_keys):
+        name = curve.data_path.partition('"')[2].partition('"')[0]
+        value, before = head.data.shape_keys.key_blocks[name].value, curve.evaluate(frame)
+        if not name.startswith(EXPRESSION_KEY) or abs(value - before) < UNCHANGED:
+            continue
+        if len(curve.keyframe_points) == 1:  # the motion never moves this slider
+            for neighbor in (frame - 1, frame + 1):
+                curve.keyframe_points.insert(neighbor, before)
+        curve.keyframe_points.insert(frame, value)
 
 
 def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:

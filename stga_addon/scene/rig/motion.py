@@ -119,6 +119,11 @@ def sample_motion(
     return FlameSequence(sequence.model, shape, sequence.static_offset, tuple(range(len(frames))), frames.__getitem__)
 
 
+def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
+    """FLAME parameters of the head as it is posed in the scene now, keyed or not. Raises StgaError without a rig."""
+    return _sample_frame(head, rig_of(head), model)
+
+
 def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
     bones = rig.evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones
     rotations = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}

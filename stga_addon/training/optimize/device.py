@@ -1,7 +1,6 @@
-"""Choice of the training device: a working NVIDIA GPU, else the CPU."""
+"""Choice of the training device: the GPU where it is right and faster, else the CPU."""
 
-import ctypes
-import os
+from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -10,29 +9,45 @@ import numpy as np
 from ...errors import StgaError
 
 if TYPE_CHECKING:  # choosing a device needs neither torch nor numba
+    from ...raster.gpu.trial import Trial
     from ..settings import TrainingSettings
     from .backend import Backend
     from .frames import FrameStore
     from .state import TrainState
 
-MIN_FREE_BYTES = 1 << 30
-"""Free GPU memory that training needs at least."""
+GPU = "gpu:"
+"""Before the adapter's name in the device of a run."""
 
 
 def choose_device(wanted: str) -> tuple[str, str]:
-    """The device to train on, for `make_backend`, and a sentence that explains the choice.
+    """The device to train on, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
 
-    wanted: one of `settings.DEVICES`; "auto" takes a GPU if it has enough memory and passes the self-test; "warp-cpu"
-    runs the GPU's code on the CPU, slowly, for tests. Raises StgaError if "cuda" is wanted and no GPU qualifies.
+    wanted: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with this
+    part in its name). "auto" takes the first adapter that is no software, right and faster than the CPU. Raises
+    StgaError if a GPU is wanted and none works.
     """
-    if wanted in ("cpu", "warp-cpu"):
-        return wanted, f"Training on the CPU (--device {wanted})"
-    found, reason = _find_gpu()
-    if found is not None:
-        return found, f"Training on {reason}"
-    if wanted == "cuda":
-        raise StgaError(f"--device cuda: {reason}")
-    return "cpu", f"Training on the CPU: {reason}"
+    if wanted == "cpu":
+        return "cpu", "Training on the CPU (--device cpu)"
+    if wanted == "auto":
+        return _fastest()
+    adapter = _adapter(wanted)
+    trial = _trial(adapter)
+    if not trial.is_right:
+        raise StgaError(f"--device {wanted}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu")
+    return GPU + adapter, f"Training on {adapter}, {_comparison(trial)}"
+
+
+def adapter_names(software: bool = True) -> list[str]:
+    """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is none."""
+    if find_spec("wgpu") is None:
+        raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
+    from ...raster.gpu.device import adapters, is_software
+
+    names = [name for name, adapter in adapters().items() if software or not is_software(adapter)]
+    if not names:
+        found = "no GPU" if adapters() else "no graphics driver with Vulkan, Metal or Direct3D 12"
+        raise StgaError(f"--device gpu: {found} was found")
+    return names
 
 
 def make_backend(
@@ -48,34 +63,62 @@ def make_backend(
         return CpuBackend(settings, units, frames, state)
     if settings.tracking:
         raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
+    from ...raster.gpu.device import Device
     from .gpu_backend import GpuBackend
 
-    return GpuBackend("cpu" if device == "warp-cpu" else device, settings, units, frames, state)
+    return GpuBackend(Device(_adapter(device)), settings, units, frames, state)
 
 
-def _find_gpu() -> tuple[str | None, str]:
-    """The GPU to train on and its description, or None and the reason why there is none."""
-    if find_spec("warp") is None:
-        return None, "the package warp-lang (NVIDIA Warp) is not installed"
+def _adapter(device: str) -> str:
+    """The adapter's name for "gpu" or "gpu:NAME"."""
+    names, wanted = adapter_names(), device.removeprefix(GPU)
+    if device == "gpu" or wanted in names:
+        return names[0] if device == "gpu" else wanted
+    found = [name for name in names if wanted.lower() in name.lower()]
+    if len(found) == 1:
+        return found[0]
+    which = "several adapters" if found else "no adapter"
+    raise StgaError(f"--device {device}: {which} of that name; there are: {', '.join(names)}")
+
+
+def _fastest() -> tuple[str, str]:
+    """The first real GPU that is right and faster than the CPU, or the CPU and why."""
     try:
-        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
-    except OSError:
-        return None, "there is no NVIDIA driver"
-    try:
-        import warp
+        names = adapter_names(software=False)
+    except Exception as error:  # whatever a driver raises, the CPU can still train
+        return "cpu", f"Training on the CPU: {_first_line(error)}"
+    reasons = []
+    for adapter in names:
+        try:
+            trial = _trial(adapter)
+        except Exception as error:
+            reasons.append(f"{adapter} fails ({_first_line(error)})")
+            continue
+        if trial.is_right and trial.device_s < trial.cpu_s:
+            return GPU + adapter, f"Training on {adapter}, {_comparison(trial)}"
+        reasons.append(f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial))
+    return "cpu", f"Training on the CPU: {'; '.join(reasons)}"
 
-        from ...raster.gpu.self_test import compile_kernels, passes
 
-        if not warp.is_cuda_available():
-            return None, "the NVIDIA driver finds no usable GPU"
-        device = warp.get_cuda_device()
-        if device.free_memory < MIN_FREE_BYTES:
-            free, needed = device.free_memory >> 20, MIN_FREE_BYTES >> 20
-            return None, f"{device.name} has {free} MiB of free memory; training needs at least {needed} MiB"
-        compile_kernels(device.alias)
-        if not passes(device.alias):
-            return None, f"{device.name} fails the self-test: its results are wrong"
-    except Exception as error:  # whatever a driver or compiler raises, the CPU can still train
-        first_line = (str(error).strip() or repr(error)).splitlines()[0]
-        return None, f"the GPU self-test failed ({first_line})"
-    return device.alias, f"{device.name} ({device.free_memory >> 20} MiB of free memory)"
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or repr(error)).splitlines()[0].removeprefix("--device gpu: ")
+
+
+@cache
+def _trial(adapter: str) -> "Trial":
+    from ...raster.gpu.device import Device
+    from ...raster.gpu.trial import try_device
+
+    return try_device(Device(adapter))
+
+
+def _comparison(trial: "Trial") -> str:
+    """How fast a device is beside the CPU, of which an image took the other time."""
+    times = f"{1e3 * trial.device_s:.1f} and {1e3 * trial.cpu_s:.1f} ms an image"
+    faster, slower = trial.cpu_s / trial.device_s, trial.device_s / trial.cpu_s
+    share = f"{faster:.1f} times as fast as" if faster > 1 else f"{slower:.1f} times slower than"
+    return f"{share} the CPU in a trial ({times})"
+
+
+def _wrong(adapter: str, trial: "Trial") -> str:
+    return f"{adapter} computes gradients that differ from the CPU's by {100 * trial.error:.2g} %"

@@ -1,4 +1,4 @@
-"""Hull points: splats for what the mesh does not cover (hair, shoulders, clothes)."""
+"""Hull points: splats for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a single camera."""
 
 from collections.abc import Sequence
 
@@ -50,17 +50,46 @@ def hull_points(capture: Capture, views: Sequence[View], convention: str, sh_deg
     return to_local(world, frames, face[outside])
 
 
+def flat_points(capture: Capture, view: View, convention: str, sh_degree: int) -> Splats:
+    """Unbound splats for what a single camera shows beside the mesh: one layer at the depth of the mesh's outline.
+
+    A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of its pixel, as deep
+    as the part of the mesh that is nearest in the image, follows the nearest triangle, and has the size and distance
+    of hull points.
+    """
+    mesh, camera = capture.mesh(view.timestep), view.camera
+    voxel = voxel_size(mesh)
+    samples = _mesh_samples(mesh, capture.faces)
+    pixels, depth = camera.project(samples)
+    step = max(1.0, voxel * (camera.fl_x + camera.fl_y) / 2 / float(np.median(depth)))
+    rows, columns = np.meshgrid(
+        np.arange(step / 2, camera.height, step), np.arange(step / 2, camera.width, step), indexing="ij"
+    )
+    beside = (_foreground(view) & ~_silhouette(mesh, capture.faces, camera))[rows.astype(int), columns.astype(int)]
+    centers = np.stack([columns[beside], rows[beside]], axis=1)
+    if not len(centers):
+        return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
+    points = camera.unproject(centers, depth[cKDTree(pixels).query(centers)[1]])
+    _, face = _nearest_triangle(points, mesh, capture.faces)
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    return to_local(_new_splats(points, voxel, sh_degree), frames, face)
+
+
 def voxel_size(mesh: np.ndarray) -> float:
     """Distance in meters between hull points around a mesh (V, 3)."""
     return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
 
 
 def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh and nearest triangle (N,), approximated by a lattice of samples on every triangle."""
-    weights = lattice_weights(4, inset=0.02)
-    samples = np.einsum("pc,fci->fpi", weights, mesh[faces]).reshape(-1, 3)
+    """Distance (N,) to the mesh and nearest triangle (N,), approximated by samples of every triangle."""
+    samples = _mesh_samples(mesh, faces)
     distance, nearest = cKDTree(samples).query(points)
-    return distance, nearest // len(weights)
+    return distance, nearest // (len(samples) // len(faces))
+
+
+def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Points (F · S, 3) of a lattice on every triangle, triangle by triangle."""
+    return np.asarray(np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces]).reshape(-1, 3))
 
 
 def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float) -> np.ndarray:

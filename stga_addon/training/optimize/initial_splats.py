@@ -6,25 +6,31 @@ import numpy as np
 
 from ...avatar.embedding import face_frames, to_world
 from ...avatar.lattice import lattice_splats
-from ...avatar.splats import Splats
+from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.model import Capture
 from ..settings import TrainingSettings
-from .hull_points import hull_points, in_image
+from .hull_points import flat_points, hull_points, in_image
+from .initial_colors import triangle_colors
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
-    """The lattice on the neutral mesh and, if the settings say so, hull points of the first training timestep."""
+    """The lattice on the neutral mesh and, if the settings say so, hull points of the first training timestep
+    (`flat_points` where a single camera shows it)."""
     lattice = lattice_splats(
         capture.neutral, capture.faces, settings.lattice, settings.sh_degree, convention=settings.convention
     )
     if not settings.teeth:
         lattice = lattice.rows(~teeth_triangles(capture)[lattice.face])
+    first = capture.views["train"][0].timestep
+    views = [view for view in capture.views["train"] if view.timestep == first]
+    lattice.sh[:, 0] = (triangle_colors(capture, views)[lattice.face] - 0.5) / SH_C0
     parts = [lattice]
     if settings.hull_points:
-        first = capture.views["train"][0].timestep
-        views = [view for view in capture.views["train"] if view.timestep == first]
-        parts.append(hull_points(capture, views, settings.convention, settings.sh_degree))
+        if len(views) == 1:
+            parts.append(flat_points(capture, views[0], settings.convention, settings.sh_degree))
+        else:
+            parts.append(hull_points(capture, views, settings.convention, settings.sh_degree))
     strains = STRAIN_COMPONENTS if settings.strain_color else 0
     parts = [replace(part, strain_color=np.zeros((len(part), strains, 3), np.float32)) for part in parts]
     return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))

@@ -20,10 +20,12 @@ from ...errors import StgaError, shorten
 from ...files import read_json, remove_leftovers, write_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
-from ..settings import DEVICES, TrainingSettings, from_json, to_json
+from ..settings import TrainingSettings, from_json, is_device, to_json
 from .identity import Identity, identity_from_json
 
 FORMAT, VERSION, OLDEST_VERSION = "stga-run", 3, 2
+OLD_DEVICES = ("cuda", "cuda:0", "warp-cpu")
+"""What runs of earlier versions call a GPU."""
 CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
 
 
@@ -112,7 +114,9 @@ def read_run(folder: Path) -> Run:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
             raise ValueError(f"principal_point is {shorten(principal_point)}")
-        if not isinstance(device, str) or device.partition(":")[0] not in DEVICES:
+        if device in OLD_DEVICES:
+            device = "gpu"
+        if not is_device(device):
             raise ValueError(f"device is {shorten(device)}")
         return Run(
             Path(values["capture"]),

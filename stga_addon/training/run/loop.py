@@ -41,6 +41,7 @@ from .open_run import check_identity
 from .progress import Progress, Report
 from .replay import continued_order
 from .residual_file import write_residuals
+from .strain_range import trained_strain_range
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
@@ -131,6 +132,7 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
+        self.measured_strain: list[np.ndarray | None] = []
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""
@@ -364,7 +366,17 @@ class _Loop:
             self.settings.background,
             self.settings.antialiased,
             self.run.principal_point,
+            self._strain_range(),
         )
+
+    def _strain_range(self) -> np.ndarray | None:
+        """Measured once, or whenever refined tracking may have moved the meshes."""
+        if not self.settings.strain_color:
+            return None
+        if not self.measured_strain or self.trainer.tracking is not None:
+            mesh = self.trainer.frames.mesh if self.trainer.tracking is not None else self.capture.mesh
+            self.measured_strain = [trained_strain_range(self.capture, mesh, self.run.continuation)]
+        return self.measured_strain[0]
 
     def _save(self) -> None:
         trainer = self.trainer

@@ -11,7 +11,7 @@ try {
   const data = await readData(new Uint8Array(await readFile(file)));
   const { header, arrays } = data;
   const [motion, rig] = [new Motion(data), new Rig(data)];
-  const frames = new FaceFrames(arrays.faces.values, arrays.neutral.values, header.convention, true);
+  const frames = new FaceFrames(arrays, header.convention);
   const camera = header.views[0]?.world_to_camera ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
   const texels = new Float32Array(FACE_FLOATS * frames.count);
   const results = [];
@@ -23,7 +23,7 @@ try {
     results.push({
       vertices: Array.from(rig.vertices),
       frames: Array.from(frames.world),
-      strain: Array.from(frames.strain.values),
+      strain: Array.from(frames.strain?.values ?? []),
       order: Array.from(order),
     });
   }

@@ -4,6 +4,7 @@ import gzip
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,8 @@ def test_frames_and_strain_are_the_embedding(convention, tmp_path):
         assert np.quantile(error, 0.99) < 1e-3
         assert np.abs(found[..., 3] - expected.origin).max() < 1e-6
         assert np.quantile(np.abs(np.reshape(result["strain"], (-1, 3)) - expected.strain), 0.99) < 2e-3
+        free = replace(head.avatar, strain_range=None).frames(mesh).strain
+        assert (np.abs(free - expected.strain) > 0.01).mean() > 0.05  # the range matters here
 
 
 def test_order_is_back_to_front(head, tmp_path):

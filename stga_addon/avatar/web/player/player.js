@@ -21,8 +21,7 @@ export class Player {
     this.data = data;
     this.motion = new Motion(data);
     this.rig = new Rig(data);
-    const withStrain = Boolean(arrays.strain_color);
-    this.faceFrames = new FaceFrames(arrays.faces.values, arrays.neutral.values, header.convention, withStrain);
+    this.faceFrames = new FaceFrames(arrays, header.convention);
     this.depthSort = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values);
     this.renderer = new Renderer(this.gl, data);
     this.background = [...header.background, 1];

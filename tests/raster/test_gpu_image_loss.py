@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from raster import webgpu
+from raster import gpu_device
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from stga_addon.raster.cpu.layout import TILE
 from stga_addon.raster.cpu.rasterize import tile_grid
-from stga_addon.raster.webgpu.device import Device
-from stga_addon.raster.webgpu.image_loss import image_loss, upload_target
-from stga_addon.raster.webgpu.layout import VIEW
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.image_loss import image_loss, upload_target
+from stga_addon.raster.gpu.layout import VIEW
 from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
 
 SIZES = [(100, 70), (1, 1), (1, 40), (40, 1), (17, 33), (32, 16), (9, 11)]
@@ -18,7 +18,7 @@ SSIM_WEIGHT = 0.2
 
 @pytest.fixture(scope="module")
 def device() -> Device:
-    return webgpu.device()
+    return gpu_device.device()
 
 
 def on_device(

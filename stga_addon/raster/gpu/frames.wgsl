@@ -30,6 +30,7 @@ struct Pose {
 @group(0) @binding(6) var<storage, read_write> tensors: array<f32>;
 @group(0) @binding(7) var<storage, read_write> frames: array<f32>;
 
+const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
 const TO_TENSOR: u32 = 3u; // columns of `basis`
 const TO_PLANE: u32 = 21u;
@@ -169,7 +170,8 @@ fn average_strain(
     for (var d = 0u; d < TENSOR; d++) {
       strain += mean[d] * basis[row + d];
     }
-    frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] =
-      clamp(STRAIN_GAIN * strain, -MAX_STRAIN, MAX_STRAIN);
+    strain = clamp(STRAIN_GAIN * strain, -MAX_STRAIN, MAX_STRAIN);
+    // Rounding of a rigid triangle is no strain: Adam would take its sign for a gradient and step at full rate.
+    frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
   }
 }

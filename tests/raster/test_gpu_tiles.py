@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from raster import webgpu
-from stga_addon.raster.webgpu.device import Device
-from stga_addon.raster.webgpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED
-from stga_addon.raster.webgpu.tiles import choose_tiles, counts_buffer, list_pairs, sort_keys
+from raster import gpu_device
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED
+from stga_addon.raster.gpu.tiles import choose_tiles, counts_buffer, list_pairs, sort_keys
 
 TILES_X, TILES_Y = 9, 7
 CAPACITY = 1 << 16
@@ -16,7 +16,7 @@ CAPACITY = 1 << 16
 
 @pytest.fixture(scope="module")
 def device() -> Device:
-    return webgpu.device()
+    return gpu_device.device()
 
 
 def view_of(device: Device, splats: int, capacity: int = CAPACITY, focused: bool = False, ring: int = 0) -> Any:
@@ -120,8 +120,8 @@ def test_every_tile_lists_its_splats_near_to_far(device: Device, count: int, foc
 
 def test_more_tiles_than_a_digit_holds(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches large images, whose tiles need a second pass of the sort."""
-    monkeypatch.setattr("raster.test_webgpu_tiles.TILES_X", 130)
-    monkeypatch.setattr("raster.test_webgpu_tiles.TILES_Y", 70)
+    monkeypatch.setattr("raster.test_gpu_tiles.TILES_X", 130)
+    monkeypatch.setattr("raster.test_gpu_tiles.TILES_Y", 70)
     depth_key, rect = scene(500)
     found = listed(device, depth_key, rect)
     for tile, members in enumerate(expected_lists(depth_key, rect, found["rendered"])):

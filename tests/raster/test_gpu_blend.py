@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from raster import webgpu
+from raster import gpu_device
 from raster.test_kernels import IMAGE_TOLERANCE, NAMES, SCENES, Scene, cloud, random_cotangents
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.raster.cpu.blend import blend_backward as cpu_backward
 from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.rasterize import RenderOutput, frames_in_camera, render_forward
-from stga_addon.raster.webgpu.blend import blend_backward, blend_forward
-from stga_addon.raster.webgpu.device import Device
-from stga_addon.raster.webgpu.layout import HIDDEN, VIEW
-from stga_addon.raster.webgpu.tiles import choose_tiles, list_pairs
+from stga_addon.raster.gpu.blend import blend_backward, blend_forward
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import HIDDEN, VIEW
+from stga_addon.raster.gpu.tiles import choose_tiles, list_pairs
 
 CAPACITY = 1 << 14
 BACKGROUND = np.float32([0.9, 0.2, 0.6])
@@ -23,7 +23,7 @@ CASES = {**SCENES, "many layers": cloud(30, count=700, size=(40, 40), log_scale=
 
 @pytest.fixture(scope="module")
 def device() -> Device:
-    return webgpu.device()
+    return gpu_device.device()
 
 
 def on_cpu(scene: Scene, focus: np.ndarray | None, v: list[np.ndarray]) -> tuple[RenderOutput, np.ndarray]:

@@ -7,11 +7,13 @@ Work is recorded into one command encoder and submitted at once; nothing waits f
 import logging
 import os
 import re
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from time import sleep
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
 NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
 """What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
+POLL_INTERVAL_S = 2e-4
 BACKENDS = ("Vulkan", "Metal", "DX12")
 """Without OpenGL, which lacks what the kernels need and complains where there is no display."""
 
@@ -39,18 +42,27 @@ Groups = tuple[int, int, int] | tuple[Any, int]
 
 @cache
 def adapters() -> dict[str, Any]:
-    """The adapters that can run the kernels, by a name that tells equal ones apart; software ones last."""
+    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first, software last.
+
+    A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the slowest.
+    """
     os.environ.setdefault("NODEVICE_SELECT", "1")  # Mesa's layer for windows complains where there is no display
     set_instance_extras(backends=BACKENDS)
     found: dict[str, Any] = {}
     every = wgpu.gpu.enumerate_adapters_sync()
-    for adapter in sorted(every, key=is_software):
+    for adapter in sorted(every, key=_preference):
         if any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items()):
             continue
         name = f"{adapter.info['device']} ({adapter.info['backend_type']})"
         same = sum(known == name or known.startswith(f"{name} #") for known in found)
         found[f"{name} #{same + 1}" if same else name] = adapter
     return found
+
+
+def _preference(adapter: Any) -> tuple[int, bool]:
+    kinds, info = ("DiscreteGPU", "IntegratedGPU", "CPU"), adapter.info
+    rank = kinds.index(info["adapter_type"]) if info["adapter_type"] in kinds else 1
+    return rank, info["backend_type"] == "D3D12"
 
 
 def is_software(adapter: Any) -> bool:
@@ -66,12 +78,10 @@ class Kernel:
     pipeline: Any
     layout: Any
     bindings: dict[str, int]
-    groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = field(default_factory=dict)
-    """Bind groups by the identities of their buffers, which are kept beside them so that no identity is reused."""
 
 
 class Device:
-    """One adapter, with buffers by name and compiled kernels.
+    """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels.
 
     dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
     kernel_times                times the kernels while it is set
@@ -85,18 +95,19 @@ class Device:
         self.name = name or next(iter(known))
         if self.name not in known:
             raise StgaError(f"--device gpu:{self.name}: no such adapter; there are: {', '.join(known)}")
-        adapter = known[self.name]
-        self.is_software = is_software(adapter)
+        self.is_software = is_software(known[self.name])
         with self.errors():
-            self.gpu = adapter.request_device_sync(
-                required_features=sorted({"timestamp-query"} & adapter.features),
-                required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
-            )
+            self.gpu, self._kernels = _open(self.name)
         self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
         self.dispatches = self.submits = self.waits = 0
         self.kernel_times: KernelTimes | None = None
         self._buffers: dict[str, Any] = {}
-        self._kernels: dict[tuple, Kernel] = {}
+        self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
+
+    @property
+    def bytes(self) -> int:
+        """Size of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
 
     def buffer(self, name: str, words: int, usage: str = "storage") -> Any:
         """A buffer of at least so many 32-bit words; the same memory until more is asked for, then fresh zeros.
@@ -108,10 +119,12 @@ class Device:
         if buffer is None or buffer.size < needed:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
             size = needed if buffer is None else min(needed + needed // 32 * 4, max(needed, self.max_bytes // 4 * 4))
-            buffer = self._buffers[name] = self._new_buffer(name, size, _USAGE[usage])
+            self._groups.clear()  # which would keep the old buffer's memory
+            buffer = self._buffers[name] = self.new_buffer(name, size, _USAGE[usage])
         return buffer
 
-    def _new_buffer(self, name: str, size: int, usage: int) -> Any:
+    def new_buffer(self, name: str, size: int, usage: int) -> Any:
+        """A buffer of so many bytes; usage: flags of WebGPU."""
         if size > self.max_bytes:
             raise StgaError(
                 f"--device gpu: {self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of "
@@ -178,6 +191,21 @@ class Device:
             )
         return Kernel(f"{file}.{entry}", pipeline, layout, {name: index for index, _, name in found})
 
+    def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
+        """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
+        key = id(kernel), *(id(buffers.get(name)) for name in kernel.bindings)
+        found = self._groups.get(key)
+        if found is None:
+            if buffers.keys() != kernel.bindings.keys():
+                raise TypeError(f"{kernel.name} binds {sorted(kernel.bindings)}, not {sorted(buffers)}")
+            entries = [
+                {"binding": index, "resource": {"buffer": buffers[name]}} for name, index in kernel.bindings.items()
+            ]
+            group = self.gpu.create_bind_group(layout=kernel.layout, entries=entries)
+            # Kept with its buffers, so that no identity in the key is given to another one.
+            found = self._groups[key] = group, tuple(buffers.values())
+        return found[0]
+
     def record(self) -> "Recording":
         """Begin to record work; used as a context manager it is submitted at the end."""
         return Recording(self)
@@ -205,6 +233,7 @@ class Device:
             if "memory" in text and "out of" in text:
                 raise StgaError(_memory_sentence(self.name)) from error
             if "lost" in text:
+                _open.cache_clear()
                 raise StgaError(
                     f"--device gpu: {self.name} was lost (the driver was reset, or took too long); "
                     "resume the run, with --device cpu if it happens again"
@@ -228,7 +257,7 @@ class Recording:
             return
         compute = self._compute_pass(kernel)
         compute.set_pipeline(kernel.pipeline)
-        compute.set_bind_group(0, self._bind(kernel, buffers))
+        compute.set_bind_group(0, self.device.bind(kernel, buffers))
         if indirect:
             compute.dispatch_workgroups_indirect(*groups)
         else:
@@ -278,39 +307,28 @@ class Recording:
             self._pass.end()
             self._pass = None
 
-    def _bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
-        key = tuple(id(buffers[name]) for name in kernel.bindings)
-        found = kernel.groups.get(key)
-        if found is None:
-            if buffers.keys() != kernel.bindings.keys():
-                raise TypeError(f"{kernel.name} binds {sorted(kernel.bindings)}, not {sorted(buffers)}")
-            if len(kernel.groups) > _MAX_BIND_GROUPS:  # buffers that have grown meanwhile
-                kernel.groups.clear()
-            entries = [
-                {"binding": index, "resource": {"buffer": buffers[name]}} for name, index in kernel.bindings.items()
-            ]
-            group = self.device.gpu.create_bind_group(layout=kernel.layout, entries=entries)
-            found = kernel.groups[key] = group, tuple(buffers.values())
-        return found[0]
-
 
 class Readback:
     """Results of one recording, a few words, that arrive in host memory while the host goes on."""
 
     def __init__(self, device: Device, words: int) -> None:
-        self._device, self._words = device, words
+        self._device = device
         usage = wgpu.BufferUsage.COPY_DST | wgpu.BufferUsage.MAP_READ
-        self._buffer = device._new_buffer("readback", 4 * words, usage)
+        self._buffer = device.new_buffer("readback", -(-words // 2) * 8, usage)
         self._promise: Any = None
 
-    def copy_from(self, recording: Recording, buffer: Any) -> None:
-        """Record the copy; `start` is to follow the submit."""
-        recording.copy(buffer, self._buffer, self._words)
+    def copy_from(self, recording: Recording, *parts: tuple[Any, int]) -> None:
+        """Record the copy of the first words of some buffers; `start` is to follow the submit."""
+        at = 0
+        for buffer, words in parts:
+            recording.copy(buffer, self._buffer, words, to=at)
+            at += words
 
     def start(self) -> None:
         """Ask for the words as soon as the submitted work is done."""
         with self._device.errors():
-            self._promise = self._buffer.map_async(wgpu.MapMode.READ)
+            # Without the empty submit that wgpu makes for READ, which `read_buffer` avoids in the same way.
+            self._promise = self._buffer.map_async("READ_NOSYNC")
 
     def result(self) -> np.ndarray:
         """The words, uint32; waits if the work is not done yet."""
@@ -327,7 +345,6 @@ _RAISED_LIMITS = (
     "max-storage-buffers-per-shader-stage",
     "max-compute-workgroup-storage-size",
 )
-_MAX_BIND_GROUPS = 64
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _USAGE = {
     "storage": _STORAGE,
@@ -335,6 +352,35 @@ _USAGE = {
     "uniform": wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST | wgpu.BufferUsage.COPY_SRC,
 }
 logging.getLogger("wgpu").setLevel(logging.CRITICAL)  # what it logs it also raises, and that is reported
+
+
+@cache
+def _open(name: str) -> tuple[Any, dict[tuple, Kernel]]:
+    """An adapter's device, with its limits raised, and room for compiled kernels."""
+    adapter = adapters()[name]
+    device = adapter.request_device_sync(
+        required_features=sorted({"timestamp-query"} & adapter.features),
+        required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
+    )
+    _poll_without_blocking(device)
+    return device, {}
+
+
+def _poll_without_blocking(device: Any) -> None:
+    """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is there.
+
+    By itself it waits inside the driver for all submitted work, and holds a lock that the next submit waits for.
+    """
+    reference = weakref.ref(device)
+
+    def poll(_: bool) -> None:
+        alive = reference()
+        if alive is not None:
+            alive._poll(False)
+        sleep(POLL_INTERVAL_S)
+
+    if hasattr(getattr(device, "_poller", None), "_poll_func"):  # private: a version without it is slower, not wrong
+        device._poller._poll_func = poll
 
 
 def _source(name: str) -> str:

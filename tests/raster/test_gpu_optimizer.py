@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from raster import webgpu
+from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import adam_rows, distance_limit, opacity_weight, scale_limit
-from stga_addon.raster.webgpu.device import Device
-from stga_addon.raster.webgpu.layout import VIEW, splat_rows, split_rows
-from stga_addon.raster.webgpu.optimizer import OptimizerTables, optimize, upload_step
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import VIEW, splat_rows, split_rows
+from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
 
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate((*Parameters._fields, "sh_rest"))}
@@ -20,7 +20,7 @@ STRIDE = 11 + 3 * COEFFICIENTS + 3 * STRAINS
 
 @pytest.fixture(scope="module")
 def device() -> Device:
-    return webgpu.device()
+    return gpu_device.device()
 
 
 @dataclass

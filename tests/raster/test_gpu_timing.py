@@ -5,17 +5,17 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from raster import webgpu
-from stga_addon.raster.webgpu import timing
-from stga_addon.raster.webgpu.device import Device
-from stga_addon.raster.webgpu.layout import VIEW
-from stga_addon.raster.webgpu.project import mark_focus
-from stga_addon.raster.webgpu.timing import KernelTimes
+from raster import gpu_device
+from stga_addon.raster.gpu import timing
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import VIEW
+from stga_addon.raster.gpu.project import mark_focus
+from stga_addon.raster.gpu.timing import KernelTimes
 
 
 @pytest.fixture(scope="module")
 def device() -> Device:
-    device = webgpu.device()
+    device = gpu_device.device()
     if "timestamp-query" not in device.gpu.features:
         pytest.skip(f"{device.name} has no timestamp queries")
     return device

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from raster import webgpu
+from raster import gpu_device
 from stga_addon.errors import StgaError
-from stga_addon.raster.webgpu import device as device_module
-from stga_addon.raster.webgpu.device import Device, Kernel, Readback, adapters
+from stga_addon.raster.gpu import device as device_module
+from stga_addon.raster.gpu.device import Device, Kernel, Readback, adapters
 
 NUMBERS = """
 override STEP: u32 = 1u;
@@ -24,7 +24,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
 
 @pytest.fixture(scope="module")
 def device() -> Device:
-    return webgpu.device()
+    return gpu_device.device()
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_results_arrive_late(device: Device) -> None:
     for n, readback in enumerate(readbacks):
         words = device.upload("words", np.full(4, n, np.uint32))
         with device.record() as work:
-            readback.copy_from(work, words)
+            readback.copy_from(work, (words, 3), (words, 1))
         readback.start()
     for n, readback in enumerate(readbacks):
         assert readback.result().tolist() == [n] * 4
@@ -122,9 +122,9 @@ def test_what_the_user_is_told(device: Device) -> None:
     with pytest.raises(StgaError, match=r"allows buffers of \d+ MiB .* for rows"):
         device.buffer("rows", device.max_bytes)
     with pytest.raises(StgaError, match=r"memory of .* is full"), device.errors():
-        raise webgpu.wgpu.GPUOutOfMemoryError("")
+        raise gpu_device.wgpu.GPUOutOfMemoryError("")
     with pytest.raises(StgaError, match=r"was lost .* resume the run"), device.errors():
-        raise webgpu.wgpu.GPUValidationError("Parent device is lost")
+        raise gpu_device.wgpu.GPUValidationError("Parent device is lost")
 
 
 def test_missing_bindings_are_refused(device: Device, numbers: Callable[..., Kernel]) -> None:

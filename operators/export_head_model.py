@@ -1,0 +1,53 @@
+"""Exports a mesh object with shape keys as a linear head model, which footage can be tracked with."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene.shape_keys import shape_key_model
+from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
+from . import ids
+from .common import file_path, reporting
+
+
+class ExportHeadModel(bpy.types.Operator, ExportHelper):
+    """Export the active object's shape keys as a head model for tracking; keys named identity… make other persons"""
+
+    bl_idname = ids.EXPORT_HEAD_MODEL
+    bl_label = "Export Head Model"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    filename_ext = ".npz"
+    filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if has_shape_keys(context.active_object):
+            return True
+        cls.poll_message_set("Select a mesh with shape keys")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        write_shape_key_model(context, file_path(self.filepath, "head model"))
+        return {"FINISHED"}
+
+
+def has_shape_keys(thing: Any) -> bool:
+    """Whether an object (or None) is a mesh with shape keys besides the basis."""
+    return (
+        thing is not None
+        and thing.type == "MESH"
+        and thing.data.shape_keys is not None
+        and len(thing.data.shape_keys.key_blocks) > 1
+    )
+
+
+def write_shape_key_model(context: Any, path: Path) -> None:
+    """Write the active object's shape keys as a linear head model. Raises StgaError where it has none."""
+    if not has_shape_keys(context.active_object):
+        raise StgaError("No head model given, and the active object has no shape keys")
+    write_linear_model(path, shape_arrays(*shape_key_model(context.active_object)))

@@ -1,0 +1,276 @@
+"""Tracks a head through footage in a worker process beside Blender, and imports what it tracked."""
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+import numpy as np
+from bpy.app.handlers import persistent
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs.tracking_job import TrackingJob, remove_tracking_job, write_tracking_job
+from ..stga_addon.jobs.training_job import job_folder, worker_arguments
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.tracking.folder import is_flame
+from ..stga_addon.worker.launch import start_worker
+from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, inspect_worker, request_cancel
+from . import ids, monitor
+from .common import file_path, reporting, scene_settings
+from .environment import training_python
+from .export_head_model import write_shape_key_model
+
+CHECK_INTERVAL_S = 0.5
+HEAD_MODEL = "head_model.npz"
+"""In the capture's folder: the shape keys that it was tracked with."""
+
+
+def path_property(name: str, description: str, subtype: str = "FILE_PATH", **more: Any) -> Any:
+    """A path of the operator, and of the panel that calls it."""
+    return bpy.props.StringProperty(name=name, description=description, subtype=subtype, options=PATH_OPTIONS, **more)
+
+
+def footage_property() -> Any:
+    return path_property("Footage", "Folder with a folder of images or a video for each camera; or one video")
+
+
+def cameras_property() -> Any:
+    return path_property(
+        "Cameras",
+        "Calibration: COLMAP, Metashape, RealityCapture or transforms.json; empty: the one in the footage's folder",
+    )
+
+
+def model_property() -> Any:
+    return path_property(
+        "Head Model",
+        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb); empty: the active object's shape keys",
+    )
+
+
+def detector_property() -> Any:
+    return path_property("Detector", "Google's face_landmarker.task; empty: the network that comes with mediapipe")
+
+
+def focal_property() -> Any:
+    return bpy.props.FloatProperty(
+        name="Focal Length", description="In pixels, of a single camera without calibration; 0: a guess", min=0.0
+    )
+
+
+def frame_property(name: str, description: str, **more: Any) -> Any:
+    return bpy.props.IntProperty(name=name, description=description, **more)
+
+
+class TrackFootage(bpy.types.Operator):
+    """Track the head that the footage shows, in a process that continues when Blender is closed, and import it"""
+
+    bl_idname = ids.TRACK_FOOTAGE
+    bl_label = "Track Footage"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    footage: footage_property()
+    model: model_property()
+    directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
+    cameras: cameras_property()
+    detector: detector_property()
+    landmarks: path_property("Landmarks", "Folder with landmark files of another detector", "DIR_PATH")
+    focal: focal_property()
+    start: frame_property("Start", "First frame of the footage, counted from 0", min=0)
+    stop: frame_property("Stop", "Frame to stop before; 0: all", min=0)
+    step: frame_property("Step", "Use every nth frame", min=1, default=1)
+    python: bpy.props.StringProperty(
+        name="Python",
+        description="Python interpreter that tracks; empty: the training environment of the preferences",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_idle_tracking(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        python = training_python(context, self.python)
+        out, footage = file_path(self.directory, "capture").resolve(), file_path(self.footage, "footage")
+        if self.model:
+            model = file_path(self.model, "head model").resolve()
+        else:
+            model = out / HEAD_MODEL
+            write_shape_key_model(context, model)
+
+        def optional(value: str, what: str) -> Path | None:
+            return file_path(value, what).resolve() if value else None
+
+        job = TrackingJob(
+            footage.resolve(),
+            model,
+            optional(self.cameras, "cameras"),
+            optional(self.landmarks, "landmarks"),
+            optional(self.detector, "detector"),
+            self.focal or None,
+            self.start,
+            self.stop or None,
+            self.step,
+        )
+        return start_tracking(self, context, out, job, python)
+
+
+class CancelTracking(bpy.types.Operator):
+    """Stop tracking; the landmarks of whole cameras are kept, and Track continues with the others"""
+
+    bl_idname = ids.CANCEL_TRACKING
+    bl_label = "Cancel Tracking"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if is_tracking(context.scene):
+            return True
+        cls.poll_message_set("Nothing is being tracked")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        folder = job_folder(tracked_folder(context.scene))
+        request_cancel(folder)
+        monitor.monitor_worker(folder)
+        return {"FINISHED"}
+
+
+class DismissTracking(bpy.types.Operator):
+    """Remove the status and log of the last tracking; what it tracked stays"""
+
+    bl_idname = ids.DISMISS_TRACKING
+    bl_label = "Dismiss"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if not scene_settings(context).tracking_capture:
+            cls.poll_message_set("Nothing was tracked in this scene yet")
+            return False
+        return needs_idle_tracking(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        settings = scene_settings(context)
+        remove_tracking_job(Path(settings.tracking_capture))
+        settings.tracking_capture, settings.tracking_error = "", ""
+        return {"FINISHED"}
+
+
+def start_tracking(
+    operator: Any,
+    context: Any,
+    out: Path,
+    job: TrackingJob,
+    python: str,
+    keys: Mapping[int, np.ndarray] | None = None,
+) -> set[str]:
+    """Start a worker for the job, whose capture is imported when it is done; without a window, wait for that.
+
+    Raises StgaError, without a window also with the worker's error.
+    """
+    write_tracking_job(out, job, keys)
+    process = start_worker(job_folder(out), python, worker_arguments(out))
+    settings = scene_settings(context)
+    settings.tracking_capture, settings.tracking_model = str(out), str(job.model)
+    settings.tracking_pending, settings.tracking_error = True, ""
+    monitor.monitor_worker(job_folder(out), process)
+    if not bpy.app.background:
+        _start_timer()
+        return {"FINISHED"}
+    _wait(out, process)
+    _import(context.scene)
+    if settings.tracking_error:
+        raise StgaError(settings.tracking_error)
+    operator.report({"INFO"}, f"Tracked {out}")
+    return {"FINISHED"}
+
+
+def tracked_folder(scene: Any) -> Path:
+    """The folder that the scene's last tracking writes into."""
+    return Path(getattr(scene, ids.SETTINGS).tracking_capture)
+
+
+def tracking_snapshot(scene: Any) -> WorkerSnapshot:
+    """Status of the scene's last tracking as the timer last saw it."""
+    if not getattr(scene, ids.SETTINGS).tracking_capture:
+        return WorkerSnapshot()
+    return monitor.snapshot(job_folder(tracked_folder(scene)))
+
+
+def is_tracking(scene: Any) -> bool:
+    return tracking_snapshot(scene).state.is_alive
+
+
+def needs_idle_tracking(operator: Any, context: Any) -> bool:
+    """Poll: whether nothing is being tracked in this scene."""
+    if is_tracking(context.scene):
+        operator.poll_message_set("Tracking is running; cancel it first")
+        return False
+    return True
+
+
+def tick() -> float | None:
+    """Import what workers have tracked; seconds until the next call, as bpy.app.timers expects."""
+    pending = [
+        scene for scene in bpy.data.scenes if scene.library is None and getattr(scene, ids.SETTINGS).tracking_pending
+    ]
+    if bpy.app.is_job_running("RENDER"):
+        return CHECK_INTERVAL_S
+    for scene in pending:
+        folder = job_folder(tracked_folder(scene))
+        state = monitor.inspect_status(folder).state
+        if state.is_alive:
+            continue
+        getattr(scene, ids.SETTINGS).tracking_pending = False
+        if state == WorkerState.FINISHED:
+            _import(scene)
+        monitor.monitor_worker(folder)
+    waiting = any(getattr(scene, ids.SETTINGS).tracking_pending for scene in pending)
+    return CHECK_INTERVAL_S if waiting else None
+
+
+def _import(scene: Any) -> None:
+    """Import the scene's tracked capture; `tracking_error` says what failed."""
+    settings, out = getattr(scene, ids.SETTINGS), tracked_folder(scene)
+    settings.tracking_pending = False
+    flame = settings.tracking_model if is_flame(out) else ""
+    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
+    try:
+        with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
+            bpy.ops.stga.import_capture("EXEC_DEFAULT", window is not None, directory=str(out), flame=flame)
+    except RuntimeError as error:  # what the operator reported
+        settings.tracking_error = str(error).strip().removeprefix("Error: ")
+
+
+def _wait(out: Path, process: "subprocess.Popen[bytes]") -> None:
+    process.wait()
+    last = inspect_worker(job_folder(out), process)
+    if last.state != WorkerState.FINISHED:
+        raise StgaError(last.status.error or "Tracking was cancelled")
+
+
+def _start_timer() -> None:
+    if monitor.has_timer() and not bpy.app.timers.is_registered(tick):
+        bpy.app.timers.register(tick, first_interval=CHECK_INTERVAL_S, persistent=True)
+
+
+@persistent
+def _after_load(_: Any) -> None:
+    _start_timer()
+
+
+def register() -> None:
+    bpy.app.handlers.load_post.append(_after_load)
+    _start_timer()
+
+
+def unregister() -> None:
+    bpy.app.handlers.load_post.remove(_after_load)
+    if bpy.app.timers.is_registered(tick):
+        bpy.app.timers.unregister(tick)

@@ -1,0 +1,107 @@
+"""Trial: whether a device's gradients are the CPU's, and which of the two is faster, before training on it."""
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from ...avatar.embedding import WORLD
+from ...capture.camera import Camera
+from ..cpu.layout import CameraFrames, Parameters
+from ..cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
+from .device import Device
+from .layout import splat_rows
+from .rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
+
+SIZE = 20_000, 400
+"""Splats, and pixels of a side of the image."""
+SOFTWARE_SIZE = 1_000, 80
+"""For adapters that compute on the CPU, whose speed is no question."""
+DEGREE = 1
+MAX_ERROR = 1e-3
+"""Of a wrong device's gradient, as a share of the gradient's length; rounding makes 1e-5 of it, a lost pair 1e-2."""
+SECONDS = 0.3
+"""For each of the two, after the first image, which is not timed."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """error: largest difference of a parameter's gradient from the CPU's, as a share of its length; times in s."""
+
+    error: float
+    device_s: float
+    cpu_s: float
+
+    @property
+    def is_right(self) -> bool:
+        return self.error <= MAX_ERROR  # not where it is NaN
+
+
+def try_device(device: Device) -> Trial:
+    """Render a cloud of splats and differentiate a random sum of its colors, on the device and on the CPU."""
+    count, size = SOFTWARE_SIZE if device.is_software else SIZE
+    splats, camera = _cloud(count), Camera(size, size, 1.25 * size, 1.25 * size, size / 2, size / 2, np.eye(4))
+    face, frames = np.zeros(count, np.int32), frames_in_camera(WORLD, camera)
+    v_image = np.random.default_rng(1).normal(size=(3, size, size)).astype(np.float32)
+    expected, cpu_s = _on_cpu(splats, face, frames, v_image)
+    got, device_s = _on_device(device, splats, face, frames, camera, v_image)
+    lengths = np.linalg.norm(expected, axis=0)
+    errors = np.linalg.norm(got - expected, axis=0)[lengths > 0] / lengths[lengths > 0]
+    return Trial(float(errors.max()), device_s, cpu_s)
+
+
+def _cloud(count: int) -> Parameters:
+    random = np.random.default_rng(0)
+    values = (
+        random.normal(size=(count, 3)) * 0.4 + (0, 0, 2),
+        random.normal(size=(count, 4)),
+        random.normal(size=(count, 3)) * 0.4 - 4.5,
+        random.normal(size=count),
+        random.normal(size=(count, (DEGREE + 1) ** 2, 3)) * 0.4,
+    )
+    xyz, rotation, log_scale, opacity, sh = (value.astype(np.float32) for value in values)
+    return Parameters(xyz, rotation, log_scale, opacity, sh, np.zeros((count, 0, 3), np.float32))
+
+
+def _on_cpu(
+    splats: Parameters, face: np.ndarray, frames: CameraFrames, v_image: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Gradients (N, stride) and the time of one image."""
+    gradients, buffers = Parameters(*map(np.zeros_like, splats)), BufferPool()
+
+    def once() -> None:
+        output = render_forward(splats, face, frames, DEGREE, buffers=buffers)
+        render_backward(output, splats, face, frames, v_image, gradients, buffers=buffers)
+
+    once()
+    count, began = 0, perf_counter()
+    while not count or perf_counter() - began < SECONDS:
+        once()
+        count += 1
+    return splat_rows(gradients), (perf_counter() - began) / count
+
+
+def _on_device(
+    device: Device, splats: Parameters, face: np.ndarray, frames: CameraFrames, camera: Camera, v_image: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Gradients (N, stride) and the time of one image."""
+    rasterizer, table = Rasterizer(device), upload_splats(device, splats, face)
+    on_device, cotangents = upload_frames(device, frames), device.upload("v_image", v_image)
+    gradients, options = device.buffer("gradients", table.count * table.stride), ViewOptions(camera, DEGREE)
+
+    def once() -> None:
+        view = rasterizer.upload_view(table, options)
+        with device.record() as work:
+            rendering = rasterizer.forward(work, table, on_device, options, view)
+            rasterizer.backward(work, rendering, table, cotangents, gradients)
+
+    once()
+    while not rasterizer.pairs_fit():
+        once()
+    count, began = 0, perf_counter()
+    while not count or perf_counter() - began < SECONDS:
+        for _ in range(4):  # with the host ahead of the device, as in training
+            once()
+        rasterizer.pairs_fit()
+        count += 4
+    return device.read(gradients, (table.count, table.stride)), (perf_counter() - began) / count

@@ -1,0 +1,191 @@
+"""Correction of a tracked take by heads that were posed by hand at some timesteps."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..capture.flame_capture import PARAMETERS
+from ..capture.open import open_capture
+from ..errors import StgaError
+from ..files import read_json, read_npz, write_json, write_npz
+from ..flame.forward import FlameFrame
+from ..flame.model import FlameModel
+from ..flame.sequence import FRAME_FIELDS, FlameSequence, with_identity
+from .contact_sheet import write_contact_sheet
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
+from .footage.open import open_footage
+from .landmarks import Report, read_landmarks, read_places
+from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, parameters_of
+from .solve import (
+    EXPRESSION_ACCELERATION,
+    JOINT_ACCELERATION_RAD,
+    LANDMARK_SIGMA_M,
+    TRANSLATION_ACCELERATION_M,
+)
+from .write_capture import flame_frame
+
+KEYS_FILE, SOLVED_FILE = "tracking_keys.npz", "tracking_solved.npz"
+"""In a corrected capture: the heads posed by hand, and the parameters as they were solved without them."""
+DEFAULT_SPAN = 12
+"""Timesteps before and after a key that it may change."""
+
+
+def correct_capture(
+    out: Path,
+    model: Path,
+    keys: Mapping[int, np.ndarray],
+    span: int = DEFAULT_SPAN,
+    report: Report = lambda stage, done, total: None,
+) -> None:
+    """Solve a tracked FLAME capture again around timesteps whose parameters (E + 18,) are given: `keys`.
+
+    Always from what was tracked: a key that is no longer given leaves no trace. The timesteps' parameter files, the
+    report's errors and the contact sheet are replaced. Raises StgaError where `out` was not tracked here.
+    """
+    capture = open_capture(out, model)
+    if capture.flame is None:
+        raise StgaError(f"{out}: was not tracked with FLAME; only FLAME's pose can be corrected")
+    landmarks = out / LANDMARKS_FOLDER
+    places, used = read_places(landmarks / PLACES_FILE, len(capture.flame.model.faces))
+    timesteps, solved = _solved(out, capture.flame)
+    unknown = sorted(set(keys) - set(timesteps))
+    if unknown:
+        raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
+    rows = {timesteps.index(timestep): values for timestep, values in keys.items()}
+    report("Solve", 0, 1)
+    person = with_identity(capture.flame).model
+    chosen = SurfacePoints(places.face[used], places.barycentric[used])
+    found = corrected(person, chosen, solved, _with_landmarks(out, timesteps), rows, span)
+    write_npz(out / KEYS_FILE, {"timesteps": np.array(sorted(keys), np.int64), "parameters": _stacked(keys, solved)})
+    for number, (timestep, values) in enumerate(zip(timesteps, found, strict=True)):
+        _write_frame(out / PARAMETERS / f"{timestep:05d}.npz", flame_frame(values))
+        report("Heads", number + 1, len(timesteps))
+    report("Contact sheet", 0, 1)
+    _report_errors(out, model, places, used)
+
+
+def corrected(
+    model: FlameModel,
+    points: SurfacePoints,
+    solved: np.ndarray,
+    seen: np.ndarray,
+    keys: Mapping[int, np.ndarray],
+    span: int,
+) -> np.ndarray:
+    """Parameters (T, E + 18) that pass through the keys (row -> (E + 18,)) and return to `solved` within `span` rows.
+
+    model: of the person, with expressions alone; seen (T,) bool: rows that have landmarks. The change is smooth, and
+    moves the surface points of rows with landmarks as little as possible; less and less so towards a key, whose
+    neighbors are likely to be wrong in the same way.
+    """
+    from scipy.sparse import block_diag, csc_matrix, diags, kron
+    from scipy.sparse.linalg import spsolve
+
+    count, size = solved.shape
+    change = np.zeros_like(solved)
+    if not keys:
+        return solved.copy()
+    distance = np.abs(np.arange(count)[:, None] - np.array(sorted(keys))).min(axis=1)
+    free = (distance > 0) & (distance <= span)
+    for row, values in keys.items():
+        change[row] = values - solved[row]
+    near = np.flatnonzero(distance <= span + 2)
+    trust = seen[near] * (distance[near] / (span + 1)) ** 2
+    blocks = [
+        share * _stiffness(model, points, solved[row]) + np.diag(_precision(size))
+        for row, share in zip(near, trust, strict=True)
+    ]
+    matrix = block_diag(blocks)
+    second = _second_differences(near)
+    matrix = matrix + kron(second.T @ second, diags(_acceleration_precision(size)))
+    matrix = csc_matrix(matrix)
+    open_ = np.repeat(free[near], size)
+    if open_.any():
+        right = -matrix[open_][:, ~open_] @ change[near].ravel()[~open_]
+        flat = change[near].ravel()
+        flat[open_] = spsolve(matrix[open_][:, open_], right)
+        change[near] = flat.reshape(-1, size)
+    return np.asarray(solved + change)
+
+
+def _second_differences(rows: np.ndarray) -> Any:
+    """Sparse (D, N): the second differences of values at N ascending rows, of which three follow each other."""
+    from scipy.sparse import csc_matrix
+
+    middle = 1 + np.flatnonzero((np.diff(rows)[:-1] == 1) & (np.diff(rows)[1:] == 1))
+    number = np.arange(len(middle))
+    at = np.tile(number, 3), np.concatenate([middle - 1, middle, middle + 1])
+    return csc_matrix((np.repeat([1.0, -2.0, 1.0], len(middle)), at), shape=(len(middle), len(rows)))
+
+
+def _stiffness(model: FlameModel, points: SurfacePoints, parameters: np.ndarray) -> np.ndarray:
+    """(E + 18, E + 18): how much a change of each parameter moves the points, in standard deviations of a landmark."""
+    _, jacobian = PosedPoints(model, points).linearized(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+    flat = jacobian.reshape(-1, jacobian.shape[2]) / LANDMARK_SIGMA_M
+    return np.asarray(flat.T @ flat)
+
+
+def _acceleration_precision(size: int) -> np.ndarray:
+    sigma = (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M)
+    return np.repeat(sigma, (size - RIGID_SIZE, POSE_SIZE, TRANSLATION_SIZE)) ** -2.0
+
+
+def _precision(size: int) -> np.ndarray:
+    """A change of a coefficient has a standard deviation of 1, joints 1 radian, translation 1 meter."""
+    return np.ones(size)
+
+
+def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
+    """Timesteps and parameters (T, E + 18) as they were tracked; kept in a file before the first correction."""
+    path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
+    if path.exists():
+        arrays = read_npz(path)
+        expected = (len(timesteps), sequence.model.n_expression + RIGID_SIZE)
+        if arrays.get("parameters", np.zeros(0)).shape != expected:
+            raise StgaError(f"{path}: parameters: expected shape {expected}")
+        return timesteps, arrays["parameters"].astype(np.float64)
+    solved = np.stack([parameters_of(sequence.frame(timestep)) for timestep in timesteps])
+    write_npz(path, {"timesteps": np.array(timesteps), "parameters": solved})
+    return timesteps, solved
+
+
+def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
+    interpolated = set(read_json(out / REPORT_FILE)["interpolated"])
+    return np.array([timestep not in interpolated for timestep in timesteps])
+
+
+def _stacked(keys: Mapping[int, np.ndarray], solved: np.ndarray) -> np.ndarray:
+    return np.stack([keys[timestep] for timestep in sorted(keys)]) if keys else np.zeros((0, solved.shape[1]))
+
+
+def _write_frame(path: Path, frame: FlameFrame) -> None:
+    """Replace the moving parameters in a timestep's file; identity and offsets stay."""
+    moving = {name: np.asarray(getattr(frame, name))[None].astype(np.float32) for name in FRAME_FIELDS}
+    write_npz(path, {**read_npz(path), **moving})
+
+
+def _report_errors(out: Path, model: Path, places: SurfacePoints, used: np.ndarray) -> None:
+    """Measure the reprojection errors of the corrected capture, and draw its contact sheet."""
+    capture, footage = open_capture(out, model), open_footage(out)
+    footage = replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
+    errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
+    found = read_landmarks(footage, out / LANDMARKS_FOLDER)
+    cameras = {camera.name: camera.camera for camera in footage.cameras}
+    for name, own in found.items():
+        for timestep, pixels, confidence in zip(own.timesteps.tolist(), own.points, own.confidence, strict=True):
+            use = used & (confidence > 0)
+            if use.any():
+                head = places.on(capture.mesh(timestep), capture.faces)
+                distance = np.linalg.norm(cameras[name].project(head[use])[0] - pixels[use], axis=1)
+                errors[name][timestep] = float(np.median(distance))
+    report = read_json(out / REPORT_FILE)
+    rounded = {name: {str(t): round(px, 3) for t, px in own.items()} for name, own in errors.items()}
+    every = [px for own in errors.values() for px in own.values()]
+    write_json(
+        out / REPORT_FILE,
+        {**report, "median_reprojection_px": round(float(np.median(every)), 3), "reprojection_px": rounded},
+    )
+    write_contact_sheet(out / SHEET_FILE, footage, cameras, capture.mesh, capture.faces, errors)

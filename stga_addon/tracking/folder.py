@@ -1,0 +1,28 @@
+"""Files of a tracked capture's folder."""
+
+from pathlib import Path
+
+from ..capture.flame_capture import CANONICAL_NAME
+
+REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE = (
+    "tracking.json",
+    "contact_sheet.png",
+    "landmarks",
+    "head_model.npz",
+)
+SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+
+
+def is_written(out: Path) -> bool:
+    """Whether a folder holds a whole capture; tracking that was interrupted leaves none."""
+    return any((out / name).exists() for name in (SPLIT_FILES[0], "transforms.json"))
+
+
+def is_flame(out: Path) -> bool:
+    """Whether the tracked capture has FLAME's layout, and needs the model file to be opened."""
+    return (out / CANONICAL_NAME).exists()
+
+
+def is_tracked(out: Path) -> bool:
+    """Whether a capture has what its correction starts from."""
+    return (out / LANDMARKS_FOLDER / PLACES_FILE).is_file() and (out / REPORT_FILE).is_file()

@@ -1,0 +1,176 @@
+"""The Track panel's way: footage, worker, import, the cameras' images, a head posed by hand, and solved again."""
+
+import sys
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mathutils import Quaternion  # noqa: E402
+from tracking.test_head_model import blender_head  # noqa: E402
+from tracking.test_track import record  # noqa: E402
+
+from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.tracking.head_model import HeadModel, read_head_model  # noqa: E402
+from stga_addon.tracking.mesh_image import shaded_image  # noqa: E402
+
+HEAD = HeadModel(synthetic_flame(0), "flame")
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory):
+    """A recorded take; its folder."""
+    folder = tmp_path_factory.mktemp("take")
+    record(folder, HEAD, lambda mesh, camera: shaded_image(mesh, HEAD.model.faces, camera))
+    return folder
+
+
+def track(take, out, **more):
+    paths = {"footage": take / "footage", "landmarks": take / "points", "model": take / "head.npz", "directory": out}
+    return bpy.ops.stga.track_footage(
+        **{name: str(path) for name, path in (paths | more).items()}, python=sys.executable
+    )
+
+
+def mesh_at(frame):
+    bpy.context.scene.frame_set(frame)
+    return evaluated_vertices(bpy.context.scene.stga.head).astype(float)
+
+
+@pytest.fixture
+def tracked(extension, take, tmp_path, monkeypatch):
+    """A scene with the tracked head."""
+    monkeypatch.setenv("STGA_PYTHON", sys.executable)
+    assert track(take, tmp_path / "capture") == {"FINISHED"}
+    return tmp_path / "capture"
+
+
+def test_the_whole_way_of_the_panel(tracked, extension):
+    """Catches a capture that is not imported, a pose that is lost, or a key that the solution does not pass through."""
+    scene, settings = bpy.context.scene, bpy.context.scene.stga
+    head = settings.head
+    assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
+    assert settings.tracking_capture == str(tracked)
+    assert not settings.tracking_pending
+    cameras = extension.operators.track_correct.capture_cameras(head)
+    assert [len(camera.data.background_images) for camera in cameras] == [5] * 5
+    before = {frame: mesh_at(frame) for frame in range(5)}
+
+    scene.frame_set(1)
+    rig = extension.stga_addon.scene.rig.flame_rig.rig_of(head)
+    bone = rig.pose.bones["jaw"]
+    bone.rotation_quaternion = bone.rotation_quaternion @ Quaternion((1, 0, 0), radians(12))
+    head.data.shape_keys.key_blocks["expr_001"].value += 0.5
+    bpy.context.view_layer.update()
+    posed = evaluated_vertices(head).astype(float)
+    assert np.abs(posed - before[1]).max() > 0.003
+    assert bpy.ops.stga.mark_key() == {"FINISHED"}
+    np.testing.assert_allclose(mesh_at(4), before[4], atol=1e-6)  # a key is of its frame alone
+    np.testing.assert_allclose(mesh_at(1), posed, atol=2e-5)
+
+    assert bpy.ops.stga.solve_again() == {"FINISHED"}
+    head = settings.head
+    np.testing.assert_allclose(mesh_at(1), posed, atol=5e-5)
+    assert np.abs(mesh_at(2) - before[2]).max() > 1e-4  # without landmarks: it follows
+    assert np.abs(mesh_at(2) - before[2]).max() < np.abs(posed - before[1]).max()
+    assert list(extension.operators.track_correct.tracking_keys(head)) == [1]
+
+    scene.frame_set(1)
+    assert bpy.ops.stga.mark_key() == {"FINISHED"}  # no longer a key
+    assert bpy.ops.stga.solve_again() == {"FINISHED"}
+    for frame in range(5):
+        np.testing.assert_allclose(mesh_at(frame), before[frame], atol=2e-6)
+
+    assert bpy.ops.stga.dismiss_tracking() == {"FINISHED"}
+    assert not (tracked / "job").exists()
+    assert settings.tracking_capture == ""
+
+
+def test_looking_through_the_cameras(tracked, extension):
+    """Catches a view without the image that it is compared with, or of another size."""
+    window = bpy.context.window_manager.windows[0]
+    area = next((area for area in window.screen.areas if area.type == "VIEW_3D"), None)
+    if area is None:
+        pytest.skip("no 3D viewport in this Blender's empty file")
+    cameras = extension.operators.track_correct.capture_cameras(bpy.context.scene.stga.head)
+    with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
+        bpy.context.scene.camera = cameras[4]
+        assert bpy.ops.stga.view_footage(step=1) == {"FINISHED"}
+        assert bpy.context.scene.camera == cameras[0]
+        space = area.spaces.active
+        assert (space.region_3d.view_perspective, space.shading.show_xray) == ("CAMERA", True)
+        assert cameras[0].data.show_background_images
+        assert cameras[0].visible_get()  # else Blender draws no background
+        assert bpy.ops.stga.view_footage() == {"FINISHED"}
+        assert (space.region_3d.view_perspective, space.shading.show_xray) == ("PERSP", False)
+
+
+def test_the_active_objects_shape_keys_as_head_model(extension, take, tmp_path):
+    """Catches shape keys that are tracked in Blender's axes, and a model that is not kept with the capture."""
+    model = HEAD.model
+    blender_head(model.v_template, model.faces, ["identity 0", "smile"], model.shapedirs[:, :, [0, -1]])
+    assert track(take, tmp_path / "capture", model="") == {"FINISHED"}
+    found = read_head_model(tmp_path / "capture/head_model.npz").model
+    np.testing.assert_allclose(found.v_template, model.v_template, atol=1e-6)
+    assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
+    assert bpy.ops.stga.export_head_model.poll()
+    bpy.ops.stga.export_head_model(filepath=str(tmp_path / "exported.npz"))
+    assert read_head_model(tmp_path / "exported.npz").model.n_expression > 0
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        ({"model": ""}, "No head model given, and the active object has no shape keys"),
+        ({"model": "/nowhere/head.npz"}, "/nowhere/head.npz: cannot be read"),
+        ({"footage": "/nowhere"}, "/nowhere: is neither a folder nor a video"),
+    ],
+)
+def test_mistakes_are_one_sentence(extension, take, tmp_path, more, expected):
+    """Catches a traceback, or a failure that leaves the panel waiting."""
+    with pytest.raises(RuntimeError, match=expected):
+        track(take, tmp_path / "capture", **more)
+    assert bpy.context.scene.stga.head is None
+    assert not bpy.ops.stga.cancel_tracking.poll()
+    assert bpy.ops.stga.track_footage.poll()
+
+
+def test_a_capture_of_another_tracker_is_not_solved_again(extension, tmp_path):
+    """Catches a capture from outside whose parameters would be overwritten."""
+    from capture.factory import write_flame_capture
+
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    assert not bpy.ops.stga.solve_again.poll()
+    assert not Path(folder, "job").exists()
+
+
+def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
+    """Catches a result that never arrives where Blender was closed, or its file saved, while the worker ran."""
+    job = extension.stga_addon.jobs.tracking_job
+    out, settings = tmp_path / "capture", bpy.context.scene.stga
+    job.write_tracking_job(out, job.TrackingJob(take / "footage", take / "head.npz", landmarks=take / "points"))
+    settings.tracking_capture, settings.tracking_model = str(out), str(take / "head.npz")
+    settings.tracking_pending = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    job.run_tracking_job(out)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert extension.operators.track.tick() is None
+    assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
+    assert not bpy.context.scene.stga.tracking_pending
+
+
+def test_cancelled_tracking_writes_no_capture(extension, take, tmp_path):
+    """Catches a cancelled job that goes on, or is reported as finished."""
+    job, status = extension.stga_addon.jobs.tracking_job, extension.stga_addon.worker.status
+    out = tmp_path / "capture"
+    job.write_tracking_job(out, job.TrackingJob(take / "footage", take / "head.npz", landmarks=take / "points"))
+    status.request_cancel(out / "job")
+    job.run_tracking_job(out)
+    assert status.inspect_worker(out / "job").state == status.WorkerState.CANCELLED
+    assert not (out / "transforms_train.json").exists()

@@ -1,0 +1,174 @@
+"""The GPU rasterizer: what it has beside the tests that both back ends share, which are those with `back_end`."""
+
+import numpy as np
+import pytest
+import torch
+
+from raster import gpu_device, test_kernels
+from raster.test_kernels import (
+    GRADIENT_TOLERANCE,
+    IMAGE_TOLERANCE,
+    NAMES,
+    SCENES,
+    Scene,
+    assert_gradients_agree,
+    cloud,
+    random_cotangents,
+)
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.raster import reference
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.raster.cpu.rasterize import frames_in_camera
+from stga_addon.raster.gpu import trial
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import split_rows
+from stga_addon.raster.gpu.rasterize import Rasterizer, Rendering, ViewOptions, upload_frames, upload_splats
+
+
+class Raw:
+    """A scene through the array door: renderings, and gradients whose untouched rows keep `fill`."""
+
+    def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None, antialiased: bool = False) -> None:
+        gpu_device.device()  # or skip
+        self.rasterizer = rasterizer or Rasterizer(Device())
+        self.device, self.scene, self.antialiased = self.rasterizer.device, scene, antialiased
+        self.count = len(scene.splats["xyz"])
+        self.splats = Parameters(*(scene.splats[name] for name in NAMES))
+        v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
+        self.cotangents = v_image.float().numpy(), -v_alpha.float().numpy()
+
+    def read(self, buffer, *shape: int, dtype: type = np.float32) -> np.ndarray:
+        return self.device.read(buffer, shape, dtype)
+
+    def image(self, rendering: Rendering) -> np.ndarray:
+        return self.read(rendering.image, 3, self.scene.camera.height, self.scene.camera.width)
+
+    def forward(self, focus: np.ndarray | None = None, reach: int = 0, background=(0, 0, 0)) -> Rendering:
+        self.table = upload_splats(self.device, self.splats, np.zeros(self.count, np.int32))
+        frames = upload_frames(self.device, frames_in_camera(WORLD, self.scene.camera))
+        options = ViewOptions(
+            self.scene.camera, self.scene.degree, background, antialiased=self.antialiased, focused=focus is not None,
+            reach=reach,
+        )  # fmt: skip
+        marked = None if focus is None else self.device.upload("focus", focus.astype(np.uint32))
+        with self.device.record() as work:
+            view = self.rasterizer.upload_view(self.table, options)
+            return self.rasterizer.forward(work, self.table, frames, options, view, marked)
+
+    def gradients(
+        self, rendering: Rendering, fill: float = 0.0
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Gradients by name, the rows written, and those rows' screen gradient."""
+        table, device = self.table, self.device
+        gradients = device.upload("gradients", np.full((table.count, table.stride), fill, np.float32))
+        v_image, v_transmittance = (device.upload(f"v {n}", v) for n, v in enumerate(self.cotangents))
+        with device.record() as work:
+            screen = self.rasterizer.backward(work, rendering, table, v_image, gradients, v_transmittance)
+        written = np.flatnonzero(self.read(rendering.lists.wanted, self.count, dtype=np.uint32))
+        rows = split_rows(self.read(gradients, table.count, table.stride), table.coefficients)
+        return {name: getattr(rows, name) for name in NAMES}, written, self.read(screen, self.count)[written]
+
+
+def test_background_shows_through_and_pulls_on_the_splats() -> None:
+    """Catches a background left out of the image, of its gradient, or counted twice."""
+    scene, background = SCENES["plain"], np.float32([0.9, 0.2, 0.6])
+    raw = Raw(scene)
+    rendering = raw.forward(background=background)
+    gradients, _, _ = raw.gradients(rendering)
+    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
+    rgb, alpha, _ = reference.render(*tensors, scene.camera)
+    image = rgb + torch.from_numpy(background)[:, None, None] * (1 - alpha)
+    v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
+    expected = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), tensors)
+    assert np.abs(raw.image(rendering) - image.detach().numpy()).max() < IMAGE_TOLERANCE
+    assert_gradients_agree(gradients, dict(zip(NAMES, (g.numpy() for g in expected), strict=True)))
+
+
+def test_screen_gradient_is_the_other_back_ends() -> None:
+    """Catches density control fed with pixels, or with the gradient of something else."""
+    scene = cloud(25, count=40, size=(60, 35))
+    raw = Raw(scene)
+    _, written, screen = raw.gradients(raw.forward())
+    _, _, expected_rows, expected = test_kernels.raw_gradients(scene)
+    np.testing.assert_array_equal(written, np.sort(expected_rows))
+    np.testing.assert_allclose(screen, expected[written], atol=GRADIENT_TOLERANCE["xyz"] * expected[written].max())
+
+
+def test_focused_rendering_gives_selected_rows_the_full_images_gradient() -> None:
+    """Catches a local iteration whose restricted tiles change a selected gradient, or touch another row."""
+    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
+    focus = np.zeros(80, bool)
+    focus[[3, 17, 40]] = True
+    raw = Raw(scene)
+    rendering = raw.forward()
+    image = raw.image(rendering)
+    full, all_written, full_screen = raw.gradients(rendering)
+    part = raw.forward(focus, reach=10)
+    rendered = raw.read(part.chosen.rendered, 5, 7, dtype=np.uint32) > 0
+    assert 0 < rendered.sum() < rendered.size
+    pixels = np.kron(rendered, np.ones((16, 16), bool))[:70, :100]
+    np.testing.assert_array_equal(raw.image(part)[:, pixels], image[:, pixels])
+    gradients, written, screen = raw.gradients(part, fill=123.0)
+    assert len(written) > 0
+    assert set(written) <= {3, 17, 40}
+    scales = {name: np.abs(values).max() for name, values in full.items()}
+    for name, gradient in gradients.items():
+        # Batches begin elsewhere, so pixels are added up in another grouping.
+        np.testing.assert_allclose(gradient[written], full[name][written], atol=1e-6 * scales[name], err_msg=name)
+        assert (np.delete(gradient, written, axis=0) == 123).all(), name
+    np.testing.assert_allclose(screen, full_screen[np.isin(all_written, written)], rtol=1e-5)
+
+
+def test_coefficients_above_the_degree_are_overwritten() -> None:
+    """Catches stale gradients of harmonics that are not in use yet."""
+    raw = Raw(SCENES["lower degree than stored"])
+    gradients, written, _ = raw.gradients(raw.forward(), fill=5.0)
+    assert len(written) > 20
+    assert not gradients["sh"][written, 4:].any()
+
+
+def test_the_same_bits_twice_and_from_used_buffers() -> None:
+    """Catches sums in the order of chance, and results that depend on what an earlier image left in the buffers."""
+    rasterizer = Raw(SCENES["plain"]).rasterizer
+    for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
+        fresh, used = Raw(SCENES[name]), Raw(SCENES[name], rasterizer)
+        expected, rendering = fresh.forward(), used.forward()
+        np.testing.assert_array_equal(used.image(rendering), fresh.image(expected), err_msg=name)
+        wanted, rows_written, _ = fresh.gradients(expected)
+        gradients, same_rows, _ = used.gradients(rendering)
+        np.testing.assert_array_equal(same_rows, rows_written)
+        for parameter, want in wanted.items():
+            np.testing.assert_array_equal(gradients[parameter], want, err_msg=f"{name}: {parameter}")
+
+
+def test_what_does_not_fit_is_not_drawn_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches pairs that are dropped in silence, written past the buffers' end, or gradients of half a rendering."""
+    scene = SCENES["plain"]
+    whole = Raw(scene)
+    expected = whole.image(whole.forward())
+    monkeypatch.setattr("stga_addon.raster.gpu.rasterize.INITIAL_PAIR_CAPACITY", 10)
+    raw = Raw(scene)
+    rendering = raw.forward()
+    assert not raw.image(rendering).any()
+    gradients, written, _ = raw.gradients(rendering, fill=7.0)
+    assert not len(written)
+    assert all((gradient == 7).all() for gradient in gradients.values())
+    assert not raw.rasterizer.pairs_fit()
+    np.testing.assert_array_equal(raw.image(raw.forward()), expected)
+    assert raw.rasterizer.pairs_fit()
+
+
+def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a trial that passes whatever a device computes."""
+    device = gpu_device.device()
+    monkeypatch.setattr(trial, "SECONDS", 0.0)
+    assert trial.try_device(device).is_right
+    backward = Rasterizer.backward
+
+    def loses_a_tile(self, work, rendering, *arguments):
+        work.clear(work.device.buffer("pair_gradients", 0))  # which hold the right ones of the first trial
+        work.clear(rendering.chosen.touched, 12)
+        return backward(self, work, rendering, *arguments)
+
+    monkeypatch.setattr(Rasterizer, "backward", loses_a_tile)
+    assert not trial.try_device(device).is_right

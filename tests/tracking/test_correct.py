@@ -1,0 +1,119 @@
+"""Corrections by hand: the key is kept, its neighbors follow, all others stay."""
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.open import open_capture
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.errors import StgaError
+from stga_addon.files import read_json
+from stga_addon.flame.forward import flame_forward
+from stga_addon.tracking.correct import KEYS_FILE, correct_capture, corrected
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.posed_points import RIGID_SIZE, parameters_of
+from stga_addon.tracking.solve import person
+from stga_addon.tracking.track import track
+from stga_addon.tracking.write_capture import flame_frame
+
+from .test_fit import frame_at, places_on
+from .test_track import record
+
+HEAD = HeadModel(synthetic_flame(0), "flame")
+PERSON = person(HEAD, np.zeros(HEAD.model.n_identity)).model
+JAW = HEAD.model.n_expression + 6
+TAKE = np.stack([parameters_of(frame_at(HEAD, timestep)) for timestep in range(30)])
+
+
+def opened(timestep, angle):
+    values = TAKE[timestep].copy()
+    values[JAW] += angle
+    return values
+
+
+def correct(keys, span=5, seen=None):
+    seen = np.ones(len(TAKE), bool) if seen is None else seen
+    return corrected(PERSON, places_on(HEAD, 60), TAKE, seen, keys, span)
+
+
+def test_a_key_moves_its_neighbors_and_nothing_else():
+    """Catches a correction that pops for one frame, spreads over the take, or is pulled back by the landmarks."""
+    change = correct({12: opened(12, 0.3)}) - TAKE
+    np.testing.assert_allclose(change[12], np.eye(TAKE.shape[1])[JAW] * 0.3, atol=1e-12)
+    np.testing.assert_array_equal(change[:7], 0)
+    np.testing.assert_array_equal(change[18:], 0)
+    jaw = change[7:18, JAW]
+    assert 0.03 < jaw[4] < 0.3
+    assert 0.03 < jaw[6] < 0.3
+    assert np.abs(np.diff(jaw)).max() < 0.27
+    assert np.abs(change[:, :-RIGID_SIZE]).max() < 0.3  # expressions take over little of it
+
+
+def test_frames_without_landmarks_follow_more():
+    """Catches an interpolated frame that is held in place by landmarks which it does not have."""
+    seen = np.ones(len(TAKE), bool)
+    seen[13:16] = False
+    change = (correct({12: opened(12, 0.3)}, seen=seen) - TAKE)[:, JAW]
+    assert change[13] > correct({12: opened(12, 0.3)})[13, JAW] - TAKE[13, JAW] + 0.02
+
+
+@pytest.mark.parametrize(
+    "keys", [{0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, {3: 0.1, 25: 0.2}, dict.fromkeys(range(30), 0.1)]
+)
+def test_keys_anywhere(keys):
+    """Catches ends of the take, neighboring keys and keys everywhere, where there is nothing left to solve."""
+    given = {timestep: opened(timestep, angle) for timestep, angle in keys.items()}
+    found = correct(given)
+    for timestep, values in given.items():
+        np.testing.assert_allclose(found[timestep], values, atol=1e-12)
+    assert np.abs(found - TAKE).max() < 0.5
+
+
+def test_without_keys_nothing_changes():
+    """Catches a solution that drifts with every call."""
+    np.testing.assert_array_equal(correct({}), TAKE)
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory):
+    """A tracked capture, its model and its parameters."""
+    folder = tmp_path_factory.mktemp("tracked")
+    record(folder, HEAD)
+    track(open_footage(folder / "footage"), folder / "head.npz", folder / "out", folder / "points")
+    return folder / "out", folder / "head.npz", parameters_in(folder / "out", folder / "head.npz")
+
+
+def parameters_in(out, model):
+    sequence = open_capture(out, model).flame
+    return np.stack([parameters_of(sequence.frame(timestep)) for timestep in sequence.timesteps])
+
+
+def test_a_corrected_capture_shows_the_key(tracked):
+    """Catches a key in other units or order than the files, and a report that is still that of before."""
+    out, model, before = tracked
+    report = read_json(out / "tracking.json")
+    key = before[1].copy()
+    key[HEAD.model.n_expression + 1] += 0.3  # turns the head
+    correct_capture(out, model, {1: key}, span=1)
+    capture = open_capture(out, model)
+    expected = flame_forward(capture.flame.model, capture.flame.shape, flame_frame(key), capture.flame.static_offset)
+    np.testing.assert_allclose(capture.mesh(1), expected, atol=1e-6)
+    np.testing.assert_allclose(parameters_in(out, model)[3:], before[3:], atol=1e-7)
+    after = read_json(out / "tracking.json")
+    assert after["reprojection_px"]["cam0"]["1"] > report["reprojection_px"]["cam0"]["1"] + 0.5
+    assert abs(after["reprojection_px"]["cam0"]["4"] - report["reprojection_px"]["cam0"]["4"]) < 0.02
+    assert np.load(out / KEYS_FILE)["timesteps"].tolist() == [1]
+    correct_capture(out, model, {})
+    np.testing.assert_allclose(parameters_in(out, model), before, atol=1e-7)
+
+
+def test_what_cannot_be_corrected_is_named(tracked, tmp_path):
+    """Catches a capture of another tracker that is overwritten."""
+    out, model, before = tracked
+    with pytest.raises(StgaError, match="has no timestep 99"):
+        correct_capture(out, model, {99: before[0]})
+    (tmp_path / "flame_param").mkdir()
+    for name in ("transforms_train.json", "canonical_flame_param.npz"):
+        (tmp_path / name).write_bytes((out / name).read_bytes())
+    with pytest.raises(StgaError):
+        correct_capture(tmp_path, model, {})

@@ -1,0 +1,68 @@
+"""The range of strain that an avatar takes along from its training."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.strain import face_strain, strain_basis
+from stga_addon.capture.model import Capture
+from stga_addon.training.run import strain_range as module
+from stga_addon.training.run.folder import Continuation, Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.strain_range import trained_strain_range
+
+from .toys import quick_settings, random_splats
+
+
+def deformed(toy: Capture, timestep: int) -> np.ndarray:
+    """The toy's mesh, stretched by another amount along each axis in each timestep."""
+    return np.asarray(toy.neutral) * (1 + 0.03 * np.random.default_rng(timestep).normal(size=3))
+
+
+def strains(toy: Capture, timesteps: set[int]) -> np.ndarray:
+    basis = strain_basis(toy.neutral, toy.faces)
+    return np.stack([face_strain(basis, deformed(toy, t)) for t in sorted(timesteps)])
+
+
+def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path) -> None:
+    """Catches a range of held-out expressions too, one that clips what was trained, and one where nothing needs it."""
+    capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
+    settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
+    found = read_avatar(train(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
+    trained = strains(toy, {view.timestep for view in toy.views["train"]})
+    limits = found.strain_range
+    assert limits is not None
+    assert (limits[:, 0] <= trained.min(0)).all()
+    assert (trained.max(0) <= limits[:, 1]).all()
+    assert (trained.max(0) * 1.21 + 1e-6 >= limits[:, 1])[trained.max(0) > 0].all()
+    without = Run(toy.root, None, "vhap", replace(settings, strain_color=False))
+    assert read_avatar(train(capture, tmp_path / "off", without)).strain_range is None
+
+
+def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) -> None:
+    """Catches an avatar that forgets expressions because only one frame was refined."""
+    count = len(toy.faces)
+    limits = np.broadcast_to(np.array([[-0.5], [0.01]], np.float32), (count, 2, 3)).copy()
+    parent = Avatar(random_splats(20, count), "stga", toy.neutral.astype(np.float32), toy.faces, strain_range=limits)
+    write_avatar(tmp_path / "avatar.npz", parent)
+    continuation = Continuation(tmp_path, "", 0, 0)
+    alone = trained_strain_range(toy, lambda t: deformed(toy, t), None)
+    both = trained_strain_range(toy, lambda t: deformed(toy, t), continuation)
+    assert alone is not None
+    assert both is not None
+    np.testing.assert_array_equal(both[:, 0], np.minimum(alone[:, 0], -0.5))
+    np.testing.assert_array_equal(both[:, 1], np.maximum(alone[:, 1], np.float32(0.01)))
+    write_avatar(tmp_path / "avatar.npz", replace(parent, strain_range=None))
+    assert trained_strain_range(toy, lambda t: deformed(toy, t), continuation) is None
+
+
+def test_long_captures_are_sampled(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a sequence of thousands of timesteps that is read as a whole for every avatar."""
+    monkeypatch.setattr(module, "MAX_TIMESTEPS", 2)
+    read: list[int] = []
+    trained_strain_range(toy, lambda t: (read.append(t), deformed(toy, t))[1], None)
+    timesteps = sorted({view.timestep for view in toy.views["train"]})
+    assert read == [timesteps[0], timesteps[-1]]
