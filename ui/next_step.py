@@ -8,6 +8,7 @@ from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
 from ..operators.environment import has_training_python
 from ..operators.pose import is_posing
+from ..operators.track import tracking_snapshot
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
@@ -16,6 +17,7 @@ from ..stga_addon.scene.display.splat_object import input_identifier, splat_modi
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from .sidebar import SidebarPanel
 from .text import draw_text
+from .track_panel import draw_tracking_progress
 from .train_panel import draw_environment_setup, draw_train_button
 from .video import draw_video
 
@@ -27,7 +29,10 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
         training = monitor.training_of(context.scene).snapshot.state.is_alive
-        if not is_head(settings.head) and settings.splats is None:
+        tracking = tracking_snapshot(context.scene)
+        if tracking.state.is_alive:
+            draw_tracking_progress(layout, context, tracking)
+        elif not is_head(settings.head) and settings.splats is None:
             draw_text(
                 layout,
                 context,
