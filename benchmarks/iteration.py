@@ -1,13 +1,13 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
-    python benchmarks/iteration.py [--head ellipsoid] [--device cuda] [--splats 60000] [--width 802] [--height 550]
+    python benchmarks/iteration.py [--head ellipsoid] [--device gpu] [--splats 60000] [--width 802] [--height 550]
                                    [--repeats 30] [--out FILE.json]
 
 Splats of SH degree 3 on the demo's head (16,000 triangles, denser at eyes and mouth, as heads are), or on an evenly
 covered ellipsoid, for which a selection costs most. On the CPU: medians over repeats in one process; beside each
 stage the bytes it must at least move and the time that takes at this machine's measured copy bandwidth. On a GPU, whose
-queue is never waited for: means over all repeats, the time of each kernel, and the peak of its memory. Run it on an
-idle machine.
+queue is never waited for: means over all repeats, the same table by kernel, the dispatches, submits, waits and
+milliseconds that an iteration takes of the host, and the device's memory. Run it on an idle machine.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+import gpu_kernels
 import numpy as np
 import trimesh
 
@@ -32,10 +33,13 @@ from stga_addon.raster.cpu.project import project_backward, project_forward
 from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_forward, tile_grid, with_strain_color
 from stga_addon.raster.cpu.threads import threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
+from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
-from stga_addon.training.optimize.device import choose_device, make_backend
+from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.device import choose_device
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.losses import image_gradient, whole_image
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.settings import make_settings
@@ -163,12 +167,13 @@ def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str
 
 
 def device_step(
-    device: str, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
+    device: Device | None, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
 ) -> tuple[Backend, Batch]:
-    """A whole iteration on a device, from the posed mesh's frames on, and the global batch to give it."""
+    """A whole iteration on a GPU or the CPU, from the posed mesh's frames on, and the global batch to give it."""
     lengths = np.sqrt(2 * face_areas(mesh, faces)).astype(np.float32)
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
-    step = make_backend(device, make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats))
+    given = make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats)
+    step = CpuBackend(*given) if device is None else GpuBackend(device, *given)
     view = View(0, 0, camera, "benchmark", Path())
     return step, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
 
@@ -180,35 +185,9 @@ def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: floa
     return away <= np.quantile(away[splats.face], share)
 
 
-def queued_ms(step: Backend, batch: Batch, repeats: int) -> float:
-    """Mean wall time in milliseconds of iterations that follow each other without waiting, after five of them."""
-    import warp
-
-    for count in (5, repeats):
-        warp.synchronize()
-        begin = perf_counter()
-        for _ in range(count):
-            step.step(batch)
-        warp.synchronize()
-    return 1e3 * (perf_counter() - begin) / repeats
-
-
-def kernel_times(step: Backend, batch: Batch, repeats: int) -> dict[str, float]:
-    """kernel, copy or fill -> mean milliseconds of an iteration, longest first."""
-    import warp
-
-    warp.timing_begin(cuda_filter=warp.TIMING_ALL, synchronize=True)
-    for _ in range(repeats):
-        step.step(batch)
-    total: dict[str, float] = {}
-    for result in warp.timing_end(synchronize=True):
-        total[result.name] = total.get(result.name, 0.0) + result.elapsed / repeats
-    return dict(sorted(total.items(), key=lambda item: -item[1]))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", choices=("cpu", "cuda", "warp-cpu"), default="cpu")
+    parser.add_argument("--device", default="cpu", metavar="{cpu,gpu,gpu:NAME}")
     parser.add_argument("--head", choices=tuple(REGIONS), default="demo")
     parser.add_argument("--splats", type=int, default=60_000)
     parser.add_argument("--width", type=int, default=802)
@@ -221,33 +200,34 @@ def main() -> None:
     splats, mesh, faces = make_head(options.splats, rng)
     camera = front_camera(options.width, options.height)
     target = rng.integers(0, 256, (options.height, options.width, 3)).astype(np.uint8)
-    device, why = choose_device(options.device)
+    chosen, why = choose_device(options.device)
     print(why)
+    device = None if chosen == "cpu" else Device(chosen.partition(":")[2])
+    if device is not None and device.is_software:
+        print("This adapter is a CPU: its times say nothing of a GPU's")
     step, batch = device_step(device, splats, mesh, faces, camera, target)
 
     def measure(batch: Batch) -> float:
-        if device == "cpu":
+        if device is None:
             return median_ms(lambda: step.step(batch), options.repeats)
-        return queued_ms(step, batch, options.repeats)
+        return gpu_kernels.queued_ms(device, lambda: step.step(batch), options.repeats)
 
     whole = measure(batch)
-    if device == "cpu":
+    if device is None:
         frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
         found = cpu_table(splats, frames, target, options.repeats)
     else:
-        found = kernel_times(step, batch, options.repeats)
-        for name, ms in found.items():
-            print(f"{name:<60}{ms:8.3f} ms")
+        tiles_x, tiles_y = tile_grid(options.width, options.height)
+        found = gpu_kernels.kernel_table(
+            device, lambda: step.step(batch), len(splats), options.width * options.height, tiles_x * tiles_y,
+            options.repeats,
+        )  # fmt: skip
     print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
     print(f"{'whole iteration':<22}{whole:8.2f}")
     parts = {}
     for share in (0.05, 0.1, 0.2, 0.4):
         parts[share] = measure(replace(batch, selected=two_regions(splats, mesh, faces, share, options.head)))
         print(f"local, {share:4.0%} selected   {parts[share]:8.2f}   {parts[share] / whole:.2f} of a global one")
-    if device.startswith("cuda"):
-        import warp
-
-        print(f"peak memory {warp.get_mempool_used_mem_high(device) / 2**20:.0f} MiB")
     if options.out:
         result = {"stages_ms": found, "global_ms": whole, "local_ms": parts}
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.avatar.export import FORMATS, Meshes, check_free_space, export_avatar, range_bytes
+from ..stga_addon.avatar.export import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.format import format_bytes
@@ -127,6 +127,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         path = file_path(self.filepath, "export")
         if format.suffixes and not path.suffix:
             path = path.with_suffix(self.filename_ext)
+        check_suffix(path, self.format)
         avatar = read_avatar(self._source(context))
         check_head(avatar, head)
         motion = playback = None

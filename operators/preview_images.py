@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.scene.display.display_modes import ELLIPSOIDS, LIMITS, QUADS
-from ..stga_addon.scene.display.hints import TRANSPARENT_BOUNCES, view_transform_hint
+from ..stga_addon.scene.display.hints import use_transparent_bounces, view_transform_hint
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
 from ..stga_addon.scene.display.splat_object import set_input
 from ..stga_addon.scene.gpu.viewport_display import is_shown_as_trained
@@ -37,7 +37,7 @@ class PreviewImages(bpy.types.Operator):
                 set_input(thing, DISPLAY, mode)
         engine = scene.render.engine
         if engine == "CYCLES" and hasattr(scene, "cycles"):  # it can be chosen while its add-on is disabled
-            scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
+            use_transparent_bounces(scene)
         if getattr(context.space_data, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
             is_shown_by_engine = engine == "CYCLES" or engine.startswith("BLENDER_EEVEE")

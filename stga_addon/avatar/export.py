@@ -31,12 +31,14 @@ class Format:
 
     suffixes  of the file, the usual one first; none: a folder
     source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and its FLAME parameters
+    has_rate  whether it records how many frames play in a second
     """
 
     label: str
     description: str
     suffixes: tuple[str, ...]
     source: str
+    has_rate: bool = False
 
 
 FORMATS = {
@@ -45,12 +47,13 @@ FORMATS = {
     "gaussian-avatars": Format(
         "GaussianAvatars", "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads", (), "motion"
     ),
-    "usd": Format("USD", "The frames of the scene as an animated particle field", (".usdc", ".usdz"), "range"),
+    "usd": Format("USD", "The frames of the scene as an animated particle field", (".usdc", ".usdz"), "range", True),
     "web": Format(
         "Web Page",
         "The frames of the scene as a page that plays them, or as data for a server",
         (".html", ".stga"),
         "range",
+        True,
     ),
     "gltf": Format("glTF", "The current frame, for viewers with KHR_gaussian_splatting", (".glb",), "frame"),
     "spz": Format("SPZ", "The current frame compressed, a tenth of a PLY's size", (".spz",), "frame"),
@@ -74,8 +77,9 @@ def export_avatar(
     sequence the FLAME motion, for "gaussian-avatars"; for "web", where its rig is to go along
     fps      meshes per second
     playback what else a "web" page shows, and its meshes per second
-    Raises StgaError where the format needs what is not given, or a file cannot be written.
+    Raises StgaError where the suffix is another, the format needs what is not given, or a file cannot be written.
     """
+    check_suffix(path, format)
     if format == "gaussian-avatars":
         if sequence is None:
             raise StgaError(f"{path}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture")
@@ -96,6 +100,13 @@ def export_avatar(
         case "spz":
             write_spz(path, next(frames)[1], avatar.antialiased)
     return [path]
+
+
+def check_suffix(path: Path, format: str) -> None:
+    """Raise StgaError where the path does not end as a file of the format does."""
+    suffixes = FORMATS[format].suffixes
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise StgaError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
 
 
 def range_bytes(avatar: Avatar, format: str, frames: int) -> int:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError
 from ..files import replacing
 from .splats import SH_C0, Splats
 
@@ -23,10 +22,8 @@ def write_gltf(path: Path, world: Splats) -> None:
 
     Meters, y up as in the splats; rotations xyzw, standard deviations linear, opacity 0 to 1, every coefficient of the
     spherical harmonics an attribute. COLOR_0 is what a viewer without the extension shows.
-    Raises StgaError where the path has another suffix. Source: Khronos, KHR_gaussian_splatting.
+    Source: Khronos, KHR_gaussian_splatting.
     """
-    if path.suffix.lower() != ".glb":
-        raise StgaError(f"{path}: expected a name that ends in .glb")
     attributes = _attributes(world)
     views, accessors, offset = [], [], 0
     for name, array in attributes.items():

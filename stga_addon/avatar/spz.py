@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import StgaError
 from ..files import replacing
 from .splats import Splats
 
@@ -25,11 +24,8 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
 
     Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS says, standard deviations
     from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color 8 bits; coefficients above degree 0
-    are cut at ±1. antialiased as in `Avatar`. Raises StgaError where the path has another suffix.
-    Source: Niantic's README and `load-spz.cc`.
+    are cut at ±1. antialiased as in `Avatar`. Source: Niantic's README and `load-spz.cc`.
     """
-    if path.suffix.lower() != ".spz":
-        raise StgaError(f"{path}: expected a name that ends in .spz")
     bits = _fraction_bits(world.xyz)
     flags = ANTIALIASED if antialiased else 0
     header = MAGIC + struct.pack("<IIBBBB", VERSION, len(world), world.sh_degree, bits, flags, 0)

@@ -11,7 +11,6 @@ from ..files import replacing
 from .splats import Splats
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
-SUFFIXES = (".usdc", ".usdz")
 EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 
@@ -25,13 +24,11 @@ def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, movi
     moving_color  whether the spherical harmonics differ between frames: written for each of them, in half precision
     Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. Splats and opacities stay
     the same. A frame is in the file before the next is taken, so memory does not grow with their number.
-    Raises StgaError where USD is not installed, the path has another suffix, or a file cannot be written.
+    Raises StgaError where USD is not installed, or a file cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise StgaError(f"{path}: expected a name that ends in {' or '.join(SUFFIXES)}")
     usd = _import_usd(path)
     with replacing(path) as partial:
-        if path.suffix.lower() == ".usdc":
+        if path.suffix.lower() != ".usdz":
             _write_layer(usd, partial, frames, fps, moving_color)
             return
         layer = partial.with_name(f".layer{partial.name}")

@@ -2,16 +2,16 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..avatar.export import FORMATS, Meshes, check_free_space, export_avatar, range_bytes
+from ..avatar.export import FORMATS, Meshes, check_suffix, export_avatar
 from ..avatar.file import Avatar
 from ..avatar.playback import DEFAULT_FPS
 from ..capture.model import Capture
 from ..errors import StgaError
-from ..format import format_bytes
 from ..jobs.delegate import OpenHead
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
 from .export_web import export_web
 from .inputs import open_avatar, required_capture, timesteps_between
+from .outputs import announce_size
 
 NAME, HELP = "export", "write an avatar in another format"
 
@@ -30,8 +30,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--fps",
         type=frame_rate,
-        default=DEFAULT_FPS if head is None else head.fps,
-        help="frames per second of usd and web",
+        help=f"frames per second of usd and web (default: {DEFAULT_FPS if head is None else head.fps:g})",
     )
     parser.add_argument(
         "--motion-only", action="store_true", help="web: leave out the blend shapes and skeleton of the FLAME file"
@@ -40,16 +39,11 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    _check_options(options)
+    if options.fps is None:
+        options.fps = DEFAULT_FPS if options.head is None else options.head.fps
     avatar, capture = open_avatar(options.avatar, options)
     source = FORMATS[options.format].source
-    for option, belongs_to in (("timestep", "frame"), ("frames", "range")):
-        if getattr(options, option) is not None and source != belongs_to:
-            names = [name for name, format in FORMATS.items() if format.source == belongs_to]
-            raise StgaError(
-                f"--{option} cannot be combined with --format {options.format}, only with {', '.join(names)}"
-            )
-    if options.motion_only and options.format != "web":
-        raise StgaError(f"--motion-only cannot be combined with --format {options.format}, only with web")
     if options.format == "web":
         export_web(avatar, capture, options)
         return
@@ -60,6 +54,21 @@ def run(options: Namespace) -> None:
     else:
         meshes = _frame(avatar, capture, options.timestep)
     export_avatar(options.out, avatar, options.format, meshes, None if capture is None else capture.flame, options.fps)
+
+
+def _check_options(options: Namespace) -> None:
+    """Refuse options that the format would ignore, and a file name of another format."""
+    belongs_to = {
+        "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
+        "frames": [name for name, format in FORMATS.items() if format.source == "range"],
+        "fps": [name for name, format in FORMATS.items() if format.has_rate],
+        "motion_only": ["web"],
+    }
+    for option, formats in belongs_to.items():
+        if getattr(options, option) not in (None, False) and options.format not in formats:
+            flag = f"--{option.replace('_', '-')}"
+            raise StgaError(f"{flag} cannot be combined with --format {options.format}, only with {', '.join(formats)}")
+    check_suffix(options.out, options.format)
 
 
 def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> Meshes:
@@ -79,7 +88,5 @@ def _range(avatar: Avatar, capture: Capture | None, options: Namespace) -> Meshe
 
     capture = required_capture(capture)
     timesteps = timesteps_between(capture, options.frames)
-    size = range_bytes(avatar, options.format, len(timesteps))
-    check_free_space(options.out, size)
-    print(f"{len(timesteps)} frames of {len(avatar.splats)} splats: about {format_bytes(size)}")
+    announce_size(options.out, avatar, options.format, len(timesteps))
     return ((timestep, capture.mesh(timestep)) for timestep in tqdm(timesteps, desc="Exporting", unit="frame"))

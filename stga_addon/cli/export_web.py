@@ -14,6 +14,7 @@ from ..capture.camera import Camera
 from ..capture.model import Capture
 from ..selection import SelectionOptions, select_capture
 from .inputs import required_capture, timesteps_between
+from .outputs import announce_size
 
 SPLITS = ("val", "train", "test")
 
@@ -21,11 +22,13 @@ SPLITS = ("val", "train", "test")
 def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> None:
     """Write the page of --out with the capture's timesteps (--frames), or the neutral mesh without a capture."""
     if capture is None and options.frames is None:
+        announce_size(options.out, avatar, "web", 1)
         playback = Playback(title=_title(options), fps=options.fps, motion_only=True)
         export_avatar(options.out, avatar, "web", [(0, avatar.neutral)], playback=playback)
         return
     capture = required_capture(capture)
     timesteps = timesteps_between(capture, options.frames)
+    announce_size(options.out, avatar, "web", len(timesteps))
     playback = Playback(
         title=_title(options),
         fps=options.fps,

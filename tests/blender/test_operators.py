@@ -384,7 +384,10 @@ def test_more_bounces_where_cycles_needs_them(extension):
     scene.cycles.transparent_max_bounces = 8
     assert "8 layers" in hints.transparent_bounces_hint(scene)
     bpy.ops.stga.more_bounces()
-    assert scene.cycles.transparent_max_bounces == 64
+    assert (scene.cycles.transparent_max_bounces, scene.cycles.min_transparent_bounces) == (64, 64)
+    scene.cycles.min_transparent_bounces = 0
+    assert "noise" in hints.transparent_bounces_hint(scene)
+    bpy.ops.stga.more_bounces()
     assert hints.transparent_bounces_hint(scene) is None
     scene.cycles.transparent_max_bounces = 200
     bpy.ops.stga.more_bounces()

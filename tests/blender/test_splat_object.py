@@ -220,6 +220,27 @@ def test_colors_follow_the_active_camera(degree):
     np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + 0.28209479177387814 * sh[:, 0]), atol=2e-6)
 
 
+def test_colors_follow_a_moving_camera():
+    """Catches colors that stay those of the first frame while the camera moves, in playback and in renders."""
+    avatar = avatar_of("stga", 100)
+    sh = np.random.default_rng(3).normal(0, 0.3, (100, 4, 3)).astype(np.float32)
+    avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
+    shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    camera, scene = active_camera((0.3, -0.9, 1.2)), bpy.context.scene
+    expected = {}
+    for frame, place in ((1, (0.3, -0.9, 1.2)), (5, (-0.8, 0.5, 0.9))):
+        camera.location = place
+        scene.frame_set(frame)
+        expected[frame] = displayed_colors(shown)
+    assert np.abs(expected[1] - expected[5]).max() > 0.1
+    for frame, place in ((1, (0.3, -0.9, 1.2)), (5, (-0.8, 0.5, 0.9))):
+        camera.location = place
+        camera.keyframe_insert("location", frame=frame)
+    for frame in (1, 5, 1):
+        scene.frame_set(frame)
+        np.testing.assert_allclose(displayed_colors(shown), expected[frame], atol=1e-6)
+
+
 def test_colors_follow_strain():
     """Catches strain of another triangle, in other axes or not averaged, against numpy on the deformed mesh."""
     avatar = avatar_of("stga", 1500)

@@ -152,6 +152,23 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
 
 
+def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path) -> None:
+    """Catches a device that renders something else, or is not asked."""
+    from raster import gpu_device
+
+    gpu_device.device()  # or skip
+    cameras = root / "transforms_val.json"
+    for device in ("cpu", "gpu"):
+        out = tmp_path / device
+        assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out), "--device", device]) == 0
+    names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
+    assert names
+    for name in names:
+        one, other = (np.asarray(Image.open(tmp_path / device / name)).astype(int) for device in ("cpu", "gpu"))
+        assert np.abs(one - other).max() <= 1
+        assert one.std() > 5
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("black", (0, 0, 0)), ("1,0,0.2", (255, 0, 51)), ("white", (255, 255, 255))]
 )
@@ -259,11 +276,15 @@ def test_export_refuses_what_does_not_fit(
     assert "--timestep cannot be combined with --format usd" in message
     message = refused(capsys, "export", trained, "--format", "ply", "--motion-only", *out)
     assert "--motion-only cannot be combined with --format ply, only with web" in message
+    message = refused(capsys, "export", trained, "--format", "spz", "--fps", "30", *out)
+    assert "--fps cannot be combined with --format spz, only with usd, web" in message
+    message = refused(capsys, "export", trained, "--format", "usd", "--out", tmp_path / "o.usda")
+    assert "o.usda: expected a name that ends in .usdc or .usdz" in message
     message = refused(capsys, "export", trained, "--format", "ply-sequence", "--frames", "7:9", *out)
     assert "has no timestep from 7 to 9" in message
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
-    message = refused(capsys, "export", trained, "--format", "ply-sequence", *out)
-    assert "1.0 kB are free there" in message
+    for words in (["ply-sequence", *out], ["web", "--out", tmp_path / "o.html"]):
+        assert "1.0 kB are free there" in refused(capsys, "export", trained, "--format", *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -350,7 +371,7 @@ def test_an_avatar_without_capture(
     assert "give --capture" in message
     message = refused(capsys, "export", avatar, "--format", "ply-sequence", "--out", tmp_path / "o")
     assert "give --capture" in message
-    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o")
+    message = refused(capsys, "export", avatar, "--format", "ply", "--timestep", 1, "--out", tmp_path / "o.ply")
     assert "give --capture" in message
     assert not (tmp_path / "o").exists()
 

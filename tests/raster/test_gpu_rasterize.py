@@ -166,6 +166,7 @@ def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     backward = Rasterizer.backward
 
     def loses_a_tile(self, work, rendering, *arguments):
+        work.clear(work.device.buffer("pair_gradients", 0))  # which hold the right ones of the first trial
         work.clear(rendering.chosen.touched, 12)
         return backward(self, work, rendering, *arguments)
 

@@ -104,8 +104,13 @@ def test_what_is_wrong_is_said_and_only_auto_falls_back(
 
 def test_a_driver_that_fails_leaves_the_cpu(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches "auto" that ends in a driver's traceback."""
-    monkeypatch.setattr(trial, "try_device", raises)
-    assert choose_device("auto") == ("cpu", "Training on the CPU: device lost")
+    works, broken = trial.try_device, {CARD}
+    monkeypatch.setattr(trial, "try_device", lambda name: raises(name) if name in broken else works(name))
+    assert choose_device("auto")[0] == f"gpu:{OTHER}"
+    device_module._trial.cache_clear()
+    broken.add(OTHER)
+    reasons = f"{CARD} fails (device lost); {OTHER} fails (device lost)"
+    assert choose_device("auto") == ("cpu", f"Training on the CPU: {reasons}")
 
 
 def test_only_software_is_no_gpu(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -179,6 +179,22 @@ def test_an_iteration_is_one_submit(toy: Capture, part: str | None) -> None:
     assert device.waits == before[2]
 
 
+def test_states_are_the_same_bits_on_both(toy: Capture) -> None:
+    """Catches a checkpoint of one device that the other reads differently: rows, moments, counts, statistics, marks."""
+    settings = settings_of()
+    cpu, gpu = pair(toy, settings)
+    for timestep in (1, 3):
+        cpu.step(batch_of(toy, settings, timestep))
+    gpu.state = cpu.state
+    state = gpu.state
+    for name, want in bits(cpu.state).items():
+        np.testing.assert_array_equal(bits(state)[name], want, err_msg=name)
+    gpu.step(batch_of(toy, settings))
+    cpu.state = gpu.state
+    assert not np.array_equal(bits(cpu.state)["parameters/xyz"], bits(state)["parameters/xyz"])
+    cpu.step(batch_of(toy, settings))  # which fails where an array has another type or is not contiguous
+
+
 def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
     """Catches density control whose result stays on the host, and a state that is no copy."""
     settings = settings_of()
@@ -219,3 +235,19 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, runs: Callable[[s
     assert read_checkpoint(tmp_path).iteration == 17
     train(toy, tmp_path, run, resume=True)
     assert_same_state(tmp_path, runs("gpu"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("begun", "resumed"), [("cpu", "gpu"), ("gpu", "cpu")])
+def test_a_run_moves_to_the_other_device(
+    toy: Capture, runs: Callable[[str], Path], tmp_path: Path, begun: str, resumed: str
+) -> None:
+    """Catches a checkpoint that only its own device continues, and moments or counts lost on the way."""
+    run = make_run(toy, "selective", iterations=40, strain_color=True)
+    train(toy, tmp_path, replace(run, device=begun), report=stop_at(17))
+    assert read_checkpoint(tmp_path).iteration == 17
+    train(toy, tmp_path, replace(run, device=resumed), resume=True)
+    moved, unbroken = (read_metrics(folder)[-1] for folder in (tmp_path, runs("cpu")))
+    assert moved["iteration"] == unbroken["iteration"]
+    assert moved["psnr"] == pytest.approx(unbroken["psnr"], abs=0.15)
+    assert moved["splats"] == pytest.approx(unbroken["splats"], rel=0.02)

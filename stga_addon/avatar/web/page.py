@@ -9,9 +9,11 @@ from pathlib import Path
 PLAYER = Path(__file__).parent / "player"
 MODULES = (
     "data.js",
+    "vector.js",
     "rotation.js",
     "motion.js",
     "rig.js",
+    "strain.js",
     "face_frames.js",
     "depth_sort.js",
     "shaders.js",

@@ -14,7 +14,6 @@ from .data_file import data_file
 from .page import element_script, page
 from .rig import WebRig, baked_rig, flame_rig
 
-SUFFIXES = (".html", ".stga")
 SCRIPT_NAME = "stga-avatar.js"
 BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
 """About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
@@ -31,14 +30,12 @@ def write_web(
     meshes: Iterable[np.ndarray] = (),
     sequence: FlameSequence | None = None,
 ) -> list[Path]:
-    """Write an .html page that plays the avatar, or an .stga data file with the player beside it; returns the files.
+    """Write a page that plays the avatar, or an .stga data file with the player beside it; returns the files.
 
     sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else the posed `meshes`
               (V, 3) meters are baked, of which there is one at least
-    Raises StgaError where the suffix is another, there is no pose, or a file cannot be written.
+    Raises StgaError where there is no pose, or a file cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise StgaError(f"{path}: a web page is named .html, and data for a server .stga")
     with_flame = sequence is not None and not playback.motion_only
     rig = _rig(path, None if playback.motion_only else sequence, meshes)
     try:

@@ -42,18 +42,27 @@ Groups = tuple[int, int, int] | tuple[Any, int]
 
 @cache
 def adapters() -> dict[str, Any]:
-    """The adapters that can run the kernels, by a name that tells equal ones apart; software ones last."""
+    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first, software last.
+
+    A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the slowest.
+    """
     os.environ.setdefault("NODEVICE_SELECT", "1")  # Mesa's layer for windows complains where there is no display
     set_instance_extras(backends=BACKENDS)
     found: dict[str, Any] = {}
     every = wgpu.gpu.enumerate_adapters_sync()
-    for adapter in sorted(every, key=is_software):
+    for adapter in sorted(every, key=_preference):
         if any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items()):
             continue
         name = f"{adapter.info['device']} ({adapter.info['backend_type']})"
         same = sum(known == name or known.startswith(f"{name} #") for known in found)
         found[f"{name} #{same + 1}" if same else name] = adapter
     return found
+
+
+def _preference(adapter: Any) -> tuple[int, bool]:
+    kinds, info = ("DiscreteGPU", "IntegratedGPU", "CPU"), adapter.info
+    rank = kinds.index(info["adapter_type"]) if info["adapter_type"] in kinds else 1
+    return rank, info["backend_type"] == "D3D12"
 
 
 def is_software(adapter: Any) -> bool:
@@ -94,6 +103,11 @@ class Device:
         self.kernel_times: KernelTimes | None = None
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
+
+    @property
+    def bytes(self) -> int:
+        """Size of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
 
     def buffer(self, name: str, words: int, usage: str = "storage") -> Any:
         """A buffer of at least so many 32-bit words; the same memory until more is asked for, then fresh zeros.

@@ -28,16 +28,17 @@ const REACH: i32 = 2 * RADIUS;
 const SIDE: i32 = i32(TILE);
 const INNER: i32 = SIDE + 2 * RADIUS; // pixels whose SSIM depends on the tile
 const OUTER: i32 = SIDE + 2 * REACH; // pixels that those depend on
-const INNER_AREA: i32 = INNER * INNER;
 const OUTER_AREA: i32 = OUTER * OUTER;
+const STRIPS: i32 = 2; // in which the inner rows are blurred, so that 16 KiB of a workgroup's memory suffice
+const STRIP_ROWS: i32 = INNER / STRIPS;
+const STRIP_AREA: i32 = STRIP_ROWS * INNER;
 const THREADS: i32 = i32(WORKGROUP);
-const ROUNDS: i32 = (INNER_AREA + THREADS - 1) / THREADS;
-// SSIM's window from its middle outwards.
-const WINDOW = array<f32, RADIUS + 1>(WINDOW_0, WINDOW_1, WINDOW_2, WINDOW_3, WINDOW_4, WINDOW_5);
+const STRIP_ROUNDS: i32 = (STRIP_AREA + THREADS - 1) / THREADS; // a thread's pixels of a strip
+const ROUNDS: i32 = STRIPS * STRIP_ROUNDS;
 
-// First the image and its target (2 planes of OUTER²), then SSIM's slopes (3 of INNER²).
-var<workgroup> planes: array<f32, 2 * OUTER_AREA>;
-var<workgroup> blurred: array<f32, OUTER * INNER>;
+// First the image and its target (OUTER²), then two at a time of SSIM's slopes (INNER²).
+var<workgroup> values: array<vec2f, OUTER_AREA>;
+var<workgroup> blurred: array<vec2f, (STRIP_ROWS + 2 * RADIUS) * INNER>;
 
 fn byte_of(word: u32, index: u32) -> f32 {
   return f32((word >> (8u * (index & 3u))) & 255u);
@@ -56,57 +57,51 @@ fn target_value(x: i32, y: i32, channel: u32) -> f32 {
   return value * (1.0 / 255.0);
 }
 
-// One of the four values whose means SSIM is made of, at a place of the planes.
-fn moment(which: i32, at: i32) -> f32 {
-  let a = planes[at];
-  let b = planes[OUTER_AREA + at];
-  switch which {
-    case 0: {
-      return a;
-    }
-    case 1: {
-      return b;
-    }
-    case 2: {
-      return a * a + b * b;
-    }
-    default: {
-      return a * b;
-    }
-  }
+// Two of the four values whose means SSIM is made of.
+fn moments_of(squares: bool, pixel: vec2f) -> vec2f {
+  return select(pixel, vec2f(dot(pixel, pixel), pixel.x * pixel.y), squares);
 }
 
-// Blur along x: OUTER rows of INNER pixels.
-fn blur_moment(which: i32, local: i32) {
-  for (var n = local; n < OUTER * INNER; n += THREADS) {
-    let at = n / INNER * OUTER + n % INNER + RADIUS;
-    var total = WINDOW[0] * moment(which, at);
-    for (var k = 1; k <= RADIUS; k++) {
-      total += WINDOW[k] * (moment(which, at - k) + moment(which, at + k));
-    }
-    blurred[n] = total;
+// Blur along x the rows that a strip's windows reach: INNER pixels of each.
+fn blur_moments(squares: bool, strip: i32, local: i32) {
+  for (var n = local; n < (STRIP_ROWS + 2 * RADIUS) * INNER; n += THREADS) {
+    let at = (strip * STRIP_ROWS + n / INNER) * OUTER + n % INNER + RADIUS;
+    blurred[n] = WINDOW_0 * moments_of(squares, values[at])
+      + WINDOW_1 * (moments_of(squares, values[at - 1]) + moments_of(squares, values[at + 1]))
+      + WINDOW_2 * (moments_of(squares, values[at - 2]) + moments_of(squares, values[at + 2]))
+      + WINDOW_3 * (moments_of(squares, values[at - 3]) + moments_of(squares, values[at + 3]))
+      + WINDOW_4 * (moments_of(squares, values[at - 4]) + moments_of(squares, values[at + 4]))
+      + WINDOW_5 * (moments_of(squares, values[at - 5]) + moments_of(squares, values[at + 5]));
   }
 }
 
 // Blur along x: INNER rows of SIDE pixels.
-fn blur_slope(which: i32, local: i32) {
+fn blur_slopes(local: i32) {
   for (var n = local; n < INNER * SIDE; n += THREADS) {
-    let at = which * INNER_AREA + n / SIDE * INNER + n % SIDE + RADIUS;
-    var total = WINDOW[0] * planes[at];
-    for (var k = 1; k <= RADIUS; k++) {
-      total += WINDOW[k] * (planes[at - k] + planes[at + k]);
-    }
-    blurred[n] = total;
+    let at = n / SIDE * INNER + n % SIDE + RADIUS;
+    blurred[n] = WINDOW_0 * values[at]
+      + WINDOW_1 * (values[at - 1] + values[at + 1])
+      + WINDOW_2 * (values[at - 2] + values[at + 2])
+      + WINDOW_3 * (values[at - 3] + values[at + 3])
+      + WINDOW_4 * (values[at - 4] + values[at + 4])
+      + WINDOW_5 * (values[at - 5] + values[at + 5]);
   }
 }
 
 // Blur along y at a place of `blurred`, whose rows are `stride` long.
-fn blur_column(at: i32, stride: i32) -> f32 {
-  var total = WINDOW[0] * blurred[at];
-  for (var k = 1; k <= RADIUS; k++) {
-    total += WINDOW[k] * (blurred[at - k * stride] + blurred[at + k * stride]);
-  }
-  return total;
+fn blur_column(at: i32, stride: i32) -> vec2f {
+  return WINDOW_0 * blurred[at]
+    + WINDOW_1 * (blurred[at - stride] + blurred[at + stride])
+    + WINDOW_2 * (blurred[at - 2 * stride] + blurred[at + 2 * stride])
+    + WINDOW_3 * (blurred[at - 3 * stride] + blurred[at + 3 * stride])
+    + WINDOW_4 * (blurred[at - 4 * stride] + blurred[at + 4 * stride])
+    + WINDOW_5 * (blurred[at - 5 * stride] + blurred[at + 5 * stride]);
+}
+
+// The place, among the INNER² pixels, of a thread's pixel of a round; past the end where it has none.
+fn inner_place(round: i32, local: i32) -> i32 {
+  let n = round % STRIP_ROUNDS * THREADS + local;
+  return select(INNER * INNER, round / STRIP_ROUNDS * STRIP_AREA + n, n < STRIP_AREA);
 }
 
 // SSIM from the blurred moments; and its derivatives by mean, sum of squares and product, the other two held fixed.
@@ -142,37 +137,38 @@ fn gradient(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
   for (var n = local; n < OUTER_AREA; n += THREADS) {
     let x = corner.x - REACH + n % OUTER;
     let y = corner.y - REACH + n / OUTER;
-    planes[n] = 0.0;
-    planes[OUTER_AREA + n] = 0.0;
+    values[n] = vec2f(0.0);
     if is_inside(x, y) {
-      planes[n] = image[plane + u32(y) * view.width + u32(x)];
-      planes[OUTER_AREA + n] = target_value(x, y, group.z);
+      values[n] = vec2f(image[plane + u32(y) * view.width + u32(x)], target_value(x, y, group.z));
     }
   }
   workgroupBarrier();
 
   var moments: array<vec4f, ROUNDS>;
-  for (var which = 0; which < 4; which++) {
-    blur_moment(which, local);
-    workgroupBarrier();
-    for (var round = 0; round < ROUNDS; round++) {
-      let n = local + round * THREADS;
-      if n < INNER_AREA {
-        moments[round][which] = blur_column(n + RADIUS * INNER, INNER);
+  for (var strip = 0; strip < STRIPS; strip++) {
+    for (var part = 0; part < 2; part++) {
+      blur_moments(part == 1, strip, local);
+      workgroupBarrier();
+      for (var round = 0; round < STRIP_ROUNDS; round++) {
+        let n = local + round * THREADS;
+        if n < STRIP_AREA {
+          let found = blur_column(n + RADIUS * INNER, INNER);
+          let at = strip * STRIP_ROUNDS + round;
+          moments[at] = select(vec4f(found, 0.0, 0.0), vec4f(moments[at].xy, found), part == 1);
+        }
       }
+      workgroupBarrier();
     }
-    workgroupBarrier();
   }
   let place = vec2i(local % SIDE, local / SIDE); // of this thread's pixel in the tile
-  let own = (place.y + REACH) * OUTER + place.x + REACH;
-  let a = planes[own];
-  let b = planes[OUTER_AREA + own];
+  let pixel = values[(place.y + REACH) * OUTER + place.x + REACH];
   workgroupBarrier();
 
   var total = vec2f(0.0);
+  var by_product: array<f32, ROUNDS>;
   for (var round = 0; round < ROUNDS; round++) {
-    let n = local + round * THREADS;
-    if n < INNER_AREA {
+    let n = inner_place(round, local);
+    if n < INNER * INNER {
       let at = vec2i(n % INNER, n / INNER) - RADIUS; // in the tile
       var slopes = vec4f(0.0);
       if is_inside(corner.x + at.x, corner.y + at.y) {
@@ -181,28 +177,34 @@ fn gradient(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
           total.y += slopes.x;
         }
       }
-      planes[n] = slopes.y;
-      planes[INNER_AREA + n] = slopes.z;
-      planes[2 * INNER_AREA + n] = slopes.w;
+      values[n] = slopes.yz;
+      by_product[round] = slopes.w;
     }
   }
   workgroupBarrier();
-
-  var slope = vec3f(0.0);
-  for (var which = 0; which < 3; which++) {
-    blur_slope(which, local);
-    workgroupBarrier();
-    slope[which] = blur_column((place.y + RADIUS) * SIDE + place.x, SIDE);
-    workgroupBarrier();
+  let column = (place.y + RADIUS) * SIDE + place.x;
+  blur_slopes(local);
+  workgroupBarrier();
+  let slope = blur_column(column, SIDE);
+  for (var round = 0; round < ROUNDS; round++) {
+    let n = inner_place(round, local);
+    if n < INNER * INNER {
+      values[n] = vec2f(by_product[round], 0.0);
+    }
   }
+  workgroupBarrier();
+  blur_slopes(local);
+  workgroupBarrier();
+  let slope_of_product = blur_column(column, SIDE).x;
+  workgroupBarrier();
   let x = corner.x + place.x;
   let y = corner.y + place.y;
   if is_inside(x, y) {
-    total.x = abs(a - b);
-    let by_ssim = slope.x + 2.0 * a * slope.y + b * slope.z;
+    total.x = abs(pixel.x - pixel.y);
+    let by_ssim = slope.x + 2.0 * pixel.x * slope.y + pixel.y * slope_of_product;
     let share = 1.0 / f32(3u * view.width * view.height);
     v_image[plane + u32(y) * view.width + u32(x)] =
-      share * ((1.0 - loss.ssim_weight) * sign(a - b) - loss.ssim_weight * by_ssim);
+      share * ((1.0 - loss.ssim_weight) * sign(pixel.x - pixel.y) - loss.ssim_weight * by_ssim);
   }
   total = sum_of_workgroup(total, index);
   if index == 0u {
@@ -226,14 +228,12 @@ fn total(@builtin(local_invocation_index) index: u32) {
 
 // Sum over the workgroup's threads, always in the same order; right in thread 0.
 fn sum_of_workgroup(value: vec2f, index: u32) -> vec2f {
-  planes[index] = value.x;
-  planes[WORKGROUP + index] = value.y;
+  values[index] = value;
   for (var half = WORKGROUP / 2u; half > 0u; half /= 2u) {
     workgroupBarrier();
     if index < half {
-      planes[index] += planes[index + half];
-      planes[WORKGROUP + index] += planes[WORKGROUP + index + half];
+      values[index] += values[index + half];
     }
   }
-  return vec2f(planes[0], planes[WORKGROUP]);
+  return values[0];
 }

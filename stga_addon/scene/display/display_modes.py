@@ -20,8 +20,8 @@ NATIVE = "Native Splats"
 LIMITS = {
     AS_TRAINED: "Exact in viewports and by the engine STGA Splats; EEVEE and Cycles render camera quads",
     POINTS: "Fast: round, of each splat's mean size",
-    ELLIPSOIDS: "From all sides; EEVEE needs many samples. Colors are those that the scene's camera sees",
-    QUADS: "For EEVEE and Cycles; right through the scene's camera only",
+    ELLIPSOIDS: "For EEVEE and Cycles, from all sides, in the colors that the scene's camera sees",
+    QUADS: "For EEVEE and Cycles, faster; right through the scene's camera only",
     NATIVE: "Blender's own splats; this was not tried",
 }
 """What each display is for and what it is not, in its tooltip and in the panel."""

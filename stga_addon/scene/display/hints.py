@@ -16,6 +16,19 @@ def view_transform_hint(scene: bpy.types.Scene) -> str | None:
 def transparent_bounces_hint(scene: bpy.types.Scene) -> str | None:
     """A sentence where Cycles renders the scene with too few transparent bounces for splats, else None."""
     cycles = getattr(scene, "cycles", None)  # None where the Cycles add-on is disabled
-    if scene.render.engine != "CYCLES" or cycles is None or cycles.transparent_max_bounces >= TRANSPARENT_BOUNCES:
+    if scene.render.engine != "CYCLES" or cycles is None:
         return None
-    return f"Cycles sees through {cycles.transparent_max_bounces} layers of splats; {TRANSPARENT_BOUNCES} are needed"
+    if cycles.transparent_max_bounces < TRANSPARENT_BOUNCES:
+        return (
+            f"Cycles sees through {cycles.transparent_max_bounces} layers of splats; {TRANSPARENT_BOUNCES} are needed"
+        )
+    if cycles.min_transparent_bounces < TRANSPARENT_BOUNCES:
+        return "Cycles ends rays between splats at random, which is seen as noise"
+    return None
+
+
+def use_transparent_bounces(scene: bpy.types.Scene) -> None:
+    """Let Cycles see through overlapping splats, without ending rays between them at random."""
+    cycles = scene.cycles
+    cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
+    cycles.min_transparent_bounces = max(cycles.min_transparent_bounces, TRANSPARENT_BOUNCES)

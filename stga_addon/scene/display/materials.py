@@ -17,7 +17,8 @@ EXTENT = 3.0
 
 def point_material() -> bpy.types.Material:
     """Emits the color of a point cloud's points, with their opacity; built where the file has none."""
-    return _splat_material(POINT_MATERIAL, _point_shader)
+    # EEVEE does not sort the points of a point cloud.
+    return _splat_material(POINT_MATERIAL, _point_shader, "DITHERED")
 
 
 def ellipsoid_material() -> bpy.types.Material:
@@ -25,18 +26,19 @@ def ellipsoid_material() -> bpy.types.Material:
 
     Along a ray with unit direction D through a surface point P of the sphere, both in the instance's space, the
     Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² − (P·D)²; its density
-    there is taken for the whole splat. Exact for Cycles up to the order of overlapping splats, noisy in EEVEE, whose
-    transparency is stochastic.
+    there is taken for the whole splat. Exact for Cycles up to the order of overlapping splats, and for EEVEE up to
+    their order by centers.
     """
-    return _splat_material(ELLIPSOID_MATERIAL, _ellipsoid_shader)
+    # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come as close.
+    return _splat_material(ELLIPSOID_MATERIAL, _ellipsoid_shader, "BLENDED")
 
 
-def _splat_material(name: str, build: Callable[[Nodes], Any]) -> bpy.types.Material:
+def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bpy.types.Material:
+    """method: EEVEE's, "DITHERED" or "BLENDED"."""
     material = bpy.data.materials.get(name)
     if material is None:
         material = new_material(name, build)
-        # Stochastic transparency needs no sorting, which tens of thousands of overlapping splats would make too slow.
-        material.surface_render_method = "DITHERED"
+        material.surface_render_method = method
         material.use_backface_culling = True
     return material
 

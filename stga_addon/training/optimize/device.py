@@ -83,17 +83,25 @@ def _adapter(device: str) -> str:
 
 def _fastest() -> tuple[str, str]:
     """The first real GPU that is right and faster than the CPU, or the CPU and why."""
-    reasons = []
     try:
-        for adapter in adapter_names(software=False):
-            trial = _trial(adapter)
-            if trial.is_right and trial.device_s < trial.cpu_s:
-                return GPU + adapter, f"Training on {adapter}, {_comparison(trial)}"
-            reasons.append(f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial))
+        names = adapter_names(software=False)
     except Exception as error:  # whatever a driver raises, the CPU can still train
-        first_line = (str(error).strip() or repr(error)).splitlines()[0]
-        reasons.append(first_line.removeprefix("--device gpu: "))
+        return "cpu", f"Training on the CPU: {_first_line(error)}"
+    reasons = []
+    for adapter in names:
+        try:
+            trial = _trial(adapter)
+        except Exception as error:
+            reasons.append(f"{adapter} fails ({_first_line(error)})")
+            continue
+        if trial.is_right and trial.device_s < trial.cpu_s:
+            return GPU + adapter, f"Training on {adapter}, {_comparison(trial)}"
+        reasons.append(f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial))
     return "cpu", f"Training on the CPU: {'; '.join(reasons)}"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or repr(error)).splitlines()[0].removeprefix("--device gpu: ")
 
 
 @cache

@@ -1,6 +1,8 @@
 """A FLAME head with splats on it, in a motion of three frames."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.playback import Playback
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.avatar.web.data_file import data_file
+from stga_addon.avatar.web.page import page
 from stga_addon.avatar.web.rig import WebRig, flame_rig
 from stga_addon.capture.camera import Camera, look_at
+from stga_addon.development.browser import Browser, find_browser
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh
@@ -19,6 +23,28 @@ from ..conftest import random_splats
 
 SPLATS = 1500
 SIZE = 120
+READY = """new Promise((done) => {
+  const avatar = document.querySelector('stga-avatar');
+  const look = () => (avatar.info || avatar.shadowRoot?.querySelector('p').textContent ? done() : setTimeout(look, 20));
+  look();
+})"""
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    executable = find_browser()
+    if executable is None:
+        pytest.skip("no Chromium on this machine (apt-get install chromium)")
+    opened = Browser(executable, tmp_path_factory.mktemp("profile"), (500, 400))
+    yield opened
+    opened.close()
+
+
+def show(browser: Browser, folder: Path, data: bytes) -> None:
+    """Open the page of a data file from disk."""
+    (folder / "a.html").write_text(page("Zoë", "", data), encoding="utf-8")
+    browser.open((folder / "a.html").as_uri())
+    browser.evaluate(READY)
 
 
 @dataclass(frozen=True)

@@ -80,12 +80,6 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
     assert "derived from a FLAME model" in (tmp_path / "b.html").read_text(encoding="utf-8")
 
 
-def test_other_suffixes_are_refused(head, tmp_path):
-    """Catches a page under a name that no browser opens."""
-    with pytest.raises(StgaError, match=r"\.html"):
-        write_web(tmp_path / "a.htm", head.avatar, Playback(), list(head.meshes))
-
-
 def test_no_data_without_its_player(head, tmp_path):
     """Catches a data file left behind by an export that fails at the player beside it."""
     (tmp_path / SCRIPT_NAME).mkdir()

@@ -2,18 +2,15 @@
 
 import base64
 import io
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from stga_addon.avatar.web.page import page
+from stga_addon.development.browser import Browser
 from stga_addon.raster.render import render_avatar, to_uint8
 
-from .browser import Browser
-from .conftest import Head, make_head
+from .conftest import Head, make_head, show
 
 MIN_PSNR = 55.0
 MIN_EXACT_PSNR = 68.0
@@ -28,25 +25,6 @@ SNAPSHOT = """(async () => {
   const reader = new FileReader();
   return new Promise((done) => Object.assign(reader, { onload: () => done(reader.result) }).readAsDataURL(blob));
 })()"""
-READY = """new Promise((done) => {
-  const avatar = document.querySelector('stga-avatar');
-  const look = () => (avatar.info || avatar.shadowRoot?.querySelector('p').textContent ? done() : setTimeout(look, 20));
-  look();
-})"""
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    opened = Browser(tmp_path_factory.mktemp("profile"), (500, 400))
-    yield opened
-    opened.close()
-
-
-def show(browser: Browser, folder: Path, data: bytes) -> None:
-    """Open the page of a data file from disk."""
-    (folder / "a.html").write_text(page("Zoë", "", data), encoding="utf-8")
-    browser.open((folder / "a.html").as_uri())
-    browser.evaluate(READY)
 
 
 def psnr(browser: Browser, head: Head, frame: int) -> float:

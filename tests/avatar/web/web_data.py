@@ -56,3 +56,34 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
         unbound=np.zeros(count, bool),
         strain_color=arrays.get("strain_color", np.zeros((count, 0), np.float32)).reshape(count, -1, 3),
     )
+
+
+def posed_mesh(
+    header: dict[str, Any], arrays: dict[str, np.ndarray], coefficients: np.ndarray, pose: np.ndarray, frame: int
+) -> np.ndarray:
+    """Vertices (V, 3) of coefficients (R,), pose (J, 3) axis-angle and the translation of a frame."""
+    parents = header["parents"]
+    local = np.stack([_rotation(vector) for vector in pose])
+    features = (local[1:] - np.eye(3)).ravel()
+    shaped = arrays["base"] + np.einsum("r,rvc->vc", coefficients, arrays["basis"])
+    shaped = shaped + np.einsum("p,pvc->vc", features, arrays["correctives"])
+    joints = arrays["joint_rest"] + np.einsum("r,rjc->jc", coefficients, arrays["joint_basis"])
+    world: list[np.ndarray] = []
+    for joint, parent in enumerate(parents):
+        own = np.eye(4)
+        own[:3, :3] = local[joint]
+        own[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0)
+        world.append(own if parent < 0 else world[parent] @ own)
+    skinned = np.zeros_like(shaped, dtype=float)
+    for joint, matrix in enumerate(world):
+        moved = (shaped - joints[joint]) @ matrix[:3, :3].T + matrix[:3, 3]
+        skinned += arrays["weights"][:, joint, None] * moved
+    return skinned + arrays["translation"][frame]
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Matrix of an axis-angle vector (Rodrigues)."""
+    angle = max(float(np.linalg.norm(vector)), 1e-12)
+    x, y, z = np.asarray(vector, float) / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

@@ -1,6 +1,6 @@
 // Pinhole cameras (OpenCV axes: x right, y down, z ahead) and the ways to move one around a point.
 
-import { crossed } from './face_frames.js';
+import { crossed, dotProduct, unit } from './vector.js';
 
 const MAX_ELEVATION = 1.54; // radians; short of the pole, where "up" has no direction
 const MIN_DISTANCE_M = 0.02;
@@ -105,12 +105,4 @@ function row(matrix, k) {
 
 function inCamera(matrix, point) {
   return [0, 1, 2].map((k) => dotProduct(row(matrix, k), point) + matrix[4 * k + 3]);
-}
-
-function dotProduct(a, b) {
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-function unit(v) {
-  return v.map((value) => value / Math.hypot(...v));
 }

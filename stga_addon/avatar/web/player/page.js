@@ -146,9 +146,10 @@ function toggleTheme() {
 
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
-function addSlider(parent, { label, low, high, read, write, format }) {
+function addSlider(parent, { id, label, low, high, read, write, format }) {
   const row = document.createElement('label');
   row.className = 'slider';
+  row.dataset.name = id;
   row.innerHTML = '<span></span><button class="value" title="Release"></button><input type="range" step="any">';
   const [name, value, input] = row.children;
   name.textContent = label;
@@ -181,12 +182,19 @@ function addSlider(parent, { label, low, high, read, write, format }) {
   return row;
 }
 
+/** "Expression 3" for expr_003. */
+function expressionLabel(name) {
+  const number = /^expr_(\d+)$/.exec(name);
+  return number ? `Expression ${Number(number[1])}` : name;
+}
+
 function addExpressions() {
   const section = byId('expressions');
   const list = section.querySelector('.sliders');
   const rows = avatar.info.sliders.map(({ name, reach }) =>
     addSlider(list, {
-      label: name,
+      id: name,
+      label: expressionLabel(name),
       low: -reach,
       high: reach,
       read: () => avatar.getExpression(name),
@@ -210,6 +218,7 @@ function addPose() {
   const list = byId('pose').querySelector('.sliders');
   for (const [label, joints, axis, low, high] of known) {
     addSlider(list, {
+      id: label,
       label,
       low,
       high,

@@ -12,7 +12,7 @@ export class Rig {
     this.jointRest = arrays.joint_rest.values;
     this.jointBasis = arrays.joint_basis.values;
     const joints = this.parents.length;
-    this.shaped = new Float32Array(this.base.length);
+    this.shaped = new Float64Array(this.base.length);
     this.vertices = new Float64Array(this.base.length);
     this.joints = new Float64Array(3 * joints);
     this.local = new Float64Array(9 * joints);
@@ -68,8 +68,12 @@ export class Rig {
     const { shaped, weights, skin, vertices } = this;
     const joints = this.parents.length;
     for (let v = 0, at = 0; at < shaped.length; v++, at += 3) {
-      const [x, y, z] = [shaped[at], shaped[at + 1], shaped[at + 2]];
-      let [px, py, pz] = [translation[0], translation[1], translation[2]];
+      const x = shaped[at];
+      const y = shaped[at + 1];
+      const z = shaped[at + 2];
+      let px = translation[0];
+      let py = translation[1];
+      let pz = translation[2];
       for (let j = 0; j < joints; j++) {
         const w = weights[v * joints + j];
         if (w === 0) continue;
@@ -85,18 +89,34 @@ export class Rig {
   }
 }
 
-/** target += Σ factor · shape, two shapes at a time, which halves the passes over `target`. */
+/** target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than the sums. */
 function addShapes(target, shapes, factors) {
   const size = target.length;
-  const used = [];
-  for (let k = 0; k < factors.length; k++) if (factors[k] !== 0) used.push(k);
-  for (let n = 0; n < used.length; n += 2) {
-    const [a, from] = [factors[used[n]], used[n] * size];
-    if (n + 1 === used.length) {
-      for (let i = 0; i < size; i++) target[i] += a * shapes[from + i];
-    } else {
-      const [b, also] = [factors[used[n + 1]], used[n + 1] * size];
-      for (let i = 0; i < size; i++) target[i] += a * shapes[from + i] + b * shapes[also + i];
+  const [offset, factor] = [[], []];
+  for (let k = 0; k < factors.length; k++) {
+    if (factors[k] === 0) continue;
+    offset.push(k * size);
+    factor.push(factors[k]);
+  }
+  while (offset.length % 8) {
+    offset.push(0);
+    factor.push(0);
+  }
+  for (let n = 0; n < offset.length; n += 8) {
+    const [a, b, c, d] = offset.slice(n, n + 4);
+    const [e, f, g, h] = offset.slice(n + 4, n + 8);
+    const [p, q, r, s] = factor.slice(n, n + 4);
+    const [t, u, v, w] = factor.slice(n + 4, n + 8);
+    for (let i = 0; i < size; i++) {
+      target[i] +=
+        p * shapes[a + i] +
+        q * shapes[b + i] +
+        r * shapes[c + i] +
+        s * shapes[d + i] +
+        t * shapes[e + i] +
+        u * shapes[f + i] +
+        v * shapes[g + i] +
+        w * shapes[h + i];
     }
   }
 }

@@ -42,7 +42,7 @@ class StgaAvatar extends HTMLElement {
       () => this.#player,
       () => this.#changed('camerachange'),
     );
-    this.#canvas.addEventListener('webglcontextlost', (event) => event.preventDefault());
+    this.#canvas.addEventListener('webglcontextlost', (event) => this.#lose(event));
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
   }
@@ -240,11 +240,26 @@ class StgaAvatar extends HTMLElement {
     if (this.hasAttribute('autoplay')) this.play();
   }
 
-  /** The graphics driver was restarted: upload everything again. */
+  /** The graphics driver was restarted. */
+  #lose(event) {
+    event.preventDefault(); // so that it will be given back
+    this.#message.textContent = 'The graphics driver was restarted. Waiting for it …';
+    this.#message.hidden = false;
+  }
+
+  /** Upload everything again, and go on where it was. */
   #restore() {
     if (!this.#player) return;
-    const { camera, pivot, background, showSelection, data } = this.#player;
-    this.#player = Object.assign(new Player(this.#canvas, data), { camera, pivot, background, showSelection });
+    const { camera, pivot, background, showSelection, data, motion } = this.#player;
+    try {
+      this.#player = new Player(this.#canvas, data);
+    } catch (error) {
+      this.#fail(error);
+      return;
+    }
+    Object.assign(this.#player, { camera, pivot, background, showSelection, motion });
+    this.#player.invalidate();
+    this.#message.hidden = true;
     this.#changed('frame');
   }
 

@@ -9,8 +9,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     "--headless",
@@ -27,18 +25,16 @@ FLAGS = (
 TIMEOUT_S = 120.0
 
 
-def find_browser() -> str:
-    """Path of a Chromium; skips the test where there is none."""
-    found = next((path for path in map(shutil.which, NAMES) if path), None)
-    if found is None:
-        pytest.skip("no Chromium on this machine (apt-get install chromium)")
-    return found
+def find_browser() -> str | None:
+    """Path of a Chromium; None where there is none."""
+    return next((path for path in map(shutil.which, NAMES) if path), None)
 
 
 class Browser:
     """One browser window. `requests` are the addresses that pages asked for, `errors` what they complained of."""
 
-    def __init__(self, profile: Path, size: tuple[int, int] = (900, 700)) -> None:
+    def __init__(self, executable: str, profile: Path, size: tuple[int, int] = (900, 700)) -> None:
+        """`executable`: of a Chromium (`find_browser`); `profile`: folder of its own files; `size` in pixels."""
         out_read, self._out = os.pipe()
         self._in, in_write = os.pipe()
 
@@ -48,12 +44,13 @@ class Browser:
             os.dup2(write, 4)
 
         self._process = subprocess.Popen(
-            [find_browser(), *FLAGS, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "about:blank"],
+            [executable, *FLAGS, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "about:blank"],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(3, 4), preexec_fn=place,
         )  # fmt: skip
         os.close(out_read)
         os.close(in_write)
-        self._buffer, self._number, self._session = b"", 0, None
+        self._buffer, self._number = b"", 0
+        self._session: str | None = None
         self.requests: list[str] = []
         self.errors: list[str] = []
         targets = self.send("Target.getTargets")["targetInfos"]
@@ -63,6 +60,7 @@ class Browser:
             self.send(f"{domain}.enable")
 
     def close(self) -> None:
+        """End the browser's process."""
         self._process.terminate()
         self._process.wait()
         os.close(self._out)

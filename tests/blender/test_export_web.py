@@ -1,0 +1,105 @@
+"""Web pages of a FLAME head exported from Blender: sliders, motion and camera."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from avatar.web.web_data import posed_mesh, read_web_data  # noqa: E402
+from capture.factory import write_flame_capture  # noqa: E402
+
+from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
+from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
+from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
+from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
+from stga_addon.flame.model import JOINTS  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+
+BLENDER_TOLERANCE_M = 1e-5
+"""Float32 skinning in Blender, steps of the file's blend shapes and weights."""
+
+
+@pytest.fixture
+def demo_head(extension, tmp_path: Path):
+    """The demo's FLAME head in the scene with an avatar; the capture it was imported from."""
+    folder, _ = write_flame_capture(tmp_path / "capture", timesteps=(0, 1, 2))
+    model = folder / "demo.npz"
+    write_flame(synthetic_flame(0), model)
+    for file in [*folder.glob("flame_param/*.npz"), folder / "canonical_flame_param.npz"]:
+        with np.load(file) as found:  # its offsets are those of another mesh
+            kept = {name: found[name] for name in found.files if name != "static_offset"}
+        np.savez(file, **kept)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert bpy.ops.stga.import_capture(directory=str(folder), flame=str(model)) == {"FINISHED"}
+    capture = open_capture(folder, model)
+    neutral = capture.neutral.astype(np.float32)
+    splats = lattice_splats(neutral, capture.faces, sh_degree=0, convention="stga")
+    write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
+    assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "anna.npz")) == {"FINISHED"}
+    return capture
+
+
+def exported(folder: Path, **options) -> tuple[dict, dict[str, np.ndarray]]:
+    path = folder / "anna.stga"
+    assert bpy.ops.stga.export_avatar(filepath=str(path), format="web", **options) == {"FINISHED"}
+    return read_web_data(path.read_bytes())
+
+
+def test_timeline_and_camera(demo_head, tmp_path):
+    """Catches the capture's motion where the scene plays another, frames outside its range, and another camera."""
+    scene = bpy.context.scene
+    head = scene.stga.head
+    jaw = rig_of(head).pose.bones["jaw"]
+    for frame, angle in ((0, 0.0), (5, 0.4)):
+        jaw.rotation_quaternion = (np.cos(angle / 2), np.sin(angle / 2), 0, 0)
+        jaw.keyframe_insert("rotation_quaternion", frame=frame)
+        head.data.shape_keys.key_blocks["expr_003"].value = 2 * angle
+        head.data.shape_keys.key_blocks["expr_003"].keyframe_insert("value", frame=frame)
+    scene.frame_start, scene.frame_end, scene.render.fps = 1, 5, 24
+    header, arrays = exported(tmp_path)
+    assert (header["fps"], len(arrays["pose"])) == (24, 5)
+    for index, frame in enumerate(range(1, 6)):
+        scene.frame_set(frame)
+        found = posed_mesh(header, arrays, arrays["coefficients"][index], arrays["pose"][index], index)
+        assert np.abs(found - evaluated_vertices(head)).max() < BLENDER_TOLERANCE_M
+    assert np.ptp(arrays["pose"][:, JOINTS.index("jaw"), 0]) > 0.2
+    camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
+    head_to_camera = np.array(scene.camera.matrix_world.inverted() @ head.matrix_world)
+    np.testing.assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
+
+
+def test_sliders_are_flames(demo_head, tmp_path):
+    """Catches a slider that moves another blend shape, and correctives or joints that do not follow."""
+    header, arrays = exported(tmp_path)
+    flame = demo_head.flame
+    assert sorted(slider["name"] for slider in header["sliders"]) == [
+        f"expr_{component:03d}" for component in range(flame.model.n_expression)
+    ]
+    rng = np.random.default_rng(0)
+    expressions = rng.normal(0, 0.7, flame.model.n_expression)
+    pose = rng.normal(0, 0.2, (len(JOINTS), 3))
+    wanted = FlameFrame(
+        expr=expressions,
+        rotation=pose[0],
+        neck_pose=pose[1],
+        jaw_pose=pose[2],
+        eyes_pose=pose[3:].ravel(),
+        translation=arrays["translation"][0],
+    )
+    expected = flame_forward(flame.model, flame.shape, wanted, flame.static_offset)
+    assert np.abs(posed_mesh(header, arrays, expressions, pose, 0) - expected).max() < BLENDER_TOLERANCE_M
+
+
+def test_motion_only_leaves_flame_out(demo_head, tmp_path):
+    """Catches blend shapes of the model in a page that was asked for without them, or another motion in it."""
+    header, arrays = exported(tmp_path, motion_only=True)
+    assert (header["sliders"], header["joints"]) == ([], ["root"])
+    scene = bpy.context.scene
+    for index, frame in enumerate(range(scene.frame_start, scene.frame_end + 1)):
+        scene.frame_set(frame)
+        found = posed_mesh(header, arrays, arrays["coefficients"][index], arrays["pose"][index], index)
+        assert np.abs(found - evaluated_vertices(scene.stga.head)).max() < BLENDER_TOLERANCE_M

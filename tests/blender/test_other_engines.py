@@ -1,0 +1,96 @@
+"""Images of splats by EEVEE and Cycles, against the CPU rasterizer's."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.avatar.embedding import WORLD  # noqa: E402
+from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
+from stga_addon.capture.camera import Camera  # noqa: E402
+from stga_addon.raster.cpu.compose import compose  # noqa: E402
+from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
+from stga_addon.scene.compat import enable_nodes  # noqa: E402
+from stga_addon.scene.display.colors import linear_to_srgb, srgb_to_linear  # noqa: E402
+from stga_addon.scene.display.display_modes import ELLIPSOIDS, QUADS  # noqa: E402
+from stga_addon.scene.display.hints import use_transparent_bounces  # noqa: E402
+from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
+from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
+from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
+from stga_addon.scene.render.camera import render_camera  # noqa: E402
+
+SIZE_PX = 64
+SAMPLES = 4
+MIN_PSNR_DB = 33.0
+"""Ellipsoids end at three standard deviations, and the rasterizer blurs what is smaller than a pixel."""
+EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
+EEVEE_MARKS = (
+    pytest.mark.slow,  # compiling its shaders takes most of a minute
+    pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"),
+)
+
+
+def overlapping_splats() -> Splats:
+    """Translucent splats of two colors, which tell the order in which they are blended."""
+    rng = np.random.default_rng(0)
+    count = 400
+    direction = rng.normal(size=(count, 3))
+    xyz = 0.1 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    colors = np.where(xyz[:, 2:] > 0, (1.2, -0.3, -0.8), (-0.8, 0.2, 1.2))
+    return Splats(
+        xyz=xyz.astype(np.float32),
+        rotation=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scale=rng.normal(-4.5, 0.3, (count, 3)).astype(np.float32),
+        opacity=rng.normal(1.0, 1.0, count).astype(np.float32),
+        sh=colors[:, None].astype(np.float32),
+        face=np.zeros(count, np.int32),
+        unbound=np.zeros(count, bool),
+    )
+
+
+def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
+    """(3, H, W) sRGB over black as both engines blend: the rasterizer's image of splats with linear colors."""
+    linear = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh.astype(np.float64), 0, 1))
+    image = compose(
+        [PosedSplats(replace(splats, sh=((linear - 0.5) / SH_C0).astype(np.float32)), WORLD, np.eye(4))], view
+    )
+    return np.asarray(linear_to_srgb(np.clip(image.rgb, 0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("engine", "display"),
+    [pytest.param(EEVEE, QUADS, marks=EEVEE_MARKS), ("CYCLES", QUADS), ("CYCLES", ELLIPSOIDS)],
+)
+def test_images_without_noise(engine: str, display: str, tmp_path: Path) -> None:
+    """Catches splats that are blended out of order, and transparency by chance, which a few samples show as noise."""
+    scene = bpy.context.scene
+    splats = overlapping_splats()
+    set_input(show_world_splats(splats, "ball"), DISPLAY, display)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.data.lens, camera.location = 80, (0, 0, 0.6)
+    scene.collection.objects.link(camera)
+    scene.camera, scene.world = camera, bpy.data.worlds.new("black")
+    enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (0, 0, 0, 1)
+    render = scene.render
+    render.engine, render.filepath = engine, str(tmp_path / "image.png")
+    render.resolution_x = render.resolution_y = SIZE_PX
+    render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
+    scene.view_settings.view_transform = "Standard"
+    if engine == "CYCLES":
+        scene.cycles.samples, scene.cycles.use_denoising = SAMPLES, False
+        use_transparent_bounces(scene)
+    else:
+        scene.eevee.taa_render_samples = SAMPLES
+    bpy.ops.render.render(write_still=True)
+    found = np.asarray(Image.open(tmp_path / "image.png"), np.float32).transpose(2, 0, 1) / 255
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    view = render_camera(camera.evaluated_get(depsgraph), depsgraph, SIZE_PX, SIZE_PX, (0, 0, SIZE_PX, SIZE_PX))
+    expected = blended_in_linear_light(splats, view)
+    psnr_db = -10 * np.log10(np.mean((found - expected) ** 2))
+    print(f"{engine}, {display}: {psnr_db:.1f} dB")
+    assert expected.mean() > 0.1, "nothing to compare"
+    assert psnr_db >= MIN_PSNR_DB
