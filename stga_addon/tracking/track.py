@@ -12,6 +12,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..errors import StgaError
 from ..files import read_json, write_json
+from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
@@ -102,7 +103,7 @@ def track(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, found, fit),
+        _warnings(footage, found, fit) + scale_warnings(fit, places, reliable, footage, found),
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
