@@ -86,7 +86,8 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
 def device_of(run: Run, wanted: str = "auto") -> tuple[str, str]:
     """The device to continue a run on, and why: its own, unless `wanted` names another (`choose_device`).
 
-    A run of a GPU that this machine lacks continues on the first one. Raises StgaError where that device does not work or cannot train this run.
+    A run of a GPU that this machine lacks continues on the first one.
+    Raises StgaError where that device does not work or cannot train this run.
     """
     own = run.device if _has(run.device) else run.device.partition(":")[0]
     try:
