@@ -10,6 +10,7 @@ import numpy as np
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.tracking_job import TrackingJob
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
@@ -19,7 +20,7 @@ from .common import capture_of, flame_of, head_of, is_head, needs_head, needs_ri
 from .environment import training_python
 from .track import needs_idle_tracking, start_tracking
 
-XRAY_ALPHA = 0.6
+XRAY_ALPHA = 0.4
 
 
 class ViewFootage(bpy.types.Operator):
@@ -42,11 +43,14 @@ class ViewFootage(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        cameras = capture_cameras(head_of(context))
+        head = head_of(context)
+        cameras = capture_cameras(head)
         if not cameras:
             raise StgaError("The capture has no cameras in this scene; import it again")
         space, scene = context.space_data, context.scene
-        if self.step == 0 and space.region_3d.view_perspective == "CAMERA":
+        leave = self.step == 0 and space.region_3d.view_perspective == "CAMERA"
+        show_kind(head.parent, tags.CAMERA, context.view_layer, not leave)  # a hidden camera shows no images
+        if leave:
             space.region_3d.view_perspective, space.shading.show_xray = "PERSP", False
             return {"FINISHED"}
         row = cameras.index(scene.camera) if scene.camera in cameras else 0

@@ -8,6 +8,7 @@ from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
 from ..operators.environment import has_training_python
 from ..operators.pose import is_posing
+from ..operators.track import tracking_snapshot
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
@@ -27,7 +28,13 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
         training = monitor.training_of(context.scene).snapshot.state.is_alive
-        if not is_head(settings.head) and settings.splats is None:
+        tracking = tracking_snapshot(context.scene)
+        if tracking.state.is_alive:
+            done = f"Tracking, {100 * tracking.status.progress:.0f} %"
+            draw_text(
+                layout, context, f"{done}: the head is imported when it is done. Go on working, save, or quit Blender"
+            )
+        elif not is_head(settings.head) and settings.splats is None:
             draw_text(
                 layout,
                 context,

@@ -103,6 +103,7 @@ def _draw_button(layout: Any, settings: Any) -> None:
 
 
 def _draw_progress(layout: Any, context: Any, now: WorkerSnapshot) -> None:
+    """Draw what the worker is doing, and Cancel."""
     text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
     layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")
     if now.status.detail:

@@ -20,6 +20,7 @@ TRACKING_REQUIREMENTS = (
     "absl-py>=2.3,<3",
     "flatbuffers>=25.9,<26",
     "attrs>=23,<27; python_version < '3.13'",
+    "certifi>=2024; python_version >= '3.13'",
     "protobuf>=4.25.3,<5; python_version < '3.13'",
 )
 """What tracking needs besides: OpenCV for distorted lenses, and what the landmark detector imports."""

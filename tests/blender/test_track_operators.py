@@ -105,6 +105,7 @@ def test_looking_through_the_cameras(tracked, extension):
         space = area.spaces.active
         assert (space.region_3d.view_perspective, space.shading.show_xray) == ("CAMERA", True)
         assert cameras[0].data.show_background_images
+        assert cameras[0].visible_get()  # else Blender draws no background
         assert bpy.ops.stga.view_footage() == {"FINISHED"}
         assert (space.region_3d.view_perspective, space.shading.show_xray) == ("PERSP", False)
 

@@ -1,5 +1,6 @@
 """`stga track` from footage to a capture that opens, with landmark files and with the real detector."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -162,6 +163,25 @@ def test_a_camera_that_does_not_fit_is_named(recorded, capsys):
     assert "camera cam3" in message
     assert "timestep" in message
     assert not (folder / "out/transforms_train.json").exists()
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.05])
+def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
+    """Catches a camera whose focal length is 5 % off, which moves landmarks less than a detector's own errors."""
+    folder, _ = recorded
+    path = folder / "footage/transforms.json"
+    written = read_json(path)
+    for entry in written["frames"]:
+        if entry["camera_id"] == "cam1":
+            entry["fl_x"], entry["fl_y"] = factor * entry["fl_x"], factor * entry["fl_y"]
+    write_json(path, written)
+    assert command(folder) == 0
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: camera")]
+    assert len(warnings) == 1
+    size = "larger" if factor < 1 else "smaller"
+    assert re.search(
+        rf"camera cam1: shows the head [45]\.\d% {size} .* timestep \d; check its focal length", warnings[0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -76,13 +76,15 @@ class RefineStrategy:
 class ExtendStrategy:
     """Trains what new takes need, in all frames; every so often all splats.
 
-    region  (F,) bool: what moves in the new takes, or looks different there
+    region    (F,) bool: what moves in the new takes, or looks different there
+    interval  local iterations between two that train all splats
     """
 
     region: np.ndarray
+    interval: int = EXTEND_GLOBAL_INTERVAL
 
     def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
-        is_global = iteration % (EXTEND_GLOBAL_INTERVAL + 1) == EXTEND_GLOBAL_INTERVAL
+        is_global = iteration % (self.interval + 1) == self.interval
         return None if is_global or not self.region.any() else self.region
 
 

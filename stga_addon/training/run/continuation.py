@@ -218,7 +218,8 @@ def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | 
     for view in capture.views.get("val", ()):
         groups.setdefault(_group(run, view.timestep), []).append(view)
     limit, chosen = max(MIN_GROUP_VIEWS, MAX_EVALUATION_VIEWS // max(1, len(groups))), []
-    for group, members in groups.items():
+    for name, members in groups.items():
+        group = name if len(groups) > 1 else ""
         for view in spread_views(members, limit):
             found = replace(read_evaluation_view(capture, view), group=group)
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)

@@ -21,7 +21,12 @@ MIN_REGION_SHARE = 0.3
 
 
 def continued_order(
-    continuation: Continuation, capture: Capture, region: np.ndarray | None, seed: int, start: int = 0
+    continuation: Continuation,
+    capture: Capture,
+    region: np.ndarray | None,
+    seed: int,
+    start: int = 0,
+    replay_share: float = REPLAY_SHARE,
 ) -> Iterator[View]:
     """Endless order of views from position `start` on: of the continuation's frames and, now and then, of others.
 
@@ -32,7 +37,7 @@ def continued_order(
     others = replayed_views(capture, [view for view in views if not continuation.includes(view.timestep)])
     if region is not None:
         asked, others = (views_of_region(capture, members, region) for members in (asked, others))
-    share = REPLAY_SHARE if others else 0.0
+    share = replay_share if others else 0.0
     replayed = [int(position * share) for position in (start, start + 1)]
     new = view_order(asked, 1, seed, start - replayed[0])
     old = view_order(others, 1, seed + 1, replayed[0]) if others else new

@@ -1,0 +1,246 @@
+"""Compares ways to extend an avatar by a take, and to refine a region of it, at equal training time.
+
+    python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2] [--refine mouth]
+
+The training timesteps are split into two takes, alternating by how much of the face moves. An avatar is trained on the
+first; each arm then continues it for the same time. PSNR of held-out views in dB: whole image and moving region of the
+old and the new take; with --refine, of the region. --clock cpu counts processor time, for a machine that others use:
+set NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first take is not repeated.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from stga_addon.capture.loader import ViewLoader
+from stga_addon.capture.model import View
+from stga_addon.capture.open import open_capture
+from stga_addon.effects.plan import with_effect_plan
+from stga_addon.selection import SelectionOptions, select_capture
+from stga_addon.training.evaluate.metrics import evaluate
+from stga_addon.training.optimize.exposure import exposure_correction
+from stga_addon.training.optimize.precompile import precompile_kernels
+from stga_addon.training.optimize.strategies import ExtendStrategy, GlobalStrategy, Strategy
+from stga_addon.training.optimize.trainer import Trainer
+from stga_addon.training.run.continuation import (
+    DENSITY_INTERVAL,
+    Prepared,
+    continued_evaluation_views,
+    late_rates,
+    prepare_extension,
+    prepare_refinement,
+    starting_state,
+)
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.replay import continued_order
+from stga_addon.training.run.request import Extension, Refinement
+from stga_addon.training.schedule import view_order
+from stga_addon.training.settings import TrainingSettings, make_settings
+
+EVALUATIONS = 4
+CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A way to go on: settings, which views, and which splats. anew: with new splats instead of the avatar's."""
+
+    settings: TrainingSettings
+    views: Iterator[View]
+    strategy: Strategy
+    anew: bool = False
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--flame", type=Path)
+    parser.add_argument("--base", type=int, default=1500, help="iterations on the first take")
+    parser.add_argument("--seconds", type=float, default=60.0, help="time of each arm")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--refine", metavar="REGION", help="compare refinements of this region instead")
+    parser.add_argument("--arms", nargs="+", help="only these (names as in the table)")
+    parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
+    parser.add_argument("--folder", type=Path, default=Path("out/extend"))
+    options = parser.parse_args()
+    precompile_kernels()
+    old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
+    for seed in options.seeds:
+        parent = trained(old, options, seed)
+        print(f"seed {seed}, {parent}", flush=True)
+        if options.refine:
+            wanted = Refinement(parent, options.refine, seconds=options.seconds, seed=seed)
+            prepared, arms = prepare_refinement(wanted, "cpu"), refine_arms
+        else:
+            wanted = Extension(parent, (new,), seconds=options.seconds, seed=seed)
+            prepared, arms = prepare_extension(wanted, "cpu"), extend_arms
+        for name, arm in arms(prepared, seed).items():
+            if not options.arms or name in options.arms:
+                compare(name, prepared, arm, options)
+
+
+def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Path]:
+    """Two captures with every other training timestep each; their files are links into the whole one."""
+    capture = open_capture(root, flame)
+    timesteps = sorted({view.timestep for view in capture.views["train"]})
+    selection = select_capture(capture, SelectionOptions())
+    ranked = sorted(timesteps, key=lambda timestep: selection[timestep].mean())
+    takes = []
+    for name, members in (("old", ranked[::2]), ("new", ranked[1::2])):
+        take = folder / name
+        take.mkdir(parents=True, exist_ok=True)
+        for path in root.resolve().iterdir():
+            target = take / path.name
+            if path.name.startswith("transforms"):
+                write_split(path, target, members)
+            elif not target.exists():
+                target.symlink_to(path)
+        takes.append(take)
+    return takes[0], takes[1]
+
+
+def write_split(source: Path, target: Path, timesteps: list[int]) -> None:
+    """The frames of these timesteps; a file without any of them is left out."""
+    values = json.loads(source.read_text(encoding="utf-8"))
+    frames = [frame for frame in values.get("frames", []) if frame.get("timestep_index") in timesteps]
+    if frames and source.stem in ("transforms_train", "transforms_val"):
+        target.write_text(json.dumps({**values, "frames": frames}), encoding="utf-8")
+
+
+def trained(take: Path, options: argparse.Namespace, seed: int) -> Path:
+    """The run of the first take."""
+    folder = options.folder / options.capture.name / f"base_{options.base}_{seed}"
+    if not (folder / "residuals.npz").exists():
+        capture = open_capture(take, options.flame)
+        settings = make_settings(iterations=options.base, seed=seed, effects={"tracking": "off"})
+        run = with_effect_plan(Run(capture.root, options.flame, "vhap", settings), capture, "cpu")
+        train(capture, folder, run, resume=(folder / "run.json").exists())
+    return folder
+
+
+def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
+    """Name -> arm."""
+    assert prepared.run.continuation is not None
+    assert prepared.selection is not None
+    settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
+    original = replace(settings, rates=type(settings.rates)(), sh_steps=(0.3, 0.5, 0.7)[: settings.sh_degree])
+    views = capture.views["train"]
+    new = [view for view in views if continuation.includes(view.timestep)]
+    old = [view for view in views if not continuation.includes(view.timestep)]
+    union = np.any(list(prepared.selection.values()), axis=0)
+
+    def replay(share: float) -> Iterator[View]:
+        return continued_order(continuation, capture, None, seed, replay_share=share)
+
+    def local(start: float, share: float, interval: int) -> Arm:
+        late = replace(settings, rates=late_rates(original.rates, start))
+        return Arm(late, replay(share), ExtendStrategy(union, interval))
+
+    grown = replace(settings, growth=0.5 * float(union.mean()), density_interval=DENSITY_INTERVAL)
+    return {
+        "extend": Arm(settings, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
+        "extend-0.5-0.5-4": local(0.5, 0.5, 4),
+        "extend-0.5-0.33-2": local(0.5, 0.33, 2),
+        "extend-0.3-0.5-4": local(0.3, 0.5, 4),
+        "extend-0.8-0.33-4": local(0.8, 0.33, 4),
+        "extend-grown": Arm(grown, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
+        "all-in-turn": Arm(settings, alternating(old, new, seed), GlobalStrategy()),
+        "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), GlobalStrategy()),
+        "all-new-only": Arm(settings, view_order(new, 1, seed), GlobalStrategy()),
+        "anew": Arm(original, view_order(views, 1, seed), GlobalStrategy(), anew=True),
+    }
+
+
+def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
+    """Name -> arm."""
+    assert prepared.run.continuation is not None
+    assert prepared.selection is not None
+    settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
+    region = np.any(list(prepared.selection.values()), axis=0)
+    base = Trainer(capture, settings, prepared.selection, starting_state(continuation))
+    count = int(region[base.state.face.numpy()].sum())
+
+    def refined(start: float, growth: float) -> Arm:
+        share = growth * count / len(base)
+        late = replace(
+            settings,
+            rates=late_rates(type(settings.rates)(), start),
+            growth=share,
+            density_interval=DENSITY_INTERVAL if growth else 0,
+        )
+        return Arm(late, continued_order(continuation, capture, region, seed), base.strategy)
+
+    every = view_order(capture.views["train"], 1, seed)
+    return {
+        "refine": Arm(settings, continued_order(continuation, capture, region, seed), base.strategy),
+        "refine-0.3": refined(0.3, 0.0),
+        "refine-0.8": refined(0.8, 0.0),
+        "refine-0.6-grown": refined(0.6, 1.0),
+        "all": Arm(settings, every, GlobalStrategy()),
+    }
+
+
+def alternating(old: list[View], new: list[View], seed: int) -> Iterator[View]:
+    """All views of both takes, in turn."""
+    first, second = view_order(new, 1, seed), view_order(old, 1, seed + 1)
+    while True:
+        yield next(first)
+        yield next(second)
+
+
+def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace) -> None:
+    """Train one arm and print its quality before, during and after."""
+    assert prepared.run.continuation is not None
+    capture, clock = prepared.capture, CLOCKS[options.clock]
+    state = None if arm.anew else starting_state(prepared.run.continuation)
+    trainer = Trainer(capture, arm.settings, prepared.selection or {}, state)
+    trainer.strategy = arm.strategy
+    region = arm_region(prepared)
+    evaluation_views = continued_evaluation_views(prepared.run, capture, region)
+    spent, due, lines = 0.0, 0.0, []
+    background = tuple(round(255 * level) for level in arm.settings.background)
+    with ViewLoader(
+        arm.views, background=background, correct=exposure_correction(arm.settings), mesh=capture.mesh
+    ) as loader:
+        while True:
+            if spent >= due:
+                share = min(1.0, spent / options.seconds) if arm.anew else 1.0
+                quality = evaluate(partial(trainer.render, progress=share), evaluation_views)
+                lines.append({"arm": name, "seconds": spent, "iterations": trainer.iteration, **quality.as_json()})
+                print(describe(lines[-1]), flush=True)
+                if spent >= options.seconds:
+                    break
+                due += options.seconds / EVALUATIONS
+            begin = clock()
+            view, image, mask, mesh = next(loader)
+            trainer.step(view, image, min(1.0, spent / options.seconds), mask, mesh)
+            spent += clock() - begin
+    with (options.folder / f"{options.capture.name}.jsonl").open("a", encoding="utf-8") as out:
+        out.writelines(json.dumps({**line, "seed": arm.settings.seed, "clock": options.clock}) + "\n" for line in lines)
+
+
+def arm_region(prepared: Prepared) -> np.ndarray | None:
+    if prepared.run.settings.strategy != "refine":
+        return None
+    assert prepared.selection is not None
+    return np.any(list(prepared.selection.values()), axis=0)
+
+
+def describe(line: dict[str, float]) -> str:
+    """One row of the table."""
+    names = ("take_1", "moving_take_1", "take_2", "moving_take_2", "region")
+    figures = "  ".join(f"{name} {line[f'psnr_{name}']:.2f}" for name in names if f"psnr_{name}" in line)
+    return f"{line['arm']:20} {line['seconds']:6.1f} s {line['iterations']:5d} it  all {line['psnr']:.2f}  {figures}"
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("STGA_LPIPS", "")
+    main()
