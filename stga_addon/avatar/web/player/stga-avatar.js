@@ -279,6 +279,7 @@ class StgaAvatar extends HTMLElement {
 
   #changed(event) {
     if (this.#player) this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    this.#player?.motion.sample(this.#time); // what listeners ask for is that of the new frame
     this.dispatchEvent(new CustomEvent(event));
   }
 
