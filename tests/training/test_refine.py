@@ -188,7 +188,8 @@ def test_replayed_timesteps_differ_most(toy: Capture) -> None:
     capture = replace(toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep])
     assert distinct_timesteps(capture, list(offsets), 3) == [0, 3, 4]
     views = [replace(toy.views["train"][0], timestep=t, camera_index=c) for t in range(5) for c in range(16)]
-    kept = replayed_views(capture, views)
+    assert len(replayed_views(capture, views)) == 80
+    kept = replayed_views(capture, views, 20)
     assert len(kept) == 20
     assert len({view.camera_index for view in kept}) > 4
 
