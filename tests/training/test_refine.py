@@ -176,7 +176,7 @@ def test_order_of_views_continues_and_replays(toy: Capture) -> None:
     continuation = Continuation(Path(), "", 1, 1)
     whole = list(islice(continued_order(continuation, toy, None, 5), 40))
     assert list(islice(continued_order(continuation, toy, None, 5, start=13), 27)) == whole[13:]
-    assert sum(view.timestep == 1 for view in whole) == 30
+    assert sum(view.timestep == 1 for view in whole) == 27
     assert {view.timestep for view in whole} == {0, 1, 3}
     alone = islice(continued_order(Continuation(Path(), "", 0, 9), toy, None, 5), 20)
     assert {view.timestep for view in alone} == {0, 1, 3}

@@ -34,7 +34,7 @@ from .open_run import OpenedRun, open_run
 from .replay import replayed_views
 from .request import Extension, Refinement, Request
 
-START_SHARE = 0.6
+START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""

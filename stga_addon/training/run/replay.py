@@ -8,7 +8,7 @@ from ...capture.model import Capture, View
 from ..schedule import view_order
 from .folder import Continuation
 
-REPLAY_SHARE = 0.25
+REPLAY_SHARE = 1 / 3
 """Share of the iterations that train views outside the continuation's frames, where there are any."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
