@@ -17,7 +17,6 @@ from ..stga_addon.scene.display.splat_object import input_identifier, splat_modi
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .track_panel import draw_tracking_progress
 from .train_panel import draw_environment_setup, draw_train_button
 from .video import draw_video
 
@@ -31,7 +30,10 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
         training = monitor.training_of(context.scene).snapshot.state.is_alive
         tracking = tracking_snapshot(context.scene)
         if tracking.state.is_alive:
-            draw_tracking_progress(layout, context, tracking)
+            done = f"Tracking, {100 * tracking.status.progress:.0f} %"
+            draw_text(
+                layout, context, f"{done}: the head is imported when it is done. Go on working, save, or quit Blender"
+            )
         elif not is_head(settings.head) and settings.splats is None:
             draw_text(
                 layout,

@@ -30,7 +30,7 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
         if settings.tracking_error:
             draw_text(layout, context, settings.tracking_error, "ERROR")
         if now.state.is_alive:
-            draw_tracking_progress(layout, context, now)
+            _draw_progress(layout, context, now)
             return
         if now.state != WorkerState.NONE:
             _draw_end(layout, context, now)
@@ -102,7 +102,7 @@ def _draw_button(layout: Any, settings: Any) -> None:
     track.start, track.stop, track.step = settings.footage_start, settings.footage_stop, settings.footage_step
 
 
-def draw_tracking_progress(layout: Any, context: Any, now: WorkerSnapshot) -> None:
+def _draw_progress(layout: Any, context: Any, now: WorkerSnapshot) -> None:
     """Draw what the worker is doing, and Cancel."""
     text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
     layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")

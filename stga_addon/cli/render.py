@@ -19,7 +19,16 @@ from ..files import replacing
 from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
 from ..jobs.delegate import OpenHead
-from .arguments import add_avatar, add_principal_point, color, degrees, real_number, usable_path, whole_number
+from .arguments import (
+    add_avatar,
+    add_device,
+    add_principal_point,
+    color,
+    degrees,
+    real_number,
+    usable_path,
+    whole_number,
+)
 from .inputs import avatar_path, check_topology, open_avatar
 
 NAME, HELP = "render", "render an avatar as pictures, video or turntable"
@@ -59,11 +68,14 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         metavar="FILE",
         help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
     )
+    add_device(parser, default="cpu")
     parser.add_argument("--background", type=color, default="white", help="white, black or R,G,B in 0…1")
     add_principal_point(parser)
 
 
 def run(options: Namespace) -> None:
+    from ..training.optimize.device import choose_device
+
     if options.video is not None and options.video.suffix.lower() != ".mp4":
         raise StgaError(f"{options.video}: a video's name ends in .mp4")
     if options.cameras is None and options.video is None and options.turntable is None:
@@ -72,6 +84,7 @@ def run(options: Namespace) -> None:
     views = None
     if options.cameras is not None:
         views = [frame.view for frame in read_transforms(options.cameras, principal_point)]
+    options.device, _ = choose_device(options.device)
     subject = _subject(options) if options.motion is None else _reenacted(options)
     if options.video is not None or options.turntable is not None:
         _film(options, subject, subject.views if views is None else views)
@@ -164,7 +177,9 @@ def _subject(options: Namespace) -> _Subject:
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
         return _Subject(
-            lambda view: render(splats, view.camera, options.background), (), lambda: np.median(splats.xyz, axis=0)
+            lambda view: render(splats, view.camera, options.background, device=options.device),
+            (),
+            lambda: np.median(splats.xyz, axis=0),
         )
     avatar, capture = open_avatar(options.source, options)
     if capture is None:
@@ -176,7 +191,7 @@ def _subject(options: Namespace) -> _Subject:
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
-        lambda view: render_avatar(avatar, mesh(view), view.camera, options.background),
+        lambda view: render_avatar(avatar, mesh(view), view.camera, options.background, options.device),
         capture.timesteps,
         lambda: _middle(capture.mesh(capture.timesteps[0])),
         [view for views in capture.views.values() for view in views],
@@ -202,7 +217,7 @@ def _reenacted(options: Namespace) -> _Subject:
         return sequence_mesh(sequence, timestep)
 
     return _Subject(
-        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background),
+        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background, options.device),
         tuple(sequence.timesteps),
         lambda: _middle(mesh(sequence.timesteps[0])),
     )

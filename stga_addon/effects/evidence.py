@@ -120,19 +120,29 @@ def _scatter(color: np.ndarray) -> np.ndarray:
     return np.asarray(away[~np.isnan(away)])
 
 
-def linear_evidence(color: np.ndarray, features: np.ndarray, group: np.ndarray, max_error: float = np.inf) -> Evidence:
+def linear_evidence(
+    color: np.ndarray,
+    features: np.ndarray,
+    group: np.ndarray,
+    max_error: float = np.inf,
+    range_margin: float | None = None,
+) -> Evidence:
     """Whether each triangle's color follows its features linearly, by cross-validation over groups of views.
 
     color (S, K, 3), NaN where not seen; features (S, K, D); group (S,): views that are held out together; errors of
-    more than `max_error` times the median are clipped to that.
+    more than `max_error` times the median are clipped to that; range_margin: features of views that are held out are
+    clipped to the range, times this, of 0 and those that the model was fitted to.
     """
     before, after = [], []
     fold = np.searchsorted(np.unique(group), group) % min(FOLDS, len(np.unique(group)))
     for number in np.unique(fold):
         held = fold == number
         mean, center, slope = _ridge(color[~held], features[~held])
-        error = color[held] - mean
-        predicted = np.einsum("skd,kdc->skc", features[held] - center, slope)
+        error, given = color[held] - mean, features[held]
+        if range_margin is not None:
+            fitted = range_margin * features[~held]
+            given = np.clip(given, np.minimum(fitted.min(0), 0), np.maximum(fitted.max(0), 0))
+        predicted = np.einsum("skd,kdc->skc", given - center, slope)
         known = ~np.isnan(error)
         before.append(error[known])
         after.append((error - predicted)[known])

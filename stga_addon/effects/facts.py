@@ -5,7 +5,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from ..avatar.strain import STRAIN_GAIN
+from ..avatar.strain import RANGE_MARGIN, STRAIN_GAIN
 from ..capture.model import Capture
 from ..flame.forward import FlameFrame
 from ..flame.sequence import joint_angles
@@ -69,7 +69,15 @@ class CaptureFacts:
 
     @cached_property
     def strain_dependence(self) -> Evidence:
-        return linear_evidence(self.matched_colors, self.samples.strain, self.samples.timestep)
+        """In timesteps that are left out, as in unseen expressions."""
+        samples = self.samples
+        return linear_evidence(self.matched_colors, samples.strain, samples.timestep, range_margin=RANGE_MARGIN)
+
+    @cached_property
+    def strain_dependence_known(self) -> Evidence:
+        """In cameras that are left out, as in other views of known expressions."""
+        samples = self.samples
+        return linear_evidence(self.matched_colors, samples.strain, samples.camera, range_margin=RANGE_MARGIN)
 
     @cached_property
     def pixel_range(self) -> float:

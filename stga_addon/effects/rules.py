@@ -16,7 +16,7 @@ MIN_VIEW_DEPENDENCE_LEVELS = 1.0
 MIN_CAMERA_DIFFERENCE_LEVELS = 1.5
 """Gain in levels of 255 from which differences between cameras are corrected."""
 MIN_STRAIN_DEPENDENCE_LEVELS = 1.0
-"""Gain in levels of 255 from which color depends on the triangles' deformation."""
+"""Gain in levels of 255, in frames and in cameras that are left out, from which colors depend on deformation."""
 MIN_STRETCH = 1e-6
 """Share of a triangle's size; less is rounding."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
@@ -156,7 +156,11 @@ def strain_color(facts: CaptureFacts) -> Verdict:
         return Verdict(False, f"{facts.timesteps} frames are too few to tell how color follows deformation")
     found = facts.strain_dependence
     reason = f"colors depend on deformation by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
-    return Verdict(found.gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
+    if facts.cameras == 1:
+        return Verdict(found.gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
+    known = facts.strain_dependence_known
+    reason += f" in frames that were left out, and by {known.gain:.1f} in cameras that were"
+    return Verdict(min(found.gain, known.gain) >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
 
 
 def teeth(facts: CaptureFacts) -> Verdict | None:

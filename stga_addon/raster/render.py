@@ -33,14 +33,21 @@ def render(
     background: tuple[float, float, float] = WHITE,
     frames: FaceFrames = WORLD,
     antialiased: bool = False,
+    device: str = "cpu",
 ) -> np.ndarray:
     """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
 
     splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH coefficients);
     positions in the frames of their triangles (`avatar.embedding.face_frames`), or in world meters with `WORLD`.
     camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether splats narrower than a
-    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained.
+    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained. device: "cpu", or "gpu:" and the
+    name of one of `gpu.device.adapters`.
     """
+    if device != "cpu":
+        from .gpu.render import render_image
+
+        image = render_image(device.removeprefix("gpu:"), splats, camera, background, frames, antialiased)
+        return np.clip(image, 0, 1)
     parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
     output = render_forward(
         parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
@@ -50,10 +57,14 @@ def render(
 
 
 def render_avatar(
-    avatar: Avatar, mesh: np.ndarray, camera: Camera, background: tuple[float, float, float] = WHITE
+    avatar: Avatar,
+    mesh: np.ndarray,
+    camera: Camera,
+    background: tuple[float, float, float] = WHITE,
+    device: str = "cpu",
 ) -> np.ndarray:
     """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of `render`."""
-    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased)
+    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, device)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -55,16 +55,18 @@ class TimestepLandmarks:
 class HeadFit:
     """A head tracked through a take.
 
-    head        the person: identity in the template
+    head        the person: identity and static offset in the template
     shape       (I,) its coefficients
     parameters  timestep -> (E + 18,) expression, pose of five joints, translation
     to_capture  from the world of the cameras
+    static_offset  (V, 3) meters, part of the template beside the identity; None: none
     """
 
     head: HeadModel
     shape: np.ndarray
     parameters: Mapping[int, np.ndarray]
     to_capture: Similarity
+    static_offset: np.ndarray | None = None
 
 
 def fit_head(
@@ -81,29 +83,29 @@ def fit_head(
     """
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
-    spread = _spread(several or timesteps)
+    spread = spread_over(several or timesteps, IDENTITY_TIMESTEPS)
     neutral = places.on(head.model.v_template, head.model.faces)
     scale = 1.0  # without several cameras, the head's own size decides
-    found = {t: _triangulation(take[t], reliable, neutral, scale) for t in spread}
+    found = {t: triangulated(take[t], reliable, neutral, scale) for t in spread}
     world = _average([_aligned(found[t], neutral, reliable) for t in spread])
     seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
     solved = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE))
     for number in range(ROUNDS):
         report("Fit", number, ROUNDS)
         at = places.on(subject.model.v_template, subject.model.faces)
-        found = {t: _triangulation(seen[t], reliable, at, world.scale) for t in timesteps}
-        observed = {t: _observation(found[t], world, reliable) for t in spread}
-        starts = np.stack([_rigid(at, observed[t]) for t in spread])
+        found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
+        observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
+        starts = np.stack([rigid_start(at, observed[t]) for t in spread])
         identity = solve_identity(head, places, [observed[t] for t in spread], starts)
         world = replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale)
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
-        take_observed = [_observation(found[t], world, reliable) for t in timesteps]
+        take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         solved[:] = 0
-        solved[:, -RIGID_SIZE:] = [_rigid(at, observation) for observation in take_observed]
+        solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
         solved = solve_take(subject, places, take_observed, solved)
         seen = {
-            t: _by_visibility(take[t], subject, places, values, world)
+            t: by_visibility(take[t], subject, places, values, world)
             for t, values in zip(timesteps, solved, strict=True)
         }
     report("Fit", ROUNDS, ROUNDS)
@@ -142,12 +144,13 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     return np.asarray((local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3])
 
 
-def _spread(timesteps: Sequence[int]) -> list[int]:
-    rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), IDENTITY_TIMESTEPS)).round().astype(int)
+def spread_over(timesteps: Sequence[int], count: int) -> list[int]:
+    """Up to `count` of the timesteps, evenly."""
+    rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), count)).round().astype(int)
     return [timesteps[row] for row in rows]
 
 
-def _triangulation(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:
+def triangulated(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:
     """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a single camera's are."""
     found = triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     if len(landmarks.cameras) > 1:
@@ -160,7 +163,7 @@ def _triangulation(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.
     return replace(found, position=origin + depth * directions)
 
 
-def _observation(found: Triangulation, world: Similarity, reliable: np.ndarray) -> Observation:
+def observed_landmarks(found: Triangulation, world: Similarity, reliable: np.ndarray) -> Observation:
     """The triangulation in the capture's world."""
     values, vectors = np.linalg.eigh(world.rotation @ found.information @ world.rotation.T)
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
@@ -182,7 +185,7 @@ def _average(found: Sequence[Similarity]) -> Similarity:
     return Similarity(scale, rotation, -scale * rotation @ np.median(centers, axis=0))
 
 
-def _rigid(neutral: np.ndarray, observed: Observation) -> np.ndarray:
+def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     """(18,) pose that brings a neutral head's landmarks (N, 3) onto the observed ones."""
     from scipy.spatial.transform import Rotation
 
@@ -194,7 +197,7 @@ def _rigid(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     return rigid
 
 
-def _by_visibility(
+def by_visibility(
     landmarks: TimestepLandmarks, subject: HeadModel, places: SurfacePoints, parameters: np.ndarray, world: Similarity
 ) -> TimestepLandmarks:
     """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY where it faces away."""

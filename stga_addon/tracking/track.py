@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from os.path import realpath
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..capture.camera import Camera
 from ..errors import StgaError
 from ..files import read_json, write_json
 from .camera_scale import scale_warnings
@@ -29,6 +31,7 @@ from .landmarks import (
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .surface import Take, fit_surface
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
@@ -92,8 +95,9 @@ def track(
     _check_count(found, places)
     take = {timestep: _at(footage, found, timestep, len(places)) for timestep in seen}
     fit = fit_head(head, places, reliable, take, report)
+    _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
+    fit = fit_surface(head, fit, Take(places, reliable, take, partial(_images, footage)), report)
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
-    _check_cameras(footage, errors)
     parameters = interpolated(fit.parameters, footage.timesteps)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
@@ -196,6 +200,10 @@ def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, c
     )
 
 
+def _images(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:
+    return [(camera.camera, camera.image(timestep)) for camera in footage.cameras if timestep in camera.timesteps]
+
+
 def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:
     """Raise StgaError for a camera whose landmarks do not fit the head that the others see."""
     share = {name: float(np.median([part for _, part in own.values()])) for name, own in errors.items() if own}
@@ -220,6 +228,10 @@ def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadF
         warnings.append(f"no face in any frame of: {', '.join(blind)}")
     if len(footage.cameras) == 1:
         warnings.append("one camera: size and distance of the head, and its depth, are those of the average head")
+    elif fit.static_offset is None:
+        warnings.append(
+            "the images do not show the skin's surface sharply enough: the head is fitted to landmarks alone"
+        )
     if not footage.calibrated:
         warnings.append("the focal length is a guess; give it if it is known")
     return tuple(warnings)

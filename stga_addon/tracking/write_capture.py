@@ -122,4 +122,6 @@ def _flame_arrays(fit: HeadFit, parameters: np.ndarray) -> dict[str, np.ndarray]
     frame = flame_frame(parameters)
     moving = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
     arrays = {name: getattr(frame, name)[None].astype(np.float32) for name in moving}
+    if fit.static_offset is not None:
+        arrays["static_offset"] = fit.static_offset.astype(np.float32)
     return arrays | {"shape": fit.shape.astype(np.float32)}

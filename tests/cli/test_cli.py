@@ -152,6 +152,23 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
 
 
+def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path) -> None:
+    """Catches a device that renders something else, or is not asked."""
+    from raster import gpu_device
+
+    gpu_device.device()  # or skip
+    cameras = root / "transforms_val.json"
+    for device in ("cpu", "gpu"):
+        out = tmp_path / device
+        assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out), "--device", device]) == 0
+    names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
+    assert names
+    for name in names:
+        one, other = (np.asarray(Image.open(tmp_path / device / name)).astype(int) for device in ("cpu", "gpu"))
+        assert np.abs(one - other).max() <= 1
+        assert one.std() > 5
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("black", (0, 0, 0)), ("1,0,0.2", (255, 0, 51)), ("white", (255, 255, 255))]
 )
@@ -491,7 +508,7 @@ def commands_of(parser: argparse.ArgumentParser) -> set[str]:
 def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that the parser lost, and an extension without `development` whose parser needs it."""
     shipped = {"train", "refine", "presets", "render", "eval", "select", "export", "info", "job", "environment"}
-    shipped |= {"extend", "track"}
+    shipped |= {"avatar", "extend", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
     assert commands_of(make_parser()) == shipped

@@ -225,7 +225,8 @@ def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str
     if mesh == "far away":
         shift = np.array([1e4, -1e4, 1e4])
         posed, camera.world_to_camera[:3, 3] = posed + shift, -camera.world_to_camera[:3, :3] @ shift
-    basis = strain_basis(neutral, faces)
+    ends = np.random.default_rng(8).uniform(0, 1.5, (2, len(faces), STRAIN_COMPONENTS)) * [[[-1]], [[1]]]
+    basis = strain_basis(neutral, faces, np.float32(ends.swapaxes(0, 1)) if mesh == "ball" else None)
     expected = frames_in_camera(face_frames(posed, faces, neutral, convention, basis), camera)
     step = Embedding(device, neutral, faces, convention, basis)
     step.upload(posed, camera)

@@ -74,3 +74,32 @@ def test_background_and_values_are_clipped_display_values() -> None:
     assert image.shape == (3, 48, 64)
     assert image.dtype == np.float32
     assert image.max() == 1
+
+
+def test_a_gpu_renders_the_same_picture() -> None:
+    """Catches strain, frames, background or antialiasing that only the CPU draws."""
+    from numerics.meshes import bent_ball
+
+    from raster import gpu_device
+    from stga_addon.avatar.embedding import face_frames
+    from stga_addon.avatar.strain import strain_basis
+
+    posed, neutral, faces = bent_ball()
+    count, random = len(faces), np.random.default_rng(3)
+    splats = Splats(
+        xyz=random.normal(0, 0.1, (count, 3)).astype(np.float32),
+        rotation=random.normal(size=(count, 4)).astype(np.float32),
+        log_scale=random.normal(-1, 0.5, (count, 3)).astype(np.float32),
+        opacity=random.normal(1, 1, count).astype(np.float32),
+        sh=random.normal(0, 0.4, (count, 4, 3)).astype(np.float32),
+        face=np.arange(count, dtype=np.int32),
+        unbound=np.zeros(count, bool),
+        strain_color=random.normal(0, 0.3, (count, 3, 3)).astype(np.float32),
+    )
+    size = float(np.ptp(posed, axis=0).max())
+    camera = look_at((0, 0, 2.5 * size), posed.mean(0), width=90, height=70, focal_length=150)
+    frames = face_frames(posed, faces, neutral, "stga", strain_basis(neutral, faces))
+    expected = render(splats, camera, (0.2, 0.9, 0.4), frames, antialiased=True)
+    got = render(splats, camera, (0.2, 0.9, 0.4), frames, True, device=f"gpu:{gpu_device.device().name}")
+    assert np.abs(got - np.float32([0.2, 0.9, 0.4])[:, None, None]).max() > 0.2
+    np.testing.assert_allclose(got, expected, atol=1e-5)

@@ -62,6 +62,20 @@ def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -
     print(f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
 
 
+def avatar_from_footage(out: Path, seconds: float) -> None:
+    """Make an avatar in OUT/footage from the images and cameras of the demo's capture, without its meshes.
+
+    Needs the landmark detector. Raises StgaError.
+    """
+    from ...cli.main import make_parser
+
+    model = ["--model", str(out / "capture/flame_model.npz"), "--cameras", str(out / "capture/transforms.json")]
+    more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED)]
+    options = make_parser().parse_args(["avatar", str(out / "capture"), *model, *more])
+    options.head = None
+    options.run(options)
+
+
 def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
     bar.total = total
     bar.update(done - bar.n)

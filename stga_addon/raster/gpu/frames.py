@@ -73,8 +73,8 @@ def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _basis_rows(basis: StrainBasis) -> np.ndarray:
-    """(F, 21 + 6·S): a triangle's numbers side by side."""
-    parts = basis.gram, basis.to_tensor, basis.to_plane
+    """(F, 21 + 8·S): a triangle's numbers side by side."""
+    parts = basis.gram, basis.to_tensor, basis.to_plane, basis.range
     return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
 

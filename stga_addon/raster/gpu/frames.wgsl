@@ -22,7 +22,7 @@ struct Pose {
 @group(0) @binding(2) var<storage, read> faces: array<u32>;
 // (F,) area in the neutral mesh, 0 where a triangle counts as a line.
 @group(0) @binding(3) var<storage, read> neutral_area: array<f32>;
-// (F, 21 + 6·S): `gram`, `to_tensor` and `to_plane` of the `StrainBasis`.
+// (F, 21 + 8·S): `gram`, `to_tensor`, `to_plane` and `range` of the `StrainBasis`.
 @group(0) @binding(4) var<storage, read> basis: array<f32>;
 // (V + 1 + 3·F): where the triangles that touch a vertex begin in this array, then those triangles.
 @group(0) @binding(5) var<storage, read> touching: array<u32>;
@@ -34,6 +34,10 @@ const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
 const TO_TENSOR: u32 = 3u; // columns of `basis`
 const TO_PLANE: u32 = 21u;
+
+fn basis_stride() -> u32 {
+  return TO_PLANE + (TENSOR + 2u) * pose.strains;
+}
 
 struct Edges {
   first: vec3f, // from corner 0 to corner 1
@@ -132,7 +136,7 @@ fn write_row(at: u32, row: vec3f) {
 
 // Green's strain of a triangle: the change of its edges' squared lengths and product, as a tensor.
 fn write_tensor(f: u32, e: Edges) {
-  let at = f * (TO_PLANE + TENSOR * pose.strains);
+  let at = f * basis_stride();
   let gram = vec3f(dot(e.first, e.first), dot(e.first, e.second), dot(e.second, e.second));
   let change = gram - vec3f(basis[at], basis[at + 1u], basis[at + 2u]);
   for (var d = 0u; d < TENSOR; d++) {
@@ -165,12 +169,13 @@ fn average_strain(
     }
   }
   for (var k = 0u; k < pose.strains; k++) {
-    let row = f * (TO_PLANE + TENSOR * pose.strains) + TO_PLANE + TENSOR * k;
+    let row = f * basis_stride() + TO_PLANE + TENSOR * k;
     var strain = 0.0;
     for (var d = 0u; d < TENSOR; d++) {
       strain += mean[d] * basis[row + d];
     }
-    strain = clamp(STRAIN_GAIN * strain, -MAX_STRAIN, MAX_STRAIN);
+    let range = f * basis_stride() + TO_PLANE + TENSOR * pose.strains + k;
+    strain = clamp(STRAIN_GAIN * strain, basis[range], basis[range + pose.strains]);
     // Rounding of a rigid triangle is no strain: Adam would take its sign for a gradient and step at full rate.
     frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
   }

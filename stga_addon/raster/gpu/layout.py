@@ -97,7 +97,7 @@ CONSTANTS: dict[str, int | float] = {
     **{name: float(getattr(blend, name)) for name in ("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE")},
     **{name: float(getattr(project, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
     **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
-    **{name: getattr(strain, name) for name in ("STRAIN_GAIN", "MAX_STRAIN")},
+    "STRAIN_GAIN": strain.STRAIN_GAIN,
     "WINDOW_RADIUS_PX": image_loss.WINDOW_RADIUS_PX,
     **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
     "SSIM_C1": float(image_loss.C1),
