@@ -4,8 +4,10 @@
 
 The training timesteps are split into two takes, alternating by how much of the face moves. An avatar is trained on the
 first; each arm then continues it for the same time. PSNR of held-out views in dB: whole image and moving region of the
-old and the new take; with --refine, of the region. --clock cpu counts processor time, for a machine that others use:
-set NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first take is not repeated.
+old and the new take; with --refine, of the region. Arms with numbers: share of the learning rates' schedule at the
+start, share of replayed views, local iterations between two global ones. --clock cpu counts processor time, for a
+machine that others use: set NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first
+take is not repeated.
 """
 
 import argparse
@@ -147,9 +149,8 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     grown = replace(settings, growth=0.5 * float(union.mean()), density_interval=DENSITY_INTERVAL)
     return {
         "extend": Arm(settings, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
+        "extend-0.6-0.25-4": local(0.6, 0.25, 4),
         "extend-0.5-0.5-4": local(0.5, 0.5, 4),
-        "extend-0.5-0.33-2": local(0.5, 0.33, 2),
-        "extend-0.3-0.5-4": local(0.3, 0.5, 4),
         "extend-0.8-0.33-4": local(0.8, 0.33, 4),
         "extend-grown": Arm(grown, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
         "all-in-turn": Arm(settings, alternating(old, new, seed), GlobalStrategy()),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .splats import SH_C0, Splats, no_strain_color, unit_quaternions
-from .strain import StrainBasis, face_strain
+from .strain import StrainBasis, edge_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 MIN_DIVISOR = 1e-30
@@ -75,7 +75,7 @@ def face_frames(
         scale = (edge + np.where(no_edge, side, triangles.twice_area / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
-    deformed = np.zeros((len(faces), 0), np.float32) if strain is None else face_strain(strain, vertices)
+    deformed = np.zeros((len(faces), 0), np.float32) if strain is None else edge_strain(strain, to_p1, to_p2)
     p0, p1, p2 = triangles.corners
     origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
     for column, axis in enumerate(axes):

@@ -87,10 +87,15 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     over the triangles that touch a triangle (each vertex's mean over its triangles, then the mean of its three
     vertices), so that colors do not jump at edges. Columns: along the neutral triangle's first edge, across it, shear.
     """
+    rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
+    p0, p1, p2 = np.take(rows, np.ascontiguousarray(basis.faces.T), axis=1).transpose(1, 0, 2)
+    return edge_strain(basis, p1 - p0, p2 - p0)
+
+
+def edge_strain(basis: StrainBasis, e1: np.ndarray, e2: np.ndarray) -> np.ndarray:
+    """`face_strain` from the posed triangles' edges (3, F), p1 − p0 and p2 − p0, in meters."""
     # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time of short columns.
     corners = np.ascontiguousarray(basis.faces.T)
-    p0, p1, p2 = np.take(np.ascontiguousarray(np.asarray(vertices, np.float64).T), corners, axis=1).transpose(1, 0, 2)
-    e1, e2 = p1 - p0, p2 - p0
     change = np.stack([_row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2)]) - basis.gram.T
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
     at_vertex = [np.bincount(corners.ravel(), np.tile(row, 3), len(basis.touching)) for row in tensor]

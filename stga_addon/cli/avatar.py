@@ -72,11 +72,14 @@ def summary(out: Path, blend: Path | None) -> list[str]:
     from ..tracking.folder import REPORT_FILE, SHEET_FILE
 
     report = read_json(out / CAPTURE / REPORT_FILE)
-    errors = report["reprojection_px"]
-    timesteps = {timestep for own in errors.values() for timestep in own} | set(map(str, report["interpolated"]))
-    lines = [f"warning: {warning}" for warning in report["warnings"]]
-    lines += [f"footage: cameras {len(errors)}, timesteps {len(timesteps)}"]
-    lines += [f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"]
+    try:
+        errors = report["reprojection_px"]
+        timesteps = {timestep for own in errors.values() for timestep in own} | set(map(str, report["interpolated"]))
+        lines = [f"warning: {warning}" for warning in report["warnings"]]
+        lines += [f"footage: cameras {len(errors)}, timesteps {len(timesteps)}"]
+        lines += [f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StgaError(f"{out / CAPTURE / REPORT_FILE}: is not the report of a tracking ({error!s:.100})") from error
     lines += report_run(out / RUN)
     files = [out / CAPTURE / SHEET_FILE, out / CAPTURE / REPORT_FILE, out / RUN / CURVE]
     lines += [f"report: {', '.join(str(path) for path in files if path.exists())}"]
@@ -90,7 +93,7 @@ def _track(options: Namespace, capture: Path) -> None:
 
     path, inputs = options.out / INPUTS, _inputs(options)
     if path.exists():
-        before = read_json(path)
+        before = _read_inputs(options.out)
         changed = next((name for name in inputs if before.get(name) != inputs[name]), None)
         if changed is not None:
             raise StgaError(f"{changed}: {options.out} began with {shorten(before.get(changed))}; give another --out")
@@ -99,6 +102,14 @@ def _track(options: Namespace, capture: Path) -> None:
     if not is_written(capture):
         write_json(path, inputs)
         track_footage(options, capture)
+
+
+def _read_inputs(out: Path) -> dict[str, Any]:
+    """Raises StgaError where inputs.json is missing or malformed."""
+    values = read_json(out / INPUTS)
+    if not isinstance(values, dict) or not isinstance(values.get("model"), str):
+        raise StgaError(f"{out / INPUTS}: has no model; expected what `stga avatar` wrote")
+    return values
 
 
 def _inputs(options: Namespace) -> dict[str, Any]:
@@ -129,7 +140,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     from ..scene.blend_file import empty_file, save_file
     from ..tracking.folder import is_flame
 
-    inputs = read_json(out / INPUTS)
+    inputs = _read_inputs(out)
     flame = Path(inputs["model"]) if is_flame(out / CAPTURE) else None
     capture, avatar = open_capture(out / CAPTURE, flame), read_avatar(out / RUN / "avatar.npz")
     empty_file()

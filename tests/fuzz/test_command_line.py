@@ -383,6 +383,15 @@ def track(rng: random.Random, case: Path) -> list[str]:
     return [*arguments, *option(rng, 0.2, "--offset", "0=1", *TEXTS), *output(rng, case, "new")]
 
 
+def avatar(rng: random.Random, case: Path) -> list[str]:
+    begun = case / "new" / "inputs.json"  # as if a first call had been interrupted
+    if rng.random() < 0.4:
+        begun.parent.mkdir(parents=True, exist_ok=True)
+        begun.write_text(rng.choice(["{}", "[]", '{"model": 1}', '{"model": "x", "footage": null}', "x"]))
+    iterations = ["--iterations", rng.choice(["2", "0", "x"])]
+    return [*track(rng, case), *iterations, *(["--no-blend"] if rng.random() < 0.8 else [])]
+
+
 def environment(rng: random.Random, case: Path) -> list[str]:
     action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
     return ["--folder", some_path(rng, case, "new"), *action]
@@ -396,6 +405,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "eval": (2, evaluate),
     "train": (1, train),
     "track": (1, track),
+    "avatar": (0.5, avatar),
     "job": (0.5, lambda rng, case: [some_path(rng, case, "job", "run")]),
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),

@@ -127,6 +127,26 @@ def test_what_the_user_is_told(device: Device) -> None:
         raise gpu_device.wgpu.GPUValidationError("Parent device is lost")
 
 
+def test_a_lost_device_is_told_to_who_waits(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run that waits for ever for a driver that was reset."""
+    readback = Readback(device, 4)
+    words = device.upload("words", np.zeros(4, np.uint32))
+
+    def lost(*_: object) -> None:
+        raise gpu_device.wgpu.GPUError("Parent device is lost")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(type(device.gpu), "_poll", lost)
+        broken.setattr(device_module, "LOST_CHECK_S", 0.05)
+        with device.record() as work:
+            readback.copy_from(work, (words, 4))
+        readback.start()
+        with pytest.raises(StgaError, match=r"was lost .* resume the run"):
+            readback.result()
+    assert readback._promise._thread_event.wait(10)
+    device.failures.clear()
+
+
 def test_missing_bindings_are_refused(device: Device, numbers: Callable[..., Kernel]) -> None:
     """Catches a dispatch with a buffer too many, which would be ignored."""
     buffer = device.buffer("few", 4)

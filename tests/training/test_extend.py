@@ -125,7 +125,7 @@ def test_old_and_new_views_take_turns(takes: tuple[Path, Path], parent: Path) ->
     prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
-    assert sum(view.timestep < 4 for view in views) == 10
+    assert sum(view.timestep < 4 for view in views) == 13
 
 
 def test_every_so_often_all_splats_are_trained() -> None:

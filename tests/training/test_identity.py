@@ -253,7 +253,7 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
 
 
 def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a run begun on the CPU that moves to a GPU, where refined tracking cannot be resumed."""
+    """Catches a run that moves from the CPU to a GPU, where refined tracking cannot be resumed, or to another GPU."""
     run = read_run(copy)
     assert run.device == "cpu"
     monkeypatch.setattr(
@@ -261,6 +261,10 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
     )
     assert device_of(run)[0] == "cpu"
     assert device_of(run, "gpu")[0] == "gpu:Card"
+    monkeypatch.setattr(open_run_module, "adapter_names", lambda: ["Card", "Second Card"])
+    monkeypatch.setattr(open_run_module, "choose_device", lambda wanted: (wanted, "why"))
+    assert device_of(replace(run, device="gpu:Second Card"))[0] == "gpu:Second Card"
+    assert device_of(replace(run, device="gpu:Card of another machine"))[0] == "gpu"
     with pytest.raises(StgaError, match="refines the tracking, which works on the CPU only"):
         device_of(replace(run, settings=replace(run.settings, tracking=True)), "gpu")
     monkeypatch.undo()

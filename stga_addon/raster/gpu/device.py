@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
 """What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
 POLL_INTERVAL_S = 2e-4
+LOST_CHECK_S = 0.5
 BACKENDS = ("Vulkan", "Metal", "DX12")
 """Without OpenGL, which lacks what the kernels need and complains where there is no display."""
 
@@ -85,6 +86,7 @@ class Device:
 
     dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
     kernel_times                times the kernels while it is set
+    failures                    what the driver raised while results were awaited
     """
 
     def __init__(self, name: str | None = None) -> None:
@@ -97,7 +99,7 @@ class Device:
             raise StgaError(f"--device gpu:{self.name}: no such adapter; there are: {', '.join(known)}")
         self.is_software = is_software(known[self.name])
         with self.errors():
-            self.gpu, self._kernels = _open(self.name)
+            self.gpu, self._kernels, self.failures = _open(self.name)
         self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
         self.dispatches = self.submits = self.waits = 0
         self.kernel_times: KernelTimes | None = None
@@ -154,10 +156,12 @@ class Device:
         if not count:
             return np.empty(shape, dtype)
         self.waits += 1
-        with self.errors():
-            size = -(-count * np.dtype(dtype).itemsize // 4) * 4
-            data = np.frombuffer(self.gpu.queue.read_buffer(buffer, 0, size), dtype)
-        return data[:count].reshape(shape).copy()
+        words = -(-count * np.dtype(dtype).itemsize // 4)
+        readback = Readback(self, words)
+        with self.record() as work:
+            readback.copy_from(work, (buffer, words))
+        readback.start()
+        return np.array(readback.result().view(dtype)[:count].reshape(shape))
 
     def kernel(self, file: str, entry: str = "main", include: tuple[str, ...] = (), **constants: float) -> Kernel:
         """The entry point of `file`.wgsl, compiled once.
@@ -232,7 +236,7 @@ class Device:
             text = str(error).lower()
             if "memory" in text and "out of" in text:
                 raise StgaError(_memory_sentence(self.name)) from error
-            if "lost" in text:
+            if "lost" in text or "could not map" in text:
                 _open.cache_clear()
                 raise StgaError(
                     f"--device gpu: {self.name} was lost (the driver was reset, or took too long); "
@@ -327,12 +331,15 @@ class Readback:
     def start(self) -> None:
         """Ask for the words as soon as the submitted work is done."""
         with self._device.errors():
-            # Without the empty submit that wgpu makes for READ, which `read_buffer` avoids in the same way.
+            # Without the empty submit that wgpu makes for READ; its own `read_buffer` does the same.
             self._promise = self._buffer.map_async("READ_NOSYNC")
 
     def result(self) -> np.ndarray:
         """The words, uint32; waits if the work is not done yet."""
         with self._device.errors():
+            while not self._promise._thread_event.wait(LOST_CHECK_S):  # a lost device never answers
+                if self._device.failures:
+                    raise self._device.failures[0]
             self._promise.sync_wait()
             words = np.frombuffer(self._buffer.read_mapped(), np.uint32).copy()
             self._buffer.unmap()
@@ -355,18 +362,19 @@ logging.getLogger("wgpu").setLevel(logging.CRITICAL)  # what it logs it also rai
 
 
 @cache
-def _open(name: str) -> tuple[Any, dict[tuple, Kernel]]:
-    """An adapter's device, with its limits raised, and room for compiled kernels."""
+def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
+    """An adapter's device, with its limits raised, and room for compiled kernels and for failures."""
     adapter = adapters()[name]
     device = adapter.request_device_sync(
         required_features=sorted({"timestamp-query"} & adapter.features),
         required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
     )
-    _poll_without_blocking(device)
-    return device, {}
+    failures: list[Exception] = []
+    _poll_without_blocking(device, failures)
+    return device, {}, failures
 
 
-def _poll_without_blocking(device: Any) -> None:
+def _poll_without_blocking(device: Any, failures: list[Exception]) -> None:
     """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is there.
 
     By itself it waits inside the driver for all submitted work, and holds a lock that the next submit waits for.
@@ -375,8 +383,12 @@ def _poll_without_blocking(device: Any) -> None:
 
     def poll(_: bool) -> None:
         alive = reference()
-        if alive is not None:
-            alive._poll(False)
+        try:
+            if alive is not None:
+                alive._poll(False)
+        except Exception as error:  # for the thread that waits
+            failures.append(error)
+            sleep(LOST_CHECK_S)
         sleep(POLL_INTERVAL_S)
 
     if hasattr(getattr(device, "_poller", None), "_poll_func"):  # private: a version without it is slower, not wrong

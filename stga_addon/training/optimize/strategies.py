@@ -10,7 +10,7 @@ from ..settings import CONTINUATIONS, TrainingSettings
 from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .state import TrainState
 
-EXTEND_GLOBAL_INTERVAL = 4
+EXTEND_GLOBAL_INTERVAL = 2
 """Local iterations of an extension between two that train all splats."""
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""

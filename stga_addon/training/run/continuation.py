@@ -34,12 +34,14 @@ from .open_run import OpenedRun, open_run
 from .replay import replayed_views
 from .request import Extension, Refinement, Request
 
-START_SHARE = 0.6
+START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
 MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
 """How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
+COMPARED_VIEWS = 36
+"""Views of the old takes, and of the new ones, in which residuals are compared."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
@@ -123,12 +125,10 @@ def select_for_takes(continuation: Continuation, capture: Capture, settings: Tra
     """
     views = capture.views["train"]
     avatar, correct = read_avatar(continuation.parent / "avatar.npz"), exposure_correction(settings)
+    parts = [[view for view in views if continuation.includes(view.timestep) is new] for new in (False, True)]
     old, new = (
-        triangle_residuals(avatar, capture, replayed_views(capture, members), correct, RESIDUAL_SCALE).mean()
-        for members in (
-            [view for view in views if not continuation.includes(view.timestep)],
-            [view for view in views if continuation.includes(view.timestep)],
-        )
+        triangle_residuals(avatar, capture, members, correct, RESIDUAL_SCALE).mean()
+        for members in (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
     )
     known, now = np.nan_to_num(old), np.nan_to_num(new)
     differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)

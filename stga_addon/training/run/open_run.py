@@ -7,7 +7,7 @@ from ...capture.model import Capture
 from ...capture.open import open_capture
 from ...capture.takes import join_takes
 from ...errors import StgaError
-from ..optimize.device import choose_device
+from ..optimize.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, read_run
 from .identity import Identity, difference, identity_of
 
@@ -86,9 +86,10 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
 def device_of(run: Run, wanted: str = "auto") -> tuple[str, str]:
     """The device to continue a run on, and why: its own, unless `wanted` names another (`choose_device`).
 
+    A run of a GPU that this machine lacks continues on the first one.
     Raises StgaError where that device does not work or cannot train this run.
     """
-    own = run.device.partition(":")[0]
+    own = run.device if _has(run.device) else run.device.partition(":")[0]
     try:
         device, reason = choose_device(own if wanted == "auto" else wanted)
     except StgaError as error:
@@ -98,3 +99,11 @@ def device_of(run: Run, wanted: str = "auto") -> tuple[str, str]:
     if run.settings.tracking and device != "cpu":
         raise StgaError(f"--device {wanted}: this run refines the tracking, which works on the CPU only")
     return device, reason
+
+
+def _has(device: str) -> bool:
+    """Whether a device is a GPU by the name of an adapter of this machine."""
+    try:
+        return device.startswith(GPU) and device.removeprefix(GPU) in adapter_names()
+    except StgaError:  # no GPU at all
+        return False

@@ -8,12 +8,12 @@ from ...capture.model import Capture, View
 from ..schedule import view_order
 from .folder import Continuation
 
-REPLAY_SHARE = 0.25
+REPLAY_SHARE = 1 / 3
 """Share of the iterations that train views outside the continuation's frames, where there are any."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
-REPLAY_CAMERAS = 4
-"""Views of each replayed timestep; the cameras take turns from timestep to timestep."""
+REPLAY_VIEWS = 120
+"""Views that are replayed at most; the cameras take turns from timestep to timestep. Fewer are learned by heart."""
 MAX_CANDIDATES = 200
 """Timesteps among which the replayed ones are chosen, evenly spread: long takes are not read as a whole."""
 MIN_REGION_SHARE = 0.3
@@ -47,16 +47,16 @@ def continued_order(
         position += 1
 
 
-def replayed_views(capture: Capture, views: Sequence[View]) -> list[View]:
-    """A small set of the views: a few cameras each of the timesteps whose expressions differ most."""
+def replayed_views(capture: Capture, views: Sequence[View], limit: int = REPLAY_VIEWS) -> list[View]:
+    """At most `limit` of the views: some cameras each of the timesteps whose expressions differ most."""
     by_timestep: dict[int, list[View]] = {}
     for view in views:
         by_timestep.setdefault(view.timestep, []).append(view)
     chosen = distinct_timesteps(capture, sorted(by_timestep))
-    kept = []
+    kept, cameras = [], max(1, limit // max(1, len(chosen)))
     for turn, timestep in enumerate(chosen):
         members = sorted(by_timestep[timestep], key=lambda view: view.camera_index)
-        steps = np.linspace(0, len(members), min(REPLAY_CAMERAS, len(members)), endpoint=False).astype(int)
+        steps = np.linspace(0, len(members), min(cameras, len(members)), endpoint=False).astype(int)
         kept += [members[(step + turn) % len(members)] for step in steps]
     return kept
 

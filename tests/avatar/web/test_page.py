@@ -67,15 +67,22 @@ def test_controls(browser, head, tmp_path):
       document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true }));
       document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 's', bubbles: true }));
       const before = [...avatar.camera.matrix];
+      document.getElementById('panel').hidden = false;
+      avatar.frame = 0;
+      avatar.frame = 2;
+      const shown = Number(rows[1].querySelector('.value').textContent);
+      const played = avatar.info.sliders[1].component;
       avatar.setPose('jaw', [0.3, null, null]);
       avatar.player.draw();
-      return { sliders: rows.length, pinned: document.querySelectorAll('.pinned').length, frame: avatar.frame,
+      return { shown_value: shown, played, sliders: rows.length,
+        pinned: document.querySelectorAll('.pinned').length, frame: avatar.frame,
         value: avatar.player.motion.pinnedCoefficients[avatar.info.sliders[0].component], shown: avatar.showSelection,
         notice: document.getElementById('number').textContent, name, jaw: avatar.player.motion.pinnedPose[6],
         views: document.getElementById('view').options.length, before };
     })()""")
     assert found["sliders"] == head.sequence.model.n_expression + 6
     assert (found["pinned"], found["value"], found["frame"], found["shown"]) == (1, 0.5, 2, True)
+    assert found["shown_value"] == pytest.approx(head.rig.coefficients[2, found["played"]], abs=0.006)
     assert found["jaw"] == pytest.approx(0.3)
     assert found["notice"] == "3 / 3"
     assert np.allclose(found["before"], head.camera.world_to_camera.ravel())

@@ -227,17 +227,18 @@ class StgaAvatar extends HTMLElement {
 
   #show(player) {
     this.#player?.dispose();
+    this.#player = null;
+    this.#canvas.hidden = false;
+    this.#message.hidden = true;
+    this.#resize(); // before there is anything to draw
     this.#player = player;
     this.#playing = false;
     this.#time = 0;
-    this.#canvas.hidden = false;
-    this.#message.hidden = true;
     const background = this.getAttribute('background');
     if (background) this.background = background;
-    this.#resize();
-    player.draw();
     this.dispatchEvent(new CustomEvent('load'));
     if (this.hasAttribute('autoplay')) this.play();
+    this.#changed('frame'); // the first one is drawn once, as whoever waited for "load" wants it
   }
 
   /** The graphics driver was restarted. */
@@ -278,6 +279,7 @@ class StgaAvatar extends HTMLElement {
 
   #changed(event) {
     if (this.#player) this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    this.#player?.motion.sample(this.#time); // what listeners ask for is that of the new frame
     this.dispatchEvent(new CustomEvent(event));
   }
 
@@ -302,8 +304,10 @@ class StgaAvatar extends HTMLElement {
 
   #resize() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    this.#canvas.width = Math.max(1, Math.round(this.clientWidth * ratio));
-    this.#canvas.height = Math.max(1, Math.round(this.clientHeight * ratio));
+    const [width, height] = [this.clientWidth, this.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    if (this.#canvas.width === width && this.#canvas.height === height) return;
+    this.#canvas.width = width;
+    this.#canvas.height = height;
     if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas
   }
 }
