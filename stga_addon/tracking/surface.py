@@ -36,8 +36,6 @@ POINT_SHARE = 0.25
 """Weight of a surface point: patches of neighboring points share most of their pixels."""
 LANDMARK_SHARE = 0.05
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and stay."""
-UNBIASED_LANDMARK_SHARE = 0.25
-"""The same, once what a landmark misses on this person is known."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better evidence."""
 MIN_SEEN_SHARE = 0.5
@@ -48,7 +46,7 @@ MIN_PART_SHARE = 0.33
 """Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
 OFFSET_DENSITY = 1.5e10
 """Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
-SMOOTHING_M = 0.005
+SMOOTHING_M = 0.009
 """Length over which offsets are smoothed."""
 OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
@@ -269,7 +267,7 @@ def _whole_take(
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
         seen = seen_surface(rough, t, points, take.images(t), TAKE_SWEEP, sights)
-        together.append(_joined(own, UNBIASED_LANDMARK_SHARE, seen))
+        together.append(_joined(own, LANDMARK_SHARE, seen))
     solved = solve_take(fit.head, _both(take.places, points), together, start)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
