@@ -231,7 +231,7 @@ EFFECTS = (
         "depth-limits",
         "none: splats are smaller and nearer to their triangles",
         depth_limits,
-        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20},
+        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03},
     ),
     Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
     Effect(

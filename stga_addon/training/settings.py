@@ -67,6 +67,8 @@ class TrainingSettings:
     unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between hull points
     unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points that few cameras
                    see fade, unless nothing else explains what these cameras see
+    adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats that hardly show
+                   in an image, and whose gradients are below it, hardly move
     ema_share      share of the latest step in each splat's exponential moving average, which the avatar is made of;
                    1: no averaging
     stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a splat farther than the
@@ -116,6 +118,7 @@ class TrainingSettings:
     unseen_opacity_weight: float = setting(0.06, 0, MAX_WEIGHT)
     distance_weight: float = setting(0.0, 0, MAX_WEIGHT)
     distance_limit: float = setting(1.0, 0, MAX_WEIGHT)
+    adam_epsilon: float = setting(0.003, maximum=1.0, above=0)
     ema_share: float = setting(0.05, 0, 1)
     stray_reset_interval: int = setting(200, 0, MAX_COUNT)
     stray_limit: float = setting(6.0, 0, MAX_WEIGHT)
@@ -141,6 +144,8 @@ class TrainingSettings:
     effects: Mapping[str, str] | None = None
 
 
+INRIA_ADAM_EPSILON = 1e-9
+"""3D Gaussian Splatting's ε of 1e-15, at an image of 600 by 550."""
 PAPER_SETTINGS = {
     "views_per_visit": 0,
     "global_interval": 20,
@@ -148,6 +153,7 @@ PAPER_SETTINGS = {
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_reset_share": 0.0,
+    "adam_epsilon": INRIA_ADAM_EPSILON,
     "ema_share": 1.0,
     "lattice": 4,
     "hull_points": False,
@@ -165,6 +171,7 @@ GAUSSIAN_AVATARS_SETTINGS = {
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_reset_interval": 0,
+    "adam_epsilon": INRIA_ADAM_EPSILON,
     "ema_share": 1.0,
     "hull_points": False,
     "random_background": False,

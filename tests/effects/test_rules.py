@@ -78,7 +78,7 @@ def test_one_camera(painted):
     """Catches effects that one camera cannot tell anything about."""
     plan, settings = planned(painted(cameras=1, paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density", "depth-limits"}
-    assert (settings.scale_limit, settings.stray_limit) == (1.5, 0.5)
+    assert (settings.scale_limit, settings.stray_limit, settings.adam_epsilon) == (1.5, 0.5, 0.03)
     for name in ("view-color", "exposure"):
         with pytest.raises(StgaError, match=f"--effect {name}=on: is not possible, because a single camera"):
             planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})

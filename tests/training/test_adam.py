@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from stga_addon.capture.camera import Camera
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.state import TrainState, new_state
 
@@ -46,7 +47,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
     rng = np.random.default_rng(seed)
     rows = separate_rows(state)
     groups = [{"params": [row[name] for row in rows], "lr": rate} for name, rate in RATES.items()]
-    theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-5)
     history: list[list[torch.Tensor]] = [[] for _ in rows]
     for _ in range(25):
         listed = np.flatnonzero(rng.random(6) < [1, 0.7, 0.5, 0.3, 0.1, 0.0]).astype(np.int32)
@@ -59,7 +60,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
         theirs.step()
-        adam.step(state, listed, RATES, averaging=0.2)
+        adam.step(state, listed, RATES, averaging=0.2, epsilon=np.float32(1e-5))
         for n in listed:
             history[n].append(rows[n]["xyz"].detach().clone())
     for n, values in enumerate(history):
@@ -176,3 +177,9 @@ def test_many_rows() -> None:
         # Where the random second moment is near zero a step is many rates long, and rounded in proportion.
         error = (getattr(state.parameters, name)[rows].double() - (value - step)).abs()
         assert (error <= 1e-6 + 1e-5 * step.abs() + 1e-6 * value.abs()).all(), name
+
+
+def test_epsilon_is_the_same_share_at_every_image_size() -> None:
+    """Catches splats that hardly show learning at another speed on images of another size."""
+    camera = Camera(200, 100, 300.0, 300.0, 100.0, 50.0, np.eye(4))
+    assert adam.image_epsilon(0.003, camera) == np.float32(0.003 / 60_000)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ...capture.camera import Camera
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import adam_rows
 from .state import TrainState
@@ -11,7 +12,18 @@ from .state import TrainState
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
 
 
-def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float], averaging: float = 1.0) -> None:
+def image_epsilon(share: float, camera: Camera) -> np.float32:
+    """Adam's ε for gradients of a mean over an image's values, as a share of the weight of one of them."""
+    return np.float32(share / (3 * camera.width * camera.height))
+
+
+def step(
+    state: TrainState,
+    rows: np.ndarray,
+    rates: Mapping[str, float],
+    averaging: float = 1.0,
+    epsilon: np.float32 = EPSILON,
+) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
@@ -27,7 +39,7 @@ def step(state: TrainState, rows: np.ndarray, rates: Mapping[str, float], averag
             row[3:] = rates["sh_rest"]
     adam_rows(
         rows, state.steps.numpy(), _tables(state.parameters), _tables(state.gradients), _tables(state.first),
-        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, EPSILON, np.float32(averaging),
+        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, epsilon, np.float32(averaging),
     )  # fmt: skip
 
 

@@ -41,7 +41,8 @@ class CpuBackend:
         if batch.refinement_rate:
             self._refine_tracking(batch, rows)
         self._add_limit_gradients(rows)
-        adam.step(state, rows, batch.rates, self._settings.ema_share)
+        epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
+        adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
             state.screen_gradient.numpy()[rows] += screen[rows]
             state.gradient_count.numpy()[rows] += 1

@@ -21,7 +21,7 @@ from ...raster.gpu.project import mark_focus
 from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions
 from ...raster.gpu.tiles import counts_buffer
 from ..settings import TrainingSettings
-from .adam import BETA1, BETA2, EPSILON
+from .adam import BETA1, BETA2, image_epsilon
 from .backend import Batch
 from .frames import FrameStore
 from .losses import scale_limits
@@ -204,9 +204,10 @@ class GpuBackend:
 
     def _upload_step(self, batch: Batch) -> None:
         settings = self._settings
+        epsilon = float(image_epsilon(settings.adam_epsilon, batch.view.camera))
         weights = settings.scale_weight, settings.distance_weight, settings.unseen_opacity_weight / max(len(self), 1)
         upload_step(
-            self._device, batch.rates, (float(BETA1), float(BETA2)), float(EPSILON), settings.ema_share, weights,
+            self._device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
             statistics=batch.accumulate,
         )  # fmt: skip
 
