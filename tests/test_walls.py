@@ -44,6 +44,7 @@ LIGHT = (
     "avatar.file",
     "avatar.ply",
     "selection",
+    "jobs.training_job",
 )
 
 
