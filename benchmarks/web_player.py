@@ -35,7 +35,7 @@ WINDOW_PX = (900, 700)
 ON_LOAD = """document.addEventListener('load', (event) => {
   if (event.target.localName !== 'stga-avatar') return;
   requestAnimationFrame(() => setTimeout(() => { // in which it is drawn
-    const { gl } = event.target.player;
+    const { gl } = document.querySelector('stga-avatar').player;
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until the picture is there
     window.firstFrame = performance.now(); // since the page was opened
   }));
