@@ -17,14 +17,14 @@ Arrays = dict[str, np.ndarray | FixedPoint]
 
 # Steps of fixed-point values: half of one is the largest error. Together they leave a picture of large
 # random splats 55 dB PSNR at least (tests/avatar/web/test_page.py).
-POSITION_STEP_M = 8e-6
+POSITION_STEP_M = 4e-6
 ROTATION_STEP = 1 / 724
 """The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each."""
-LOG_SCALE_STEP = 0.03
+LOG_SCALE_STEP = 0.015
 OPACITY_STEP = 1 / 255
-COLOR_STEP = 0.008
+COLOR_STEP = 0.004
 """Of the constant SH coefficient, which a color has 0.28 times."""
-SH_STEP = 0.008
+SH_STEP = 0.005
 STRAIN_STEP = 0.008
 """Of colors per unit of strain, and of a triangle's range of strain."""
 VERTEX_STEP_M = 2.0**-24

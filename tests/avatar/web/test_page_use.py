@@ -20,7 +20,7 @@ from .conftest import Head, show
 from .test_page import psnr
 
 ROOT = Path(__file__).resolve().parents[3]
-PLAY_S, PLAY_RATE = 600, 25
+PLAY_S, PLAY_RATE = 600, 10
 """Length of the long play, and pictures drawn in each second of it."""
 BATCH = 250
 """Pictures drawn at once."""
