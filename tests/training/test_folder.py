@@ -56,7 +56,7 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
         ({"capture": None}, r"run\.json: a field is missing or malformed"),
         ({"settings": None}, r"run\.json: settings: fields are missing"),
-        ({"settings": {}}, r"run\.json: settings: fields are missing or unknown \(antialiased, "),
+        ({"settings": {}}, r"run\.json: settings: fields are missing or unknown \(adam_epsilon, antialiased, "),
         ({"device": "toaster"}, r"run\.json: .*device is 'toaster'"),
         ({"principal_point": "corner"}, r"run\.json: .*principal_point is 'corner'"),
         ({"identity": {"faces": 5}}, r"run\.json: a field is missing or malformed"),

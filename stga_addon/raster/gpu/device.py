@@ -9,7 +9,7 @@ import os
 import re
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -48,11 +48,13 @@ def adapters() -> dict[str, Any]:
     A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the slowest.
     """
     os.environ.setdefault("NODEVICE_SELECT", "1")  # Mesa's layer for windows complains where there is no display
-    set_instance_extras(backends=BACKENDS)
+    with suppress(RuntimeError):  # where this process has an instance already, it stays as it is
+        set_instance_extras(backends=BACKENDS)
     found: dict[str, Any] = {}
     every = wgpu.gpu.enumerate_adapters_sync()
     for adapter in sorted(every, key=_preference):
-        if any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items()):
+        too_small = any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items())
+        if too_small or adapter.info["backend_type"] == "OpenGL":
             continue
         name = f"{adapter.info['device']} ({adapter.info['backend_type']})"
         same = sum(known == name or known.startswith(f"{name} #") for known in found)
