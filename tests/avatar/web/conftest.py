@@ -30,7 +30,7 @@ READY = """new Promise((done) => {
 })"""
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # not longer: the page would go on playing, on software graphics, beside other tests
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     executable = find_browser()
     if executable is None:
