@@ -1,4 +1,4 @@
-"""What Blender spends on a head: import, selection groups and playback.
+"""What Blender spends on a head: import and selection groups (playback: redraw.py).
 
     python benchmarks/blender.py [--repeats 3]
 
@@ -16,16 +16,12 @@ from time import perf_counter
 import numpy as np
 import trimesh
 
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.model import Capture
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh
 from stga_addon.scene.blend_file import new_file
-from stga_addon.scene.display.splat_object import show_avatar
 from stga_addon.scene.rig.head import import_head
-from stga_addon.scene.timeline import go_to_frame
 from stga_addon.scene.vertex_groups import read_selection, write_selection
 
 
@@ -48,20 +44,6 @@ def median_s(work: Callable[[], object], repeats: int) -> float:
         work()
         times.append(perf_counter() - begin)
     return statistics.median(times)
-
-
-def playback_ms(folder: Path, order: int) -> tuple[int, float]:
-    """Splats on a ball of 20,480 triangles that changes shape, and median milliseconds to go to a frame."""
-    new_file()
-    capture = moving_ball(folder, 20, 5)
-    splats = lattice_splats(capture.neutral, capture.faces, order, sh_degree=0)
-    show_avatar(Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces), import_head(capture))
-    times = []
-    for frame in range(20):
-        begin = perf_counter()
-        go_to_frame(frame)
-        times.append(1e3 * (perf_counter() - begin))
-    return len(splats), statistics.median(times[2:])
 
 
 def main() -> None:
@@ -93,9 +75,6 @@ def main() -> None:
         read_selection(head)
         print(f"1,000 groups, 10 % of {len(still.faces)} triangles: write {written - begin:.2f} s, "
               f"read {perf_counter() - written:.2f} s")  # fmt: skip
-        for order in (1, 3):
-            count, ms = playback_ms(folder, order)
-            print(f"playback, {count} splats on 20,480 triangles: {ms:.1f} ms a frame")
 
 
 if __name__ == "__main__":
