@@ -15,7 +15,16 @@ from ..stga_addon.training.run.folder import next_folder
 from ..stga_addon.training.run.request import Extension, Refinement, Request
 from . import ids
 from .common import file_path, head_of, reporting, scene_settings
-from .train import device_property, may_train, python_of, python_property, start_job, wait_property
+from .train import (
+    adapter_property,
+    device_of,
+    device_property,
+    may_train,
+    python_of,
+    python_property,
+    start_job,
+    wait_property,
+)
 
 
 class Refine(bpy.types.Operator):
@@ -63,6 +72,7 @@ class Refine(bpy.types.Operator):
         subtype="FACTOR",
     )
     device: device_property()
+    adapter: adapter_property()
     python: python_property()
     wait: wait_property()
 
@@ -102,6 +112,7 @@ class Extend(bpy.types.Operator):
         name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
     )
     device: device_property()
+    adapter: adapter_property()
     python: python_property()
     wait: wait_property()
 
@@ -149,7 +160,7 @@ def _start(operator: Any, context: Any, run: Path, wanted: Request, weights: "np
         Path(model) if model else None,
         head.get(tags.PRINCIPAL_POINT, "vhap"),
         None,
-        operator.device,
+        device_of(operator),
         wanted,
     )
     python = python_of(operator, context)

@@ -172,8 +172,12 @@ class Train(bpy.types.Operator):
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
         flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
-        device = f"gpu:{self.adapter}" if self.device == "gpu" and self.adapter else self.device
-        return TrainingJob(capture, flame, principal_point, settings, device)
+        return TrainingJob(capture, flame, principal_point, settings, device_of(self))
+
+
+def device_of(operator: Any) -> str:
+    """What `choose_device` takes, of an operator with `device_property` and `adapter_property`."""
+    return f"gpu:{operator.adapter}" if operator.device == "gpu" and operator.adapter else str(operator.device)
 
 
 def python_of(operator: Any, context: Any) -> str | None:

@@ -50,6 +50,7 @@ def _draw_refine(layout: Any, settings: Any) -> None:
         ids.REFINE, text="Refine Selected Faces" if editing else "Refine Vertex Group", icon="SCULPTMODE_HLT"
     )
     refine.directory, refine.device, refine.group = settings.run_folder, settings.device, settings.refine_group
+    refine.adapter = settings.adapter
     refine.seconds, refine.growth = settings.refine_seconds, settings.refine_growth
     if not settings.refine_all_frames:
         refine.first, refine.last = settings.refine_first, max(settings.refine_first, settings.refine_last)
@@ -61,4 +62,4 @@ def _draw_extend(layout: Any, settings: Any) -> None:
     column.prop(settings, "extend_seconds", text="Seconds")
     extend = column.operator(ids.EXTEND, icon="ADD")
     extend.directory, extend.device, extend.take = settings.run_folder, settings.device, settings.take
-    extend.seconds = settings.extend_seconds
+    extend.adapter, extend.seconds = settings.adapter, settings.extend_seconds

@@ -48,11 +48,11 @@ def run(tmp_path):
 
 def test_painted_group_becomes_the_region(head, jobs, run):
     """Catches a region of other triangles than those painted, and settings of the panel that are lost."""
-    assert bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, seconds=7, growth=0.5) == {
-        "FINISHED"
-    }
+    chosen = {"device": "gpu", "adapter": "Card (Vulkan)", "seconds": 7, "growth": 0.5}
+    assert bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, **chosen) == {"FINISHED"}
     new = run.with_name("run_2")
     wanted = jobs.read_job(new).continues
+    assert jobs.read_job(new).device == "gpu:Card (Vulkan)"
     assert (wanted.parent, wanted.frames, wanted.seconds, wanted.growth) == (run, (1, 3), 7, 0.5)
     weights = read_npz(Path(wanted.region))["weights"]
     assert weights[:40] == pytest.approx(0.8)

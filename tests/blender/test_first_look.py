@@ -87,7 +87,7 @@ def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
 
 
 def test_preview_for_other_engines(extension, tmp_path):
-    """Catches quads that face no camera, black holes in Cycles, and displays without a word on their limits."""
+    """Catches quads that face no camera, black holes in Cycles, and displays that do not state their limits."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))

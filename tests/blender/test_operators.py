@@ -132,6 +132,8 @@ def test_every_operator_explains_itself(extension):
 
 SET_BY_PANEL = {
     "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "adapter", "effects"},
+    "refine": {"directory", "group", "seconds", "growth", "device", "adapter"},
+    "extend": {"directory", "take", "seconds", "device", "adapter"},
     "apply_motion": {"filter_glob"},
     "show_avatar": {"hide_head", "filter_glob"},
     "export_avatar": {"format", "filter_glob", "check_existing", "motion_only"},

@@ -2,7 +2,6 @@
 
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from stga_addon.tracking.head_model import read_head_model, shape_arrays, write_
 MESH = synthetic_flame(0)
 SHAPES = MESH.shapedirs[:, :, [0, 1, -1, -2, -3]]
 NAMES = ("identity 0", "identity 1", "jawOpen", "smile", "brow")
-ICT = Path("/work/shared/data/ict_facekit_light.npz")
 
 
 def glb(document, data):
@@ -106,11 +104,9 @@ def test_a_glb_agrees_with_trimesh(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_real_head_with_57_expressions(tmp_path):
+def test_a_real_head_with_57_expressions(shared_data, tmp_path):
     """Catches limits that a model of real size exceeds: ICT-FaceKit's, through Blender's exporter and back."""
-    if not ICT.exists():
-        pytest.skip("ict_facekit_light.npz is missing")
-    ict = np.load(ICT)
+    ict = np.load(shared_data / "ict_facekit_light.npz")
     mean, shapes = 0.01 * ict["neutral"], 0.01 * np.moveaxis(ict["expr"], 0, 2)
     blender_head(mean, ict["tris"], ict["expr_names"].tolist(), shapes)
     export(tmp_path / "head.glb")
