@@ -117,7 +117,7 @@ def frame_span(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,18})[:-](\d{1,18})", text, re.ASCII)
     first, last = (int(part) for part in match.groups()) if match else (1, 0)
     if first > last:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 10:20")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 10:20 or 10-20")
     return first, last
 
 

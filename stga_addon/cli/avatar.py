@@ -100,8 +100,16 @@ def _track(options: Namespace, capture: Path) -> None:
     elif is_written(capture) or (options.out / RUN).exists():
         raise StgaError(f"{options.out}: holds something else ({INPUTS} is missing); give another --out")
     if not is_written(capture):
+        new = not options.out.exists()
         write_json(path, inputs)
-        track_footage(options, capture)
+        try:
+            track_footage(options, capture)
+        except StgaError:
+            if not capture.exists():  # nothing was tracked yet, so that the inputs may be mended
+                path.unlink()
+                if new:
+                    options.out.rmdir()
+            raise
 
 
 def _read_inputs(out: Path) -> dict[str, Any]:

@@ -100,6 +100,17 @@ def test_other_inputs_are_refused(made, take, capsys, more, expected):
     assert re.search(expected, capsys.readouterr().err)
 
 
+def test_a_mistyped_footage_leaves_nothing_behind(take, tmp_path, capsys):
+    """Catches a folder that remembers the mistake, and refuses the mended command as one of other inputs."""
+    mistyped = ["avatar", str(tmp_path / "nowhere"), "--model", str(take / "head.npz"), "--out", str(tmp_path / "out")]
+    assert main(mistyped) == 2
+    assert "nowhere: is neither a folder nor a video" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    assert main(mistyped) == 2
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 def test_a_folder_of_something_else_is_left_alone(take, tmp_path, capsys):
     """Catches a run or capture of the user's that is taken for a part of this avatar."""
     (tmp_path / "out/run").mkdir(parents=True)
