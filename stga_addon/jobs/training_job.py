@@ -25,7 +25,7 @@ from ..files import read_json, write_json, write_npz
 from ..training.optimize.device import choose_device
 from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
-from ..training.run.request import Request, request_from_json, request_to_json
+from ..training.run.request import Extension, Request, request_from_json, request_to_json
 from ..training.settings import TrainingSettings, from_json, is_device, to_json
 from ..worker.launch import prepare_status_folder
 from ..worker.status import StatusWriter, remove_status_folder, status_writer
@@ -179,7 +179,7 @@ def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) ->
     if job.continues is not None:
         device, reason = device_of(read_run(job.continues.parent), job.device)
         report(reason)
-        report("Comparing the avatar with the images")
+        report("Comparing the avatar with the images" if isinstance(job.continues, Extension) else "Opening the run")
         return prepare(job.continues, device, job.flame)
     assert job.settings is not None
     capture = open_capture(job.capture, job.flame, job.principal_point)

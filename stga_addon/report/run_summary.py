@@ -94,7 +94,7 @@ def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
     first, last = metrics[0], metrics[-1]
     lines = [f"splats: {first['splats']} before, {last['splats']} after"]
     for name in first:
-        if name == "psnr" or name.startswith("psnr_"):
+        if name == "psnr" or (name.startswith("psnr_") and name != "psnr_unmatched"):  # which is no region
             label = name.removeprefix("psnr").strip("_").replace("_", " ") or "held-out views"
             before, after = first[name], last.get(name, math.nan)
             lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")

@@ -28,8 +28,9 @@ def main() -> None:
 
 
 def _adapters() -> tuple[list[str], str]:
-    """The GPUs that can train, as `--device gpu:NAME` names them, and what trains by itself: the first, or the CPU.
+    """The GPUs that can train, as `--device gpu:NAME` names them, and the device to report: the first GPU, or the CPU.
 
+    Whether that GPU is right and faster than the CPU is tried before each training (`choose_device`), not here.
     The module that knows is imported by name, like the packages: it fails to load where one of them is missing.
     """
     cpu = f"CPU with {os.cpu_count()} threads"

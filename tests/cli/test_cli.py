@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -152,17 +153,21 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
 
 
-def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path) -> None:
+def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a device that renders something else, or is not asked."""
     from raster import gpu_device
 
     gpu_device.device()  # or skip
+    from stga_addon.raster.gpu import render as gpu_render
+
+    rendered = Mock(side_effect=gpu_render.render_image)
+    monkeypatch.setattr(gpu_render, "render_image", rendered)
     cameras = root / "transforms_val.json"
     for device in ("cpu", "gpu"):
         out = tmp_path / device
         assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out), "--device", device]) == 0
     names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
-    assert names
+    assert rendered.call_count == len(names) > 0
     for name in names:
         one, other = (np.asarray(Image.open(tmp_path / device / name)).astype(int) for device in ("cpu", "gpu"))
         assert np.abs(one - other).max() <= 1

@@ -7,7 +7,7 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.report import run_summary
-from stga_addon.report.run_summary import CURVE, CurveUpdater, report_run, summarize_run
+from stga_addon.report.run_summary import CURVE, CurveUpdater, report_run, summarize_continuation, summarize_run
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.settings import make_settings
@@ -38,6 +38,17 @@ def test_summary_of_a_run() -> None:
     assert lines[-1] == "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB"
     assert len(lines) == 2
     assert summarize_run([], None) == []
+
+
+def test_summary_of_a_continuation() -> None:
+    """Catches before and after exchanged, and the PSNR without matched exposure reported as a region."""
+    before, after = metrics([30.0, 32.0], psnr_take_2=20.0, psnr_unmatched=15.0, splats=9)
+    lines = summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
+    assert lines == [
+        "splats: 9 before, 12 after",
+        "held-out views: 30.00 dB before, 32.00 dB after (+2.00)",
+        "take 2: 20.00 dB before, 19.50 dB after (-0.50)",
+    ]
 
 
 def test_targets_and_plateaus() -> None:

@@ -13,7 +13,7 @@ REPLAY_SHARE = 1 / 3
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
-"""Views that are replayed at most; the cameras take turns from timestep to timestep. Fewer are learned by heart."""
+"""Views that are replayed at most; the cameras take turns from timestep to timestep. Fewer would be overfitted."""
 MAX_CANDIDATES = 200
 """Timesteps among which the replayed ones are chosen, evenly spread: long takes are not read as a whole."""
 MIN_REGION_SHARE = 0.3
