@@ -1,4 +1,4 @@
-"""Meshes that are hard to compute with: triangles that are hardly any, and a bent ball."""
+"""Meshes for numerical tests: degenerate triangles, and a bent ball."""
 
 import numpy as np
 import trimesh
@@ -25,7 +25,7 @@ DEGENERATE = {
     "first and last corner one": _line([0.2, 0.9, 0.4], [0, 1, 0]),
     "needle, 1e6 : 1": _line([0.3, -0.5, 0.81], [0, 0.5, 1]) + np.eye(3)[1, :, None] * [1e-8, 0, 0],
 }
-"""Triangles that are hardly any: by name, as corners (3, 3) at the scale of a head's, in meters."""
+"""Degenerate triangles by name, as corners (3, 3) at the scale of a head's, in meters."""
 
 
 def mesh_of(triangles: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from stga_addon.raster.gpu.rasterize import Rasterizer, Rendering, ViewOptions, 
 
 
 class Raw:
-    """A scene through the array door: renderings, and gradients whose untouched rows keep `fill`."""
+    """Renders a scene of numpy arrays by `Rasterizer`, forward and backward; rows not written keep `fill`."""
 
     def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None, antialiased: bool = False) -> None:
         gpu_device.device()  # or skip

@@ -184,7 +184,7 @@ def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
 
 
 def raw_gradients(scene: Scene, fill: float = 0.0, buffers: BufferPool | None = None, **options):
-    """Forward and backward through the array door: rendering, gradients whose untouched rows keep `fill`, and rows.
+    """Forward and backward of numpy arrays: rendering, gradients whose untouched rows keep `fill`, and rows.
 
     background, focus and reach are `render_forward`'s. The cotangents are of color and alpha.
     """

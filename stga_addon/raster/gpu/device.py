@@ -252,7 +252,6 @@ class Recording:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.dispatches = 0
         self._encoder = device.gpu.create_command_encoder()
         self._pass: Any = None
 
@@ -268,13 +267,12 @@ class Recording:
             compute.dispatch_workgroups_indirect(*groups)
         else:
             compute.dispatch_workgroups(*groups)
-        self.dispatches += 1
         self.device.dispatches += 1
 
-    def copy(self, source: Any, target: Any, words: int, at: int = 0, to: int = 0) -> None:
-        """Copy words of a buffer to another, from word `at` to word `to`."""
+    def copy(self, source: Any, target: Any, words: int, to: int = 0) -> None:
+        """Copy the first words of a buffer to another, from its word `to` on."""
         self._end_pass()
-        self._encoder.copy_buffer_to_buffer(source, 4 * at, target, 4 * to, 4 * words)
+        self._encoder.copy_buffer_to_buffer(source, 0, target, 4 * to, 4 * words)
 
     def clear(self, buffer: Any, words: int | None = None) -> None:
         """Fill the beginning of a buffer, or all of it, with zeros."""

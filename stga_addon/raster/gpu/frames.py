@@ -8,6 +8,7 @@ from ...avatar import embedding
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis
 from ...capture.camera import Camera
 from .device import Device, Recording
+from .layout import FRAME_STRAIN
 
 POSE = np.dtype(
     [("rows", np.float32, (3, 4))] + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "unused")]
@@ -57,7 +58,7 @@ class Embedding:
             **self._buffers,
             "pose": device.buffer("pose", POSE.itemsize // 4, "uniform"),
             "vertices": device.buffer("vertices", 0),
-            "frames": device.buffer("frames", self._count * (12 + self.strains)),
+            "frames": device.buffer("frames", self._count * (FRAME_STRAIN + self.strains)),
         }
         work.dispatch(device.kernel("frames", "compose"), groups, **buffers)
         if self.strains:

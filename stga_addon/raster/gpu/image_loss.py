@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cpu.layout import TILE
+from ..cpu.rasterize import tile_grid
 from .device import Device, Recording
 
 LOSS = np.dtype(
@@ -40,7 +40,7 @@ def image_loss(
     tile is touched.
     """
     device = work.device
-    columns, rows = -(-width // TILE), -(-height // TILE)
+    columns, rows = tile_grid(width, height)
     buffers = {
         "view": view,
         "loss": device.buffer("loss", LOSS.itemsize // 4, "uniform"),

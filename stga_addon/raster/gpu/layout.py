@@ -17,7 +17,7 @@ N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs
 | rendered       | 1 u32            | 1 for those and the tiles around them, as far as their gradient depends on       |
 | tile_range     | 2 u32            | a tile's first pair and one past its last                                        |
 | pairs          | 2 u32            | splat, with WANTED, and row in pair_gradients; by tile, near to far              |
-| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile   |
+| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile           |
 """
 
 import math
@@ -104,12 +104,6 @@ CONSTANTS: dict[str, int | float] = {
     "SSIM_C2": float(image_loss.C2),
     "MAX_GRADIENT": float(optimizer.MAX_GRADIENT),
 }
-
-
-def splat_stride(splats: Parameters) -> int:
-    """Words per row of `splats`."""
-    strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
-    return int(SH + 3 * splats.sh.shape[1] + 3 * strain_colors)
 
 
 def splat_rows(splats: Parameters) -> np.ndarray:

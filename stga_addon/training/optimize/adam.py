@@ -28,6 +28,7 @@ def step(
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
     averaging  weight of the stepped row in its running average; with 1, the average is the row
+    epsilon    added to the root of the second moment; `image_epsilon` in training
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """

@@ -1,7 +1,7 @@
 """Training backend on a GPU, by WebGPU kernels."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from ...raster.gpu.image_loss import image_loss, upload_target
 from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
 from ...raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from ...raster.gpu.project import mark_focus
-from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions
+from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions, upload_splats
 from ...raster.gpu.tiles import counts_buffer
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, image_epsilon
@@ -95,8 +95,8 @@ class GpuBackend:
     @state.setter
     def state(self, state: TrainState) -> None:
         self._finish_all()
-        upload, values = self._device.upload, state.parameters
-        rows = {name: upload(name, _rows(getattr(state, name))) for name in TABLES}
+        upload = self._device.upload
+        rows = {name: upload(name, splat_rows(_arrays(getattr(state, name)))) for name in TABLES}
         self._gradients = rows.pop("gradients")
         history = np.stack(
             [
@@ -111,10 +111,7 @@ class GpuBackend:
             **rows, history=upload("history", history), traits=upload("traits", traits),
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
-        self._splats = SplatTable(
-            upload("splats", _rows(values)), upload("face", state.face.numpy()), len(state), values.sh.shape[1],
-            values.strain_color.shape[1],
-        )  # fmt: skip
+        self._splats = upload_splats(self._device, _arrays(state.parameters), state.face.numpy())
 
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last if it was a global one."""
@@ -131,7 +128,7 @@ class GpuBackend:
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
         """The view with the splats' running average after all queued iterations: a new (3, H, W) float32 image."""
         self._finish_all()
-        average = SplatTable(self._tables.average, *list(vars(self._splats).values())[1:])
+        average = replace(self._splats, rows=self._tables.average)
         while True:
             with self._device.record() as work:
                 rendering = self._render(work, average, view, background, sh_degree)
@@ -212,5 +209,5 @@ class GpuBackend:
         )  # fmt: skip
 
 
-def _rows(tensors: Parameters) -> np.ndarray:
-    return splat_rows(Parameters(*(tensor.numpy() for tensor in tensors)))
+def _arrays(tensors: Parameters) -> Parameters:
+    return Parameters(*(tensor.numpy() for tensor in tensors))
