@@ -94,9 +94,9 @@ def corrected(
         change[row] = values - solved[row]
     near = np.flatnonzero(distance <= span + 2)
     trust = seen[near] * (distance[near] / (span + 1)) ** 2
+    # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter for translation.
     blocks = [
-        share * _stiffness(model, points, solved[row]) + np.diag(_precision(size))
-        for row, share in zip(near, trust, strict=True)
+        share * _stiffness(model, points, solved[row]) + np.eye(size) for row, share in zip(near, trust, strict=True)
     ]
     matrix = block_diag(blocks)
     second = _second_differences(near)
@@ -131,11 +131,6 @@ def _stiffness(model: FlameModel, points: SurfacePoints, parameters: np.ndarray)
 def _acceleration_precision(size: int) -> np.ndarray:
     sigma = (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M)
     return np.repeat(sigma, (size - RIGID_SIZE, POSE_SIZE, TRANSLATION_SIZE)) ** -2.0
-
-
-def _precision(size: int) -> np.ndarray:
-    """A change of a coefficient has a standard deviation of 1, joints 1 radian, translation 1 meter."""
-    return np.ones(size)
 
 
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:

@@ -78,8 +78,8 @@ class Take:
 
 
 def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lambda stage, done, total: None) -> HeadFit:
-    """The fit moved onto the surface that several cameras see; unchanged where no moment has
-    several, or where their images do not show enough of it.
+    """The fit moved onto the surface that several cameras see; unchanged where no timestep has landmarks of several
+    cameras, or where the images do not show enough of it.
 
     Rounds of finding the surface along the normals, and of solving scale, identity, expression and pose from it, then
     the person's smooth offsets; at last expression and pose of every timestep. Landmarks stay in at a small weight.
