@@ -58,11 +58,11 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
             twice * np.stack([_product(along, along), _product(across, across), _product(along, across)], 1)
         ),
         touching=np.maximum(np.bincount(faces.ravel(), minlength=len(neutral)), 1),
-        range=_by_component(full_range(len(faces)) if strain_range is None else strain_range),
+        range=_by_component(_full_range(len(faces)) if strain_range is None else strain_range),
     )
 
 
-def full_range(count: int) -> np.ndarray:
+def _full_range(count: int) -> np.ndarray:
     """(count, 2, 3) float32: −MAX_STRAIN and MAX_STRAIN, for every triangle and component."""
     ends = np.array([-MAX_STRAIN, MAX_STRAIN], np.float32)[:, None]
     return np.broadcast_to(ends, (count, 2, STRAIN_COMPONENTS)).copy()

@@ -4,12 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..flame.forward import axis_angle_matrices
 from .fit import HeadFit
 from .footage.model import Footage
 from .landmarks import CameraLandmarks
 from .mesh_image import vertex_normals
-from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
 
 MAX_SCALE_DIFFERENCE = 0.04
 """Of a camera from the median of all. Landmarks alone differ by up to 0.036 from the side; 5 % of focal length show."""
@@ -54,7 +53,7 @@ def camera_scales(
     for timestep in timesteps:
         values = fit.parameters[timestep]
         at = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
-        facing = normals @ axis_angle_matrices(values[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0].T
+        facing = normals @ head_rotation(values).T
         for name, own in found.items():
             rows = np.flatnonzero(own.timesteps == timestep)
             if not len(rows):

@@ -11,9 +11,8 @@ from ..capture.flame_capture import PARAMETERS
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..files import read_json, read_npz, write_json, write_npz
-from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
-from ..flame.sequence import FRAME_FIELDS, FlameSequence, with_identity
+from ..flame.sequence import FlameSequence, with_identity
 from .contact_sheet import write_contact_sheet
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.open import open_footage
@@ -25,7 +24,7 @@ from .solve import (
     LANDMARK_SIGMA_M,
     TRANSLATION_ACCELERATION_M,
 )
-from .write_capture import flame_frame
+from .write_capture import moving_arrays
 
 KEYS_FILE, SOLVED_FILE = "tracking_keys.npz", "tracking_solved.npz"
 """In a corrected capture: the heads posed by hand, and the parameters as they were solved without them."""
@@ -61,7 +60,8 @@ def correct_capture(
     found = corrected(person, chosen, solved, _with_landmarks(out, timesteps), rows, span)
     write_npz(out / KEYS_FILE, {"timesteps": np.array(sorted(keys), np.int64), "parameters": _stacked(keys, solved)})
     for number, (timestep, values) in enumerate(zip(timesteps, found, strict=True)):
-        _write_frame(out / PARAMETERS / f"{timestep:05d}.npz", flame_frame(values))
+        path = out / PARAMETERS / f"{timestep:05d}.npz"
+        write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
         report("Heads", number + 1, len(timesteps))
     report("Contact sheet", 0, 1)
     _report_errors(out, model, places, used)
@@ -94,9 +94,9 @@ def corrected(
         change[row] = values - solved[row]
     near = np.flatnonzero(distance <= span + 2)
     trust = seen[near] * (distance[near] / (span + 1)) ** 2
+    # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter for translation.
     blocks = [
-        share * _stiffness(model, points, solved[row]) + np.diag(_precision(size))
-        for row, share in zip(near, trust, strict=True)
+        share * _stiffness(model, points, solved[row]) + np.eye(size) for row, share in zip(near, trust, strict=True)
     ]
     matrix = block_diag(blocks)
     second = _second_differences(near)
@@ -133,11 +133,6 @@ def _acceleration_precision(size: int) -> np.ndarray:
     return np.repeat(sigma, (size - RIGID_SIZE, POSE_SIZE, TRANSLATION_SIZE)) ** -2.0
 
 
-def _precision(size: int) -> np.ndarray:
-    """A change of a coefficient has a standard deviation of 1, joints 1 radian, translation 1 meter."""
-    return np.ones(size)
-
-
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
     """Timesteps and parameters (T, E + 18) as they were tracked; kept in a file before the first correction."""
     path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
@@ -159,12 +154,6 @@ def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
 
 def _stacked(keys: Mapping[int, np.ndarray], solved: np.ndarray) -> np.ndarray:
     return np.stack([keys[timestep] for timestep in sorted(keys)]) if keys else np.zeros((0, solved.shape[1]))
-
-
-def _write_frame(path: Path, frame: FlameFrame) -> None:
-    """Replace the moving parameters in a timestep's file; identity and offsets stay."""
-    moving = {name: np.asarray(getattr(frame, name))[None].astype(np.float32) for name in FRAME_FIELDS}
-    write_npz(path, {**read_npz(path), **moving})
 
 
 def _report_errors(out: Path, model: Path, places: SurfacePoints, used: np.ndarray) -> None:

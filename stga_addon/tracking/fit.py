@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
-from ..flame.forward import axis_angle_matrices
 from .head_model import HeadModel
 from .mesh_image import vertex_normals
-from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints
+from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
 from .solve import Observation, person, solve_identity, solve_take
 from .triangulation import Triangulation, rays, triangulate
 
@@ -202,8 +201,7 @@ def by_visibility(
 ) -> TimestepLandmarks:
     """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY where it faces away."""
     model = subject.model
-    rotation = axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0]
-    normals = places.on(vertex_normals(model.v_template, model.faces), model.faces) @ rotation.T
+    normals = places.on(vertex_normals(model.v_template, model.faces), model.faces) @ head_rotation(parameters).T
     at = PosedPoints(model, places).positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
     towards = np.stack([world.apply(camera.position) - at for camera in landmarks.cameras])
     length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)

@@ -33,6 +33,11 @@ def parameters_of(frame: FlameFrame) -> np.ndarray:
     return np.concatenate([frame.expr, frame.pose.ravel(), frame.translation])
 
 
+def head_rotation(parameters: np.ndarray) -> np.ndarray:
+    """(3, 3) of the root joint in (E + 18,) parameters."""
+    return np.asarray(axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0])
+
+
 class PosedPoints:
     """The model's arrays at surface points; parameters are K coefficients and P = 18 numbers of pose and translation.
 

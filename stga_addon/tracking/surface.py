@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
-from ..flame.forward import axis_angle_matrices
 from .fit import (
     HeadFit,
     TimestepLandmarks,
@@ -21,7 +20,7 @@ from .head_model import HeadModel
 from .landmarks import Report
 from .mesh_image import vertex_normals
 from .photo_consistency import Sweep, facing, gray_view, in_sight, surface_offsets
-from .posed_points import RIGID_SIZE, SurfacePoints
+from .posed_points import RIGID_SIZE, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 from .write_capture import posed_mesh
 
@@ -79,8 +78,8 @@ class Take:
 
 
 def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lambda stage, done, total: None) -> HeadFit:
-    """The fit moved onto the surface that several cameras see; unchanged where no moment has
-    several, or where their images do not show enough of it.
+    """The fit moved onto the surface that several cameras see; unchanged where no timestep has landmarks of several
+    cameras, or where the images do not show enough of it.
 
     Rounds of finding the surface along the normals, and of solving scale, identity, expression and pose from it, then
     the person's smooth offsets; at last expression and pose of every timestep. Landmarks stay in at a small weight.
@@ -155,7 +154,7 @@ def seen_surface(
     views = [
         gray_view(camera, image, at.mean(0), sweep.spacing) for camera, (_, image) in zip(cameras, images, strict=True)
     ]
-    turn, cosines = _turn(fit.parameters[timestep]), []
+    turn, cosines = head_rotation(fit.parameters[timestep]), []
     for camera in cameras:
         direction = (camera.position - at.mean(0)) @ turn
         key = tuple(np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int).tolist())
@@ -258,7 +257,7 @@ def _whole_take(
     landmarks = []
     for t in timesteps:
         own = _landmarks(fit, t, take)
-        landmarks.append(replace(own, position=own.position - bias @ _turn(first.parameters[t]).T))
+        landmarks.append(replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T))
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
@@ -277,15 +276,10 @@ def _landmark_bias(fit: HeadFit, take: Take) -> np.ndarray:
     """(N, 3) in the turned head's axes: median distance of the landmarks from their places over the timesteps."""
     missed = [
         (_landmarks(fit, t, take).position - take.places.on(posed_mesh(fit, values), fit.head.model.faces))
-        @ _turn(values)
+        @ head_rotation(values)
         for t, values in fit.parameters.items()
     ]
     return np.asarray(np.median(missed, axis=0))
-
-
-def _turn(parameters: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) of the head."""
-    return np.asarray(axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0])
 
 
 def _landmarks(fit: HeadFit, timestep: int, take: Take) -> Observation:

@@ -12,6 +12,7 @@ from ..capture.camera import Camera
 from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
 from ..files import replacing, write_json, write_npz
 from ..flame.forward import FlameFrame, flame_forward
+from ..flame.sequence import FRAME_FIELDS
 from .fit import HeadFit
 from .folder import SPLIT_FILES
 from .footage.model import Footage, FootageCamera
@@ -118,10 +119,14 @@ def _write_heads(
     return {"canonical_mesh_path": "meshes/neutral.obj"}
 
 
-def _flame_arrays(fit: HeadFit, parameters: np.ndarray) -> dict[str, np.ndarray]:
+def moving_arrays(parameters: np.ndarray) -> dict[str, np.ndarray]:
+    """What changes from timestep to timestep of (E + 18,) parameters, as in VHAP's files: (1, …) float32."""
     frame = flame_frame(parameters)
-    moving = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
-    arrays = {name: getattr(frame, name)[None].astype(np.float32) for name in moving}
+    return {name: getattr(frame, name)[None].astype(np.float32) for name in FRAME_FIELDS}
+
+
+def _flame_arrays(fit: HeadFit, parameters: np.ndarray) -> dict[str, np.ndarray]:
+    arrays = moving_arrays(parameters)
     if fit.static_offset is not None:
         arrays["static_offset"] = fit.static_offset.astype(np.float32)
     return arrays | {"shape": fit.shape.astype(np.float32)}

@@ -1,5 +1,7 @@
 """Corrections by hand: the key is kept, its neighbors follow, all others stay."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -112,8 +114,8 @@ def test_what_cannot_be_corrected_is_named(tracked, tmp_path):
     out, model, before = tracked
     with pytest.raises(StgaError, match="has no timestep 99"):
         correct_capture(out, model, {99: before[0]})
-    (tmp_path / "flame_param").mkdir()
-    for name in ("transforms_train.json", "canonical_flame_param.npz"):
-        (tmp_path / name).write_bytes((out / name).read_bytes())
-    with pytest.raises(StgaError):
-        correct_capture(tmp_path, model, {})
+    other = tmp_path / "other"
+    shutil.copytree(out, other, ignore=shutil.ignore_patterns("landmarks", "tracking_*"))
+    with pytest.raises(StgaError, match=r"head_model\.npz"):
+        correct_capture(other, model, {1: before[1]})
+    assert not (other / KEYS_FILE).exists()
