@@ -83,7 +83,12 @@ class TrackFootage(bpy.types.Operator):
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
     cameras: cameras_property()
     detector: detector_property()
-    landmarks: path_property("Landmarks", "Folder with landmark files of another detector", "DIR_PATH")
+    landmarks: bpy.props.StringProperty(
+        name="Landmarks",
+        description="Folder with landmark files of another detector",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    )
     focal: focal_property()
     start: start_property()
     stop: stop_property()
