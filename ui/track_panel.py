@@ -18,7 +18,7 @@ from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
 from .failure import draw_failure
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_environment_setup
+from .train_panel import draw_environment_setup, draw_worker_progress
 
 
 class TrackPanel(SidebarPanel, bpy.types.Panel):
@@ -105,8 +105,7 @@ def _draw_button(layout: Any, settings: Any) -> None:
 
 def _draw_progress(layout: Any, context: Any, now: WorkerSnapshot) -> None:
     """Draw what the worker is doing, and Cancel."""
-    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
-    layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")
+    draw_worker_progress(layout, now)
     if now.status.detail:
         draw_text(layout, context, now.status.detail)
     layout.operator(ids.CANCEL_TRACKING, text="Cancel", icon="CANCEL")
