@@ -7,7 +7,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.shape_keys import shape_key_model
+from ..stga_addon.scene.shape_keys import has_shape_keys, shape_key_model
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import ids
 from .common import file_path, reporting
@@ -34,16 +34,6 @@ class ExportHeadModel(bpy.types.Operator, ExportHelper):
     def execute(self, context: Any) -> set[str]:
         write_shape_key_model(context, file_path(self.filepath, "head model"))
         return {"FINISHED"}
-
-
-def has_shape_keys(thing: Any) -> bool:
-    """Whether an object (or None) is a mesh with shape keys besides the basis."""
-    return (
-        thing is not None
-        and thing.type == "MESH"
-        and thing.data.shape_keys is not None
-        and len(thing.data.shape_keys.key_blocks) > 1
-    )
 
 
 def write_shape_key_model(context: Any, path: Path) -> None:

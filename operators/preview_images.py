@@ -23,7 +23,7 @@ class PreviewImages(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if any(is_shown_as_trained(thing) for thing in context.view_layer.objects):
+        if _own_as_trained(context):
             return True
         cls.poll_message_set("No splats are displayed as trained")
         return False
@@ -32,9 +32,8 @@ class PreviewImages(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         scene = context.scene
         mode = QUADS if scene.camera is not None else ELLIPSOIDS
-        for thing in context.view_layer.objects:
-            if thing.library is None and is_shown_as_trained(thing):
-                set_input(thing, DISPLAY, mode)
+        for thing in _own_as_trained(context):
+            set_input(thing, DISPLAY, mode)
         engine = scene.render.engine
         if engine == "CYCLES" and hasattr(scene, "cycles"):  # it can be chosen while its add-on is disabled
             use_transparent_bounces(scene)
@@ -47,3 +46,8 @@ class PreviewImages(bpy.types.Operator):
         hint = view_transform_hint(scene)
         self.report({"WARNING" if hint else "INFO"}, f"{mode}: {LIMITS[mode]}" + (f". {hint}" if hint else ""))
         return {"FINISHED"}
+
+
+def _own_as_trained(context: Any) -> list[Any]:
+    """The splat objects that are displayed as trained, but linked ones, whose display cannot be changed."""
+    return [thing for thing in context.view_layer.objects if thing.library is None and is_shown_as_trained(thing)]

@@ -59,8 +59,16 @@ def focal_property() -> Any:
     )
 
 
-def frame_property(name: str, description: str, **more: Any) -> Any:
-    return bpy.props.IntProperty(name=name, description=description, **more)
+def start_property() -> Any:
+    return bpy.props.IntProperty(name="Start", description="First frame of the footage, counted from 0", min=0)
+
+
+def stop_property() -> Any:
+    return bpy.props.IntProperty(name="Stop", description="Frame to stop before; 0: all", min=0)
+
+
+def step_property() -> Any:
+    return bpy.props.IntProperty(name="Step", description="Use every nth frame", min=1, default=1)
 
 
 class TrackFootage(bpy.types.Operator):
@@ -75,11 +83,16 @@ class TrackFootage(bpy.types.Operator):
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
     cameras: cameras_property()
     detector: detector_property()
-    landmarks: path_property("Landmarks", "Folder with landmark files of another detector", "DIR_PATH")
+    landmarks: bpy.props.StringProperty(
+        name="Landmarks",
+        description="Folder with landmark files of another detector",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    )
     focal: focal_property()
-    start: frame_property("Start", "First frame of the footage, counted from 0", min=0)
-    stop: frame_property("Stop", "Frame to stop before; 0: all", min=0)
-    step: frame_property("Step", "Use every nth frame", min=1, default=1)
+    start: start_property()
+    stop: stop_property()
+    step: step_property()
     python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that tracks; empty: the training environment of the preferences",

@@ -72,9 +72,9 @@ class SceneSettings(bpy.types.PropertyGroup):
     )
     detector: track.detector_property()
     focal: track.focal_property()
-    footage_start: track.frame_property("Start", "First frame of the footage, counted from 0", min=0)
-    footage_stop: track.frame_property("Stop", "Frame to stop before; 0: all", min=0)
-    footage_step: track.frame_property("Step", "Use every nth frame", min=1, default=1)
+    footage_start: track.start_property()
+    footage_stop: track.stop_property()
+    footage_step: track.step_property()
     tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last tracking
     tracking_model: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of its head model
     tracking_pending: bpy.props.BoolProperty(options={"HIDDEN"})  # it is to be imported when it is done

@@ -12,12 +12,13 @@ from ..operators.track import tracked_folder, tracking_snapshot
 from ..operators.track_correct import tracking_keys
 from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.shape_keys import has_shape_keys
 from ..stga_addon.tracking.folder import SHEET_FILE
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
 from .failure import draw_failure
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_environment_setup
+from .train_panel import draw_environment_setup, draw_worker_progress
 
 
 class TrackPanel(SidebarPanel, bpy.types.Panel):
@@ -38,7 +39,7 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
             layout.prop(settings, name)
         thing = context.view_layer.objects.active
         if not settings.head_model:
-            name = thing.name if thing is not None and thing.type == "MESH" and thing.data.shape_keys else "none"
+            name = thing.name if has_shape_keys(thing) else "none"
             layout.label(text=f"Shape keys of the active object: {name}", icon="SHAPEKEY_DATA")
         _draw_button(layout, settings)
         if not has_training_python(context):
@@ -104,8 +105,7 @@ def _draw_button(layout: Any, settings: Any) -> None:
 
 def _draw_progress(layout: Any, context: Any, now: WorkerSnapshot) -> None:
     """Draw what the worker is doing, and Cancel."""
-    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
-    layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")
+    draw_worker_progress(layout, now)
     if now.status.detail:
         draw_text(layout, context, now.status.detail)
     layout.operator(ids.CANCEL_TRACKING, text="Cancel", icon="CANCEL")

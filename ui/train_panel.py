@@ -15,7 +15,7 @@ from ..stga_addon.jobs.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effect_plan import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
-from ..stga_addon.worker.status import WorkerState
+from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
 from .curve import draw_curve
 from .failure import draw_failure
 from .properties import preset_times
@@ -86,10 +86,15 @@ class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):
             self.layout.prop(settings, name)
 
 
+def draw_worker_progress(layout: Any, now: WorkerSnapshot) -> None:
+    """Draw the bar that says what a worker is doing."""
+    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
+    layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")
+
+
 def _draw_progress(layout: Any, context: Any, training: MonitorState) -> None:
-    state, status = training.snapshot.state, training.snapshot.status
-    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(state, status.message)
-    layout.progress(factor=status.progress, text=f"{100 * status.progress:.0f} %  {text}")
+    status = training.snapshot.status
+    draw_worker_progress(layout, training.snapshot)
     column = layout.column(align=True)
     for line in (*describe_figures(status.figures), status.detail):
         draw_text(column, context, line)
