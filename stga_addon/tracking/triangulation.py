@@ -40,7 +40,7 @@ def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def triangulate(cameras: Sequence[Camera], points: np.ndarray, confidence: np.ndarray) -> Triangulation:
-    """Landmarks (C, N, 2) pixels with confidence (C, N) ≥ 0, 0 for not seen, of C cameras at one moment.
+    """Landmarks (C, N, 2) pixels with confidence (C, N) ≥ 0, 0 for not seen, of C cameras at one timestep.
 
     Iteratively reweighted least squares with Geman-McClure weights; scale per landmark is its median residual.
     """

@@ -91,7 +91,7 @@ def test_two_images_of_one_moment(tmp_path):
     """Catches a sequence of a camera that stands still taken for a rig, and a frame that replaces another."""
     camera = rig(1)[0]
     write_transforms(tmp_path, [entry(camera, "images/0.png"), entry(camera, "images/1.png")])
-    with pytest.raises(StgaError, match=r"frames\[1\]: has the pose of images/0.png; expected one moment"):
+    with pytest.raises(StgaError, match=r"frames\[1\]: has the pose of images/0.png; expected a timestep_index"):
         open_footage(tmp_path)
     frames = [entry(camera, f"images/{n}.png", timestep_index=4, camera_index=7) for n in range(2)]
     write_transforms(tmp_path, frames)

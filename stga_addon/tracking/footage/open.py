@@ -40,7 +40,7 @@ def open_footage(
     cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
     focal    focal length in pixels of a single camera without a calibration; None: a guess, and not `calibrated`
     principal_point  what `cy` means in transforms files, as in `read_transforms`; None: by the file's author
-    Cameras with a folder or video show sequences; where all have one image, it shows one moment.
+    Cameras with a folder or video show sequences; where all have one image, it shows one timestep.
     Raises StgaError in one sentence naming file, field and what was expected, also for a missing image.
     """
     sources, root = _sources(path)
@@ -131,7 +131,7 @@ def _single_camera(root: Path, sources: Sources, frames: FrameRange, focal: floa
 
 
 def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
-    """Shots with their image, after which they are named, and which shows the only moment.
+    """Shots with their image, after which they are named, and which shows the only timestep.
 
     Raises StgaError for two of the same pose: the images of a camera that stands still are a sequence.
     """
@@ -139,7 +139,9 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
     for shot in shots:
         other = poses.setdefault(_pose(shot), shot)
         if other is not shot:
-            raise StgaError(f"{shot.where}: has the pose of {other.label}; expected one moment, or a timestep_index")
+            raise StgaError(
+                f"{shot.where}: has the pose of {other.label}; expected a timestep_index, or one image of each camera"
+            )
         listed = shot.image if shot.image is not None and isfile(shot.image) else None
         image = listed or still_image(sources, shot.label, shot.where)
         inside = image.is_relative_to(sources.root)
