@@ -149,8 +149,6 @@ SET_BY_PANEL = {
         "step",
     },
     "view_footage": set(),
-    "refine": {"directory", "device", "seconds", "growth"},
-    "extend": {"directory", "device", "take", "seconds"},
     "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "adapter", "effects"},
     "refine": {"directory", "group", "seconds", "growth", "device", "adapter"},
     "extend": {"directory", "take", "seconds", "device", "adapter"},
