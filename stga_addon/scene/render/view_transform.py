@@ -64,10 +64,9 @@ class InverseView:
         place = np.interp(target, gray, np.arange(last + 1))
         rest, damping = interpolate(self._shown, place) - target, np.full((len(target), 1, 1), 1e-4)
         for _ in range(INVERSE_STEPS):
-            sides = [
-                [interpolate(self._shown, np.clip(place + step, 0, last)) for step in (unit, -unit)] for unit in np.eye(3)
-            ]
-            jacobian = np.stack([(after - before) / 2 for after, before in sides], -1)
+            ends = [np.clip(place + step, 0, last) for step in (*np.eye(3), *-np.eye(3))]
+            values = np.stack([interpolate(self._shown, end) for end in ends], -1)
+            jacobian = (values[..., :3] - values[..., 3:]) / 2
             transposed = jacobian.transpose(0, 2, 1)
             step = np.linalg.solve(transposed @ jacobian + damping * np.eye(3), transposed @ rest[..., None])[..., 0]
             moved = np.clip(place - np.clip(step, -4, 4), 0, last)
@@ -139,8 +138,8 @@ def measure(scene: Any) -> None:
 def _settings(scene: Any) -> tuple[Any, ...]:
     """What the view transform depends on, less the display device."""
     view = scene.view_settings
-    kinds = {"BOOLEAN", "INT", "FLOAT", "ENUM"}
-    names = [each.identifier for each in view.bl_rna.properties if each.type in kinds and not getattr(each, "is_array", False)]
+    scalars = [each for each in view.bl_rna.properties if each.type in {"BOOLEAN", "FLOAT", "ENUM"}]
+    names = [each.identifier for each in scalars if not getattr(each, "is_array", False)]
     curves = view.curve_mapping.curves if view.use_curve_mapping else ()
     points = [tuple(point.location) for curve in curves for point in curve.points]
     return working_space(), *(getattr(view, name) for name in names), *points
