@@ -41,4 +41,4 @@ def run(options: Namespace) -> None:
     assert prepared.selection is not None
     share = np.any(list(prepared.selection.values()), axis=0).mean()
     print(f"takes: {1 + len(prepared.run.takes)}; the new ones need {share:.0%} of the triangles")
-    train_run(folder, prepared.run, prepared.capture, prepared.selection, resume=False)
+    train_run(folder, prepared.run, prepared.capture, prepared.selection, False, options.device == "auto")
