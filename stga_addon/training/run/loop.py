@@ -142,7 +142,7 @@ class _Loop:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
         if continuation is not None:
-            state = starting_state(continuation)
+            state = starting_state(continuation, self.settings.strain_color)
             self._check(state)
         self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
