@@ -14,7 +14,9 @@ from PIL import Image
 
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
+from stga_addon.files import read_npz
 from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
 from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
@@ -98,6 +100,18 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
     selected = prepared.selection[4]
     assert selected[front & (height > 0.055)].mean() > 0.8
     assert selected[front & (height < 0)].mean() < 0.1
+
+
+def test_selection_is_written_without_training(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches a selection at the joined takes' timesteps instead of the new take's own, and a run that is begun."""
+    path = tmp_path / "selection.npz"
+    assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
+    expected = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu").selection
+    written = read_npz(path)
+    assert list(written) == ["00000", "00001", "00003"]
+    assert all(np.array_equal(written[f"{timestep - 4:05d}"], faces) for timestep, faces in expected.items())
+    assert not parent.with_name("run_2").exists()
+    assert main(["extend", str(parent), str(takes[1]), str(takes[0]), "--select-only", str(path)]) == 2
 
 
 def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
