@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ...avatar.file import read_avatar
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import open_capture
 from ...capture.region import find_region
 from ...capture.takes import first_timesteps, join_takes, require_same_head
@@ -19,7 +19,6 @@ from ..evaluate.evaluation_views import (
     MIN_REGION_PIXELS,
     EvaluationView,
     read_evaluation_view,
-    spread_views,
     visible_pixels,
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
@@ -222,7 +221,7 @@ def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | 
     limit, chosen = max(MIN_GROUP_VIEWS, MAX_EVALUATION_VIEWS // max(1, len(groups))), []
     for name, members in groups.items():
         group = name if len(groups) > 1 else ""
-        for view in spread_views(members, limit):
+        for view in evenly_spread(members, limit):
             found = replace(read_evaluation_view(capture, view), group=group)
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= MIN_REGION_PIXELS:
