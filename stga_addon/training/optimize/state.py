@@ -94,8 +94,14 @@ def with_strain_color(state: TrainState) -> TrainState:
     def added(tensors: Parameters) -> Parameters:
         return tensors._replace(strain_color=torch.zeros(len(state), STRAIN_COMPONENTS, 3))
 
-    tables = ("parameters", "gradients", "first", "second", "average")
-    return replace(state, **{name: added(getattr(state, name)) for name in tables})
+    return replace(
+        state,
+        parameters=added(state.parameters),
+        gradients=added(state.gradients),
+        first=added(state.first),
+        second=added(state.second),
+        average=added(state.average),
+    )
 
 
 def join(state: TrainState, other: TrainState) -> TrainState:
