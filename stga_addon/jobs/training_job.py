@@ -170,7 +170,7 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
 
 def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> "Prepared":
     """The run to train (new, resumed or one that continues another), its capture and the selection."""
-    from ..effects.plan import with_effect_plan
+    from ..effects.plan import with_effect_plan, with_effects_of_takes
     from ..training.run.continuation import Prepared, prepare
 
     if job.resumes:
@@ -183,7 +183,10 @@ def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) ->
         device, reason = device_of(read_run(job.continues.parent), job.device)
         report(reason)
         report("Comparing the avatar with the images" if isinstance(job.continues, Extension) else "Opening the run")
-        return prepare(job.continues, device, job.flame)
+        prepared = prepare(job.continues, device, job.flame)
+        if isinstance(job.continues, Extension):
+            prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
+        return prepared
     assert job.settings is not None
     capture = open_capture(job.capture, job.flame, job.principal_point)
     device, reason = choose_device(job.device)

@@ -16,14 +16,14 @@ import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import ViewLoader
-from ...capture.model import Capture
+from ...capture.model import Capture, evenly_spread
 from ...errors import DeviceError, StgaError
 from ...files import replacing
 from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view, spread_views
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
 from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
@@ -159,7 +159,7 @@ class _Loop:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
         if continuation is not None:
-            state = starting_state(continuation)
+            state = starting_state(continuation, self.settings.strain_color)
             self._check(state)
         self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
@@ -333,7 +333,7 @@ class _Loop:
         self.report(self._progress("Measuring residuals"))
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
         mean = triangle_residuals(
-            read_avatar(self.out / "avatar.npz"), self._refined_capture(), spread_views(views, RESIDUAL_VIEWS),
+            read_avatar(self.out / "avatar.npz"), self._refined_capture(), evenly_spread(views, RESIDUAL_VIEWS),
             exposure_correction(self.settings), RESIDUAL_SCALE,
         ).mean()  # fmt: skip
         write_residuals(self.out, mean)
