@@ -66,6 +66,12 @@ class Embedding:
         return buffers["frames"]
 
 
+def compile_kernels(device: Device) -> None:
+    """Compile what this module dispatches."""
+    for entry in ("compose", "average_strain"):
+        device.kernel("frames", entry)
+
+
 def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) float32, zero only where the float64 is."""
     area = embedding.face_areas(neutral, faces)

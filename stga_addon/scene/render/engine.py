@@ -41,14 +41,20 @@ SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
 
 
 class Interpreter:
-    """The Python that renders where Blender's own cannot: looked up by the main thread, used by render threads."""
+    """The Python that renders where Blender's own cannot, and the device: looked up by the main thread, used by render
+    threads.
 
-    def __init__(self, find: Callable[[], str]) -> None:
-        self._find = find
+    device  as `raster.compose.Composer` takes it
+    """
+
+    def __init__(self, find: Callable[[], str], find_device: Callable[[], str]) -> None:
+        self._find, self._find_device = find, find_device
         self._path = self._error = ""
+        self.device = "auto"
 
     def update(self) -> None:
-        """Look it up again; reads preferences and files, so only where another Python is needed."""
+        """Look them up again; reads preferences, and files where another Python is needed."""
+        self.device = self._find_device()
         if missing_packages():
             try:
                 self._path, self._error = self._find(), ""
@@ -62,8 +68,8 @@ class Interpreter:
         return self._path
 
 
-_interpreter = Interpreter(lambda: "")
-_client = RenderClient(_interpreter.path)
+_interpreter = Interpreter(lambda: "", lambda: "auto")
+_client = RenderClient(_interpreter.path, lambda: _interpreter.device)
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -99,6 +105,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         if image is None:
             _interpreter.update()
             image = _client.compose([layer.posed() for layer in layers], camera, with_depth=True)
+            if _client.failure:
+                self.report({"WARNING"}, _client.failure)
         view = inverse_view(scene)
         if view is None and needs_inverse(scene):
             self.report({"WARNING"}, VIEW_TRANSFORM_UNKNOWN)
@@ -287,11 +295,11 @@ def _before_render(*_: Any) -> None:
             measure(scene)
 
 
-def register(find_python: Callable[[], str]) -> None:
-    """find_python as in `raster.render_client.RenderClient`."""
+def register(find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
+    """find_python, find_device: as in `raster.render_client.RenderClient`."""
     global _interpreter, _client
-    _interpreter = Interpreter(find_python)
-    _client = RenderClient(_interpreter.path)
+    _interpreter = Interpreter(find_python, find_device)
+    _client = RenderClient(_interpreter.path, lambda: _interpreter.device)
     bpy.utils.register_class(SplatsEngine)
     bpy.app.handlers.render_pre.append(_before_render)
     for panel in _shared_panels():

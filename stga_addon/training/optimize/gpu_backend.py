@@ -9,9 +9,10 @@ import torch
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.cpu.layout import Parameters
+from ...raster.gpu import frames as frame_stage
 from ...raster.gpu import image_loss as loss_stage
 from ...raster.gpu import optimizer as optimizer_stage
-from ...raster.gpu import project as projection_stage
+from ...raster.gpu import rasterize as raster_stage
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
 from ...raster.gpu.image_loss import image_loss, upload_target
@@ -43,6 +44,12 @@ class _Queued:
     loss: float | None = None
 
 
+def compile_kernels(device: Device) -> None:
+    """Compile what an iteration dispatches, before the time that is given to training."""
+    for stage in (frame_stage, raster_stage, loss_stage, optimizer_stage):
+        stage.compile_kernels(device)
+
+
 class GpuBackend:
     """Trains asynchronously: `step` records an iteration, submits it at once and returns without waiting for it.
 
@@ -62,8 +69,7 @@ class GpuBackend:
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)
-        for stage in (projection_stage, loss_stage, optimizer_stage):
-            stage.compile_kernels(device)  # now, instead of in the time that is given to training
+        compile_kernels(device)
         self.state = state
 
     def __len__(self) -> int:
