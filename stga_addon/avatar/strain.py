@@ -23,11 +23,11 @@ class StrainBasis:
 
     faces (F, 3); gram (F, 3) squared lengths and product of the neutral edges: d1·d1, d1·d2, d2·d2.
     to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
-    to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear.
+    to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear; both float32.
     corners (3, F): `faces` by corner.
     rank (3, F): the same, with vertices counted by how many triangles touch them, most first.
     touching: of each of the first vertices in that order its first triangle, of those with two their second, …
-    to_tensor, to_plane and share are float32. share (T, 1): a third of one over how many triangles touch each vertex in that order.
+    share (T, 1): a third of one over how many triangles touch each vertex in that order.
     range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
     """
 

@@ -210,7 +210,7 @@ def failure() -> None:
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         redraw(4)
     seen["reports"] = output.getvalue().count("out of memory; points") + output.getvalue().count("MemoryError: out")
-    seen["failed"] = display.failed, display._handler is None, display.problem
+    seen["failed"] = display.failed, not display._handlers, display.problem
 
 
 def after_failure() -> Any:
@@ -224,7 +224,7 @@ def after_failure() -> Any:
     held = textures()
     viewport_display.unregister()
     seen["freed"]["disabled"] = freed(held)
-    seen["unregistered"] = display._handler is None, display._renderer is None
+    seen["unregistered"] = not display._handlers, display._renderer is None
     seen["drawn without"] = pictures_per_redraw()
     viewport_display.register()
     redraw()
@@ -234,7 +234,7 @@ def after_failure() -> Any:
 
 
 def after_load() -> None:
-    seen["after load"] = display._handler is not None, display._renderer is None, display.problem
+    seen["after load"] = bool(display._handlers), display._renderer is None, display.problem
     set_up()
     seen["drawn"].append(pictures_per_redraw())
 
