@@ -62,6 +62,7 @@ class SplatRenderer:
         test_depth: bool = True,
         bones: np.ndarray | None = None,
         scene: Any = None,
+        has_background: bool = False,
     ) -> None:
         """Put what was drawn last into the active framebuffer, which blends linearly and has the scene's depth.
 
@@ -69,14 +70,14 @@ class SplatRenderer:
         (a + b·z) / (c + d·z) at z meters along the view axis. behind: sRGB expected behind the splats, if known.
         test_depth: whether objects in front hide splats; not where the framebuffer lacks the scene's depth.
         bones: as of `front_bones`. Near them, splats are put into `scene`, the framebuffer that a viewport shows below
-        the active one, and only what that has drawn of its background is taken out of the active one.
+        the active one. Of that, if it has drawn its background there (`has_background`), what they cover is taken out.
         """
         draw = partial(self._composite_part, corner, to_depth, test_depth)
         if scene is None or bones is None or not len(bones):
             draw(OUTSIDE, behind, NO_BONES)
             return
         draw(OUTSIDE, behind, bones)
-        if behind is not None:
+        if behind is not None and has_background:
             draw(BEHIND, behind, bones)
         with scene.bind():
             draw(NEAR_BONES, None, bones)
@@ -93,11 +94,11 @@ class SplatRenderer:
         gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
         gpu.state.depth_mask_set(False)
         gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
-        shader = self._composite
+        shader, bone_image = self._composite, _image(bones)  # a texture lives as long as its name
         shader.bind()
         shader.uniform_sampler("color_image", self._color)
         shader.uniform_sampler("depth_image", self._depth)
-        shader.uniform_sampler("bones", _image(bones))
+        shader.uniform_sampler("bones", bone_image)
         shader.uniform_float("part", (part, len(bones), 0.0, 0.0))
         shader.uniform_float("corner_px", (*corner, 0.0, 0.0))
         shader.uniform_float("to_depth", to_depth)

@@ -15,7 +15,7 @@ from bpy.app.handlers import persistent
 
 from ...errors import StgaError
 from .. import tags
-from ..compat import has_scene_depth, world_nodes
+from ..compat import world_nodes
 from ..display import splat_nodes
 from ..display.colors import linear_to_srgb
 from ..display.display_modes import AS_TRAINED, POINTS
@@ -102,8 +102,10 @@ class GpuDisplay:
         self._renderer.draw(layers, view)
         is_plain = space.shading.type in ("SOLID", "WIREFRAME") or keeps_colors(context.scene)
         bones = front_bones(space, context.region_data, width, height) if is_plain else NO_BONES
-        background = expected_background(context)
-        self._renderer.composite((x, y), to_depth, background, has_scene_depth(space), bones, self._scene_target)
+        self._renderer.composite(
+            (x, y), to_depth, expected_background(context), has_scene_depth(space),
+            bones, self._scene_target, background_source(context) != "SCENE",
+        )  # fmt: skip
 
     def _fail(self, problem: str) -> None:
         self.stop()
@@ -165,11 +167,7 @@ def expected_background(context: Any) -> tuple[float, ...] | None:
     known to be behind them.
     """
     shading, theme = context.space_data.shading, context.preferences.themes[0].view_3d.space.gradients
-    if shading.type in ("SOLID", "WIREFRAME"):
-        source = shading.background_type
-    else:
-        uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
-        source = "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
+    source = background_source(context)
     if source == "THEME":
         return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient)
     if source == "VIEWPORT":
@@ -180,6 +178,23 @@ def expected_background(context: Any) -> tuple[float, ...] | None:
         color = world_color(context.scene)
         return None if color is None else _srgb(color)
     return None
+
+
+def has_scene_depth(space: Any) -> bool:
+    """Whether a 3D viewport's depth buffer holds the scene when draw handlers run.
+
+    Render engines leave it zero where overlays are off: always in 4.3, at times in 5.2.
+    """
+    return bool(space.overlay.show_overlays) or space.shading.type in ("SOLID", "WIREFRAME")
+
+
+def background_source(context: Any) -> str:
+    """What gives a viewport its background: THEME, VIEWPORT, WORLD (its color for viewports), SCENE or STUDIO."""
+    shading = context.space_data.shading
+    if shading.type in ("SOLID", "WIREFRAME"):
+        return str(shading.background_type)
+    uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
+    return "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
 
 
 def world_color(scene: Any) -> tuple[float, ...] | None:
