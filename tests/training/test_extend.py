@@ -19,6 +19,7 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
+from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
@@ -59,8 +60,8 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
-def extend(parent: Path, take: Path, out: Path, stop: int | None = None) -> Path:
-    prepared = prepare_extension(Extension(parent, (take,), iterations=ITERATIONS), "cpu")
+def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0) -> Path:
+    prepared = prepare_extension(Extension(parent, (take,), growth, iterations=ITERATIONS), "cpu")
 
     def report(progress: Progress) -> bool:
         return progress.iteration == stop
@@ -123,12 +124,16 @@ def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tm
     assert last["psnr_take_1"] != last["psnr_take_2"]
 
 
+@pytest.mark.parametrize("growth", [0.0, 0.5])
 def test_a_stopped_extension_is_continued_to_the_same_bits(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path, growth: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches an order, a selection or a take that a resumed extension does not find again."""
-    whole = extend(parent, takes[1], tmp_path / "whole")
-    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7)
+    """Catches an order, a selection, a take or a count of splats that a resumed extension does not find again."""
+    monkeypatch.setattr(continuation, "DENSITY_INTERVAL", 3)
+    whole = extend(parent, takes[1], tmp_path / "whole", growth=growth)
+    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7, growth=growth)
+    before, after = (len(read_avatar(run / "avatar.npz").splats) for run in (parent, whole))
+    assert (after > before) == bool(growth)
     opened = open_run(stopped)
     train(opened.capture, stopped, opened.run, resume=True)
     assert_same_state(stopped, whole)
@@ -173,7 +178,6 @@ def test_takes_that_do_not_fit(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches another head, or a take without images, that is found out after minutes of training."""
-    from stga_addon.training.run import continuation
 
     def changed(path: Path, *rest: Any) -> Capture:
         capture = open_capture(path, *rest)
