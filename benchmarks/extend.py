@@ -41,7 +41,7 @@ from stga_addon.training.run.continuation import (
     prepare_refinement,
     starting_state,
 )
-from stga_addon.training.run.folder import Run
+from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.replay import continued_order
 from stga_addon.training.run.request import Extension, Refinement
@@ -143,7 +143,7 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
-    original = replace(settings, rates=type(settings.rates)(), sh_steps=(0.3, 0.5, 0.7)[: settings.sh_degree])
+    original = replace(read_run(continuation.parent).settings, strain_color=settings.strain_color)
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
