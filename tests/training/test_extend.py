@@ -3,7 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
+from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_SHARE, ExtendStrategy
 from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
@@ -156,20 +156,25 @@ def test_strain_color_can_begin_with_a_further_take(takes: tuple[Path, Path], tm
     assert avatar.strain_range is not None
 
 
-def test_old_and_new_views_take_turns(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that forgets because it sees the new take only."""
+def test_global_iterations_replay_old_views(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches an extension that forgets because it sees the new take only, or trains all splats on it."""
     prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
-    assert sum(view.timestep < 4 for view in views) == 13
+    strategy = ExtendStrategy(np.ones(1, bool))
+    is_global = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(40)]
+    assert [view.timestep < 4 for view in views] == is_global
+    assert 0 < sum(is_global) < 40
 
 
-def test_every_so_often_all_splats_are_trained() -> None:
+def test_local_and_global_iterations_take_turns() -> None:
     """Catches an extension whose global iterations are lost, or are all there is."""
     region = np.array([True, False])
     strategy = ExtendStrategy(region)
-    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(2 * (EXTEND_GLOBAL_INTERVAL + 1))]
-    assert kinds == 2 * [*EXTEND_GLOBAL_INTERVAL * [False], True]
+    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(100)]
+    assert sum(kinds) == round(100 * EXTEND_GLOBAL_SHARE)
+    assert not any(first and second for first, second in pairwise(kinds))
+    assert strategy.triangles(0, 0, 0, 0.0) is region
     assert ExtendStrategy(~region & region).triangles(0, 0, 0, 0.0) is None
 
 
