@@ -25,9 +25,11 @@ from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_
 from .write_capture import posed_mesh
 
 IDENTITY_SWEEPS = (Sweep(0.010, 0.001, 0.0015), Sweep(0.004, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001))
-TAKE_SWEEP = Sweep(0.004, 0.0005, 0.001)
-SURFACE_POINTS, MAX_TAKE_POINTS = 2000, 1000
-"""Points over the whole head, and how many of those that are usually found are looked for at every timestep."""
+TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
+"""At every timestep, and how many of the points that are usually found are looked for. The first starts at the pose of
+the landmarks, from which patches do not lie on the skin that they are of yet."""
+SURFACE_POINTS = 2000
+"""Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
 SURFACE_SIGMA_M = 0.0005
@@ -109,7 +111,8 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
         if number:
             offset = offset + _offsets(found, points, seen)
             found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
-    return _whole_take(found, fit, take, _often_seen(points, seen), lambda left: report("Surface", steps - left, steps))
+    often = [_often_seen(points, seen, count) for _, count in TAKE_SWEEPS]
+    return _whole_take(found, fit, take, often, lambda left: report("Surface", steps - left, steps))
 
 
 def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
@@ -239,18 +242,20 @@ def _offsets(fit: HeadFit, points: SurfacePoints, seen: Mapping[int, SeenSurface
     return np.asarray(values[:, None] * vertex_normals(model.v_template, model.faces))
 
 
-def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface]) -> SurfacePoints:
+def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface], count: int) -> SurfacePoints:
+    """Up to `count` of the points that are found at most timesteps."""
     often = np.flatnonzero(np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE)
-    rows = often[:: 1 + len(often) // MAX_TAKE_POINTS]
+    rows = often[:: 1 + len(often) // count]
     return SurfacePoints(points.face[rows], points.barycentric[rows])
 
 
 def _whole_take(
-    fit: HeadFit, first: HeadFit, take: Take, points: SurfacePoints, report: Callable[[int], None]
+    fit: HeadFit, first: HeadFit, take: Take, points: Sequence[SurfacePoints], report: Callable[[int], None]
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 
-    What a landmark misses at the timesteps of `fit`, it misses in all: it is taken off.
+    points: for each of TAKE_SWEEPS. What a landmark misses at the timesteps of `fit`, it misses in all: it is taken
+    off.
     """
     timesteps, model = sorted(take.landmarks), fit.head.model
     bias = _landmark_bias(fit, take)
@@ -261,13 +266,17 @@ def _whole_take(
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
-    rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
-    together, sights = [], Sights()
+    together = []
+    sights: list[Sights] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
-        seen = seen_surface(rough, t, points, take.images(t), TAKE_SWEEP, sights)
-        together.append(_joined(own, LANDMARK_SHARE, seen))
-    solved = solve_take(fit.head, _both(take.places, points), together, start)
+        images = take.images(t)
+        for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
+            rough = replace(fit, parameters={t: start[number]})
+            joined = _joined(own, LANDMARK_SHARE, seen_surface(rough, t, on, images, sweep, sights[stage]))
+            start[number] = solve_take(fit.head, _both(take.places, on), [joined], start[number : number + 1])[0]
+        together.append(joined)
+    solved = solve_take(fit.head, _both(take.places, points[-1]), together, start)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 
