@@ -19,6 +19,7 @@ from .fit import (
 from .head_model import HeadModel
 from .landmarks import Report
 from .mesh_image import vertex_normals
+from .outline import outline_offsets
 from .photo_consistency import Sweep, facing, gray_view, in_sight, surface_offsets
 from .posed_points import RIGID_SIZE, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
@@ -53,8 +54,11 @@ OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
 
+OUTLINE_RADIUS_M = 0.01
+"""Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
+
 Images = Callable[[int], Sequence[tuple[Camera, np.ndarray]]]
-"""Timestep -> cameras, in the footage's world, and their images (H, W, 3) uint8."""
+"""Timestep -> cameras, in the footage's world, and their images (H, W, 3) or masks (H, W), uint8."""
 
 Sights = dict[tuple[int, ...], np.ndarray]
 """Direction from the head, rounded -> (N,) bool: points that are not hidden from there."""
@@ -71,12 +75,13 @@ class SeenSurface:
 
 @dataclass(frozen=True)
 class Take:
-    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, and images."""
+    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, images, masks."""
 
     places: SurfacePoints
     reliable: np.ndarray
     landmarks: Mapping[int, TimestepLandmarks]
     images: Images
+    masks: Images = lambda timestep: ()
 
 
 def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lambda stage, done, total: None) -> HeadFit:
@@ -99,12 +104,14 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
     take = replace(take, landmarks=visible)
     steps = len(IDENTITY_SWEEPS) * len(chosen) + len(timesteps)
     points, offset = surface_points(head, SURFACE_POINTS), np.zeros_like(head.model.v_template)
+    near = _near_landmarks(head, points, take)
     found = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
     for number, sweep in enumerate(IDENTITY_SWEEPS):
         seen: dict[int, SeenSurface] = {}
         for t in chosen:
             report("Surface", number * len(chosen) + len(seen), steps)
             seen[t] = seen_surface(found, t, points, take.images(t), sweep, {})
+            seen[t] = with_outlines(seen[t], found, t, points, take.masks(t), near, sweep.reach)
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return fit
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
@@ -166,6 +173,37 @@ def seen_surface(
         cosines.append(facing(camera, at, normals) * sights[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
     return SeenSurface(at + offset[:, None] * normals, normals, POINT_SHARE * correlation)
+
+
+def with_outlines(
+    seen: SeenSurface,
+    fit: HeadFit,
+    timestep: int,
+    points: SurfacePoints,
+    masks: Sequence[tuple[Camera, np.ndarray]],
+    near: np.ndarray,
+    reach: float,
+) -> SeenSurface:
+    """The surface with what masks say about points at the head's outline; near (N,) bool: those that count."""
+    vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
+    at = points.on(vertices, faces)
+    total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
+    for camera, mask in masks:
+        posed = fit.to_capture.camera(camera)
+        offset, known = outline_offsets(posed, mask, vertices, faces, at, seen.normal, reach)
+        total += POINT_SHARE * (known & near)
+        moved += POINT_SHARE * (known & near) * offset
+    mean = moved / np.maximum(total, 1e-9)
+    return replace(seen, position=at + mean[:, None] * seen.normal, weight=total)
+
+
+def _near_landmarks(head: HeadModel, points: SurfacePoints, take: Take) -> np.ndarray:
+    """(N,) bool: points within OUTLINE_RADIUS_M of a reliable landmark."""
+    from scipy.spatial import cKDTree
+
+    template, faces = head.model.v_template, head.model.faces
+    distance, _ = cKDTree(take.places.on(template, faces)[take.reliable]).query(points.on(template, faces))
+    return np.asarray(distance < OUTLINE_RADIUS_M)
 
 
 def smooth_offsets(
