@@ -25,7 +25,14 @@ from .posed_points import RIGID_SIZE, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 from .write_capture import posed_mesh
 
-IDENTITY_SWEEPS = (Sweep(0.010, 0.001, 0.0015), Sweep(0.004, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001))
+IDENTITY_SWEEPS = (
+    Sweep(0.010, 0.001, 0.0015),
+    Sweep(0.004, 0.0005, 0.001),
+    Sweep(0.003, 0.0005, 0.001),
+    Sweep(0.003, 0.0005, 0.001),
+)
+FIRST_OFFSET_SWEEP = 2
+"""Before it, what is left between head and surface is mostly a pose and identity that have not converged."""
 TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
 """At every timestep, and how many of the points that are usually found are looked for. The first starts at the pose of
 the landmarks, from which patches do not lie on the skin that they are of yet."""
@@ -54,6 +61,8 @@ OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
 
+MAX_OUTLINE_CAMERAS = 8
+"""Cameras whose masks are compared at every timestep."""
 OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
 
@@ -115,7 +124,7 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return fit
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
-        if number:
+        if number >= FIRST_OFFSET_SWEEP:
             offset = offset + _offsets(found, points, seen)
             found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
     often = [_often_seen(points, seen, count) for _, count in TAKE_SWEEPS]
@@ -190,9 +199,9 @@ def with_outlines(
     total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
     for camera, mask in masks:
         posed = fit.to_capture.camera(camera)
-        offset, known = outline_offsets(posed, mask, vertices, faces, at, seen.normal, reach)
-        total += POINT_SHARE * (known & near)
-        moved += POINT_SHARE * (known & near) * offset
+        offset, known = outline_offsets(posed, mask, vertices, faces, at[near], seen.normal[near], reach)
+        total[near] += POINT_SHARE * known
+        moved[near] += POINT_SHARE * offset
     mean = moved / np.maximum(total, 1e-9)
     return replace(seen, position=at + mean[:, None] * seen.normal, weight=total)
 
@@ -304,19 +313,27 @@ def _whole_take(
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
-    together = []
+    together, near = [], [_near_landmarks(fit.head, on, take) for on in points]
     sights: list[Sights] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
-        images = take.images(t)
+        images, masks = take.images(t), _spread_cameras(take.masks(t))
         for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
             rough = replace(fit, parameters={t: start[number]})
-            joined = _joined(own, LANDMARK_SHARE, seen_surface(rough, t, on, images, sweep, sights[stage]))
+            seen = seen_surface(rough, t, on, images, sweep, sights[stage])
+            seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
+            joined = _joined(own, LANDMARK_SHARE, seen)
             start[number] = solve_take(fit.head, _both(take.places, on), [joined], start[number : number + 1])[0]
         together.append(joined)
     solved = solve_take(fit.head, _both(take.places, points[-1]), together, start)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
+
+
+def _spread_cameras(masks: Sequence[tuple[Camera, np.ndarray]]) -> Sequence[tuple[Camera, np.ndarray]]:
+    """Up to MAX_OUTLINE_CAMERAS of them."""
+    rows = spread_over(range(len(masks)), MAX_OUTLINE_CAMERAS)
+    return [masks[row] for row in rows]
 
 
 def _landmark_bias(fit: HeadFit, take: Take) -> np.ndarray:
