@@ -200,7 +200,7 @@ class Device:
 
     def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
         """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
-        key = id(kernel), *(id(buffers.get(name)) for name in kernel.bindings)
+        key = id(kernel), *buffers, *map(id, buffers.values())
         found = self._groups.get(key)
         if found is None:
             if buffers.keys() != kernel.bindings.keys():

@@ -18,7 +18,7 @@ SMALL = CaptureOptions(train=2, test=1, cameras=6, width=72, height=100, samples
 @pytest.mark.slow
 def test_demo_writes_its_files(tmp_path):
     """Catches a break anywhere in the chain of the README's first command."""
-    run_demo(tmp_path, 6.0, SMALL)
+    run_demo(tmp_path, {"seconds": 6.0}, SMALL)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).
@@ -35,7 +35,7 @@ def test_demo_writes_its_files(tmp_path):
 @pytest.mark.slow
 def test_the_blend_file_opens_with_head_groups_and_splats(tmp_path):
     """Catches a demo.blend that an artist opens to find empty or unanimated."""
-    run_demo(tmp_path, 2.0, SMALL)
+    run_demo(tmp_path, {"seconds": 2.0}, SMALL)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
     heads = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "head"]
     splats = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
