@@ -39,9 +39,7 @@ MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
 
-def run_demo(
-    out: Path, budget: Mapping[str, Any], options: CaptureOptions | None = None, device: str = "cpu"
-) -> None:
+def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | None = None, device: str = "cpu") -> None:
     """Make a capture of a synthetic head, import it into Blender, select, train, and show the avatar.
 
     budget: the setting that limits training, `seconds` or `iterations`; device: one of `choose_device`.
