@@ -106,7 +106,7 @@ class Device:
         self.dispatches = self.submits = self.waits = 0
         self.kernel_times: KernelTimes | None = None
         self._buffers: dict[str, Any] = {}
-        self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
+        self._groups: dict[tuple[int | str, ...], tuple[Any, tuple[Any, ...]]] = {}
 
     @property
     def bytes(self) -> int:
@@ -200,7 +200,7 @@ class Device:
 
     def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
         """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
-        key = id(kernel), *buffers, *map(id, buffers.values())
+        key: tuple[int | str, ...] = id(kernel), *buffers, *map(id, buffers.values())
         found = self._groups.get(key)
         if found is None:
             if buffers.keys() != kernel.bindings.keys():
