@@ -7,8 +7,11 @@ import pytest
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.cli.main import main
 from stga_addon.development.demo.capture import CaptureOptions
 from stga_addon.development.demo.run import run_demo
+from stga_addon.training.run.folder import read_run
+from stga_addon.training.run.metrics_log import read_metrics
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
@@ -30,6 +33,22 @@ def test_demo_writes_its_files(tmp_path):
     gray = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
     assert colored.sum() > 50, "no selected splat is shown in color"
     assert gray.sum() > 50, "no frozen splat is shown gray"
+
+
+@pytest.mark.slow
+def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, capsys):
+    """Catches `stga demo --device gpu` that trains on the CPU, or whose files need it."""
+    from raster import gpu_device
+
+    adapter = gpu_device.device().name
+    monkeypatch.setattr(
+        "stga_addon.development.demo.run.run_demo", lambda out, budget, device: run_demo(out, budget, SMALL, device)
+    )
+    assert main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"]) == 0
+    assert f"Training on {adapter}" in capsys.readouterr().out
+    assert read_run(tmp_path / "run").device == f"gpu:{adapter}"
+    assert read_metrics(tmp_path / "run")[-1]["iteration"] == 4
+    assert (tmp_path / "demo.blend").exists()
 
 
 @pytest.mark.slow
