@@ -133,7 +133,7 @@ class Device:
             raise DeviceError(
                 f"{self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of {size >> 20} MiB "
                 f"for {name}",
-                "train smaller images or fewer splats, or continue with --device cpu",
+                "train smaller images or fewer splats, or continue on the CPU (--device cpu)",
             )
         with self.errors():
             return self.gpu.create_buffer(label=name, size=size, usage=usage)
@@ -243,7 +243,7 @@ class Device:
                 _open.cache_clear()
                 raise DeviceError(
                     f"{self.name} was lost (the driver was reset, or took too long)",
-                    "try again, with --device cpu if it happens again; a run's last checkpoint is kept for --resume",
+                    "try again, on the CPU (--device cpu) if it happens again; a run keeps its last checkpoint for --resume",
                 ) from error
             raise
 
@@ -403,5 +403,5 @@ def _source(name: str) -> str:
 def _full_memory(name: str) -> DeviceError:
     return DeviceError(
         f"the memory of {name} is full",
-        "close other programs that use it, train smaller images or fewer splats, or continue with --device cpu",
+        "close other programs that use it, train smaller images or fewer splats, or continue on the CPU (--device cpu)",
     )
