@@ -243,7 +243,7 @@ class Device:
                 _open.cache_clear()
                 raise DeviceError(
                     f"{self.name} was lost (the driver was reset, or took too long)",
-                    "try again, on the CPU (--device cpu) if it happens again; a run keeps its last checkpoint for --resume",
+                    "try again, on the CPU (--device cpu) if it happens again; a run's checkpoint is kept for --resume",
                 ) from error
             raise
 
