@@ -23,7 +23,7 @@ from ..evaluate.evaluation_views import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
-from ..optimize.state import TrainState, new_state
+from ..optimize.state import TrainState, new_state, with_strain_color
 from ..optimize.tracking import with_refined_tracking
 from ..settings import Rates, TrainingSettings, validate
 from .checkpoint import read_checkpoint
@@ -147,8 +147,8 @@ def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
     return take
 
 
-def starting_state(continuation: Continuation) -> TrainState:
-    """The parent's avatar as a state of training.
+def starting_state(continuation: Continuation, strain_color: bool) -> TrainState:
+    """The parent's avatar as a state of training; strain_color: with coefficients of strain, zero where it had none.
 
     The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
     Raises StgaError where the avatar is not the one that the continuation was made for.
@@ -163,8 +163,10 @@ def starting_state(continuation: Continuation) -> TrainState:
         if all(np.array_equal(array, getattr(kept, name)) for name, array in vars(splats).items()):
             parameters = Parameters(*(tensor.clone() for tensor in state.average))
             zero = torch.zeros(len(state))
-            return replace(state, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
-    return new_state(splats)
+            state = replace(state, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
+            return with_strain_color(state) if strain_color else state
+    state = new_state(splats)
+    return with_strain_color(state) if strain_color else state
 
 
 def late_rates(rates: Rates, share: float) -> Rates:

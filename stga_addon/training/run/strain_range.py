@@ -25,7 +25,10 @@ def trained_strain_range(
     seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     if continuation is None:
         return seen
-    earlier = read_avatar(continuation.parent / "avatar.npz").strain_range
+    parent = read_avatar(continuation.parent / "avatar.npz")
+    earlier = parent.strain_range
+    if not parent.splats.strain_color.shape[1]:
+        return seen  # its colors follow strain only from here on
     if earlier is None:
         return None
     widest: np.ndarray = np.stack([np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])], 1)
