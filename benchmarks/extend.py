@@ -24,7 +24,7 @@ import numpy as np
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
-from stga_addon.effects.plan import with_effect_plan
+from stga_addon.effects.plan import with_effect_plan, with_effects_of_takes
 from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.optimize.exposure import exposure_correction
@@ -84,6 +84,7 @@ def main() -> None:
         else:
             wanted = Extension(parent, (new,), seconds=options.seconds, seed=seed)
             prepared, arms = prepare_extension(wanted, "cpu"), extend_arms
+            prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
         for name, arm in arms(prepared, seed).items():
             if not options.arms or name in options.arms:
                 compare(name, prepared, arm, options)
@@ -166,7 +167,7 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
     region = np.any(list(prepared.selection.values()), axis=0)
-    base = Trainer(capture, settings, prepared.selection, starting_state(continuation))
+    base = Trainer(capture, settings, prepared.selection, starting_state(continuation, settings.strain_color))
     count = int(region[base.state.face.numpy()].sum())
 
     def refined(start: float, growth: float) -> Arm:
@@ -201,7 +202,7 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     """Train one arm and print its quality before, during and after."""
     assert prepared.run.continuation is not None
     capture, clock = prepared.capture, CLOCKS[options.clock]
-    state = None if arm.anew else starting_state(prepared.run.continuation)
+    state = None if arm.anew else starting_state(prepared.run.continuation, arm.settings.strain_color)
     trainer = Trainer(capture, arm.settings, prepared.selection or {}, state)
     trainer.strategy = arm.strategy
     region = arm_region(prepared)

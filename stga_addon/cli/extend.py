@@ -39,6 +39,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    from ..effects.plan import with_effects_of_takes
     from ..training.run.continuation import prepare_extension
     from ..training.run.request import Extension
 
@@ -56,7 +57,10 @@ def run(options: Namespace) -> None:
     assert prepared.selection is not None
     share = np.any(list(prepared.selection.values()), axis=0).mean()
     print(f"takes: {1 + len(prepared.run.takes)}; the new ones need {share:.0%} of the triangles")
-    train_run(folder, prepared.run, prepared.capture, prepared.selection, resume=False)
+    run = with_effects_of_takes(prepared.run, prepared.capture)
+    if run.settings.strain_color != prepared.run.settings.strain_color:
+        print(next(f"strain-color  {decision}" for decision in run.effect_plan if decision.effect == "strain-color"))
+    train_run(folder, run, prepared.capture, prepared.selection, False, options.device == "auto")
 
 
 def _write_selection(path: Path, wanted: "Extension", flame: Path | None) -> None:

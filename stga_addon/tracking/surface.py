@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.model import evenly_spread
 from .fit import (
     HeadFit,
     TimestepLandmarks,
     by_visibility,
     observed_landmarks,
     rigid_start,
-    spread_over,
     triangulated,
 )
 from .head_model import HeadModel
@@ -105,7 +105,7 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
     several = [t for t in timesteps if len(take.landmarks[t].cameras) > 1]
     if not several:
         return fit
-    chosen = spread_over(several, SURFACE_TIMESTEPS)
+    chosen = evenly_spread(several, SURFACE_TIMESTEPS)
     visible = {
         t: by_visibility(own, fit.head, take.places, fit.parameters[t], fit.to_capture)
         for t, own in take.landmarks.items()

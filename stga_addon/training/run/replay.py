@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 from ..schedule import view_order
 from .folder import Continuation
 
@@ -65,8 +65,7 @@ def distinct_timesteps(capture: Capture, timesteps: Sequence[int], count: int = 
     """At most `count` timesteps: the most neutral one, then always the one farthest from all chosen so far."""
     if len(timesteps) <= count:
         return list(timesteps)
-    spread = np.unique(np.linspace(0, len(timesteps) - 1, min(MAX_CANDIDATES, len(timesteps))).round().astype(int))
-    candidates = [timesteps[n] for n in spread]
+    candidates = evenly_spread(timesteps, MAX_CANDIDATES)
     meshes = np.stack([capture.expression_mesh(timestep, "head").astype(np.float32) for timestep in candidates])
     chosen = [int(np.argmin(_distance(meshes, capture.neutral)))]
     nearest = _distance(meshes, meshes[chosen[0]])

@@ -1,12 +1,12 @@
 """Range of strain that a run has trained on, within which its avatar's colors follow strain."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from ...avatar.file import read_avatar
 from ...avatar.strain import seen_range, strain_basis
-from ...capture.model import Capture
+from ...capture.model import Capture, evenly_spread
 from .folder import Continuation
 
 MAX_TIMESTEPS = 64
@@ -21,17 +21,15 @@ def trained_strain_range(
     mesh: timestep -> (V, 3) that is trained on. None where the parent's avatar has no limits.
     """
     basis = strain_basis(capture.neutral, capture.faces)
-    seen = seen_range(basis, (mesh(timestep) for timestep in _measured(capture)))
+    timesteps = evenly_spread(sorted({view.timestep for view in capture.views["train"]}), MAX_TIMESTEPS)
+    seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     if continuation is None:
         return seen
-    earlier = read_avatar(continuation.parent / "avatar.npz").strain_range
+    parent = read_avatar(continuation.parent / "avatar.npz")
+    earlier = parent.strain_range
+    if not parent.splats.strain_color.shape[1]:
+        return seen  # its colors follow strain only from here on
     if earlier is None:
         return None
     widest: np.ndarray = np.stack([np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])], 1)
     return widest
-
-
-def _measured(capture: Capture) -> Sequence[int]:
-    timesteps = sorted({view.timestep for view in capture.views["train"]})
-    rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), MAX_TIMESTEPS)).round().astype(int)
-    return [timesteps[row] for row in rows]
