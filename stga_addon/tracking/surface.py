@@ -317,7 +317,7 @@ def _whole_take(
     sights: list[Sights] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
-        images, masks = take.images(t), _spread_cameras(take.masks(t))
+        images, masks = take.images(t), evenly_spread(take.masks(t), MAX_OUTLINE_CAMERAS)
         for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
             rough = replace(fit, parameters={t: start[number]})
             seen = seen_surface(rough, t, on, images, sweep, sights[stage])
@@ -328,12 +328,6 @@ def _whole_take(
     solved = solve_take(fit.head, _both(take.places, points[-1]), together, start)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
-
-
-def _spread_cameras(masks: Sequence[tuple[Camera, np.ndarray]]) -> Sequence[tuple[Camera, np.ndarray]]:
-    """Up to MAX_OUTLINE_CAMERAS of them."""
-    rows = spread_over(range(len(masks)), MAX_OUTLINE_CAMERAS)
-    return [masks[row] for row in rows]
 
 
 def _landmark_bias(fit: HeadFit, take: Take) -> np.ndarray:
