@@ -54,7 +54,7 @@ def _rim(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    return faces[np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE]
+    return np.asarray(faces[np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE])
 
 
 def _edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
