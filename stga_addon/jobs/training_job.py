@@ -22,7 +22,7 @@ from ..capture.open import open_capture
 from ..capture.region import write_region
 from ..errors import StgaError, shorten
 from ..files import read_json, write_json, write_npz
-from ..training.optimize.device import choose_device
+from ..raster.device import choose_device
 from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
 from ..training.run.request import Extension, Request, request_from_json, request_to_json
@@ -162,7 +162,10 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
 
         job = read_job(run)
         prepared = _prepare(run, job, lambda stage: writer.update(0.0, stage))
-        return train(prepared.capture, run, prepared.run, prepared.selection, job.resumes, _Report(writer, also))
+        return train(
+            prepared.capture, run, prepared.run, prepared.selection, job.resumes, _Report(writer, also),
+            falls_back=job.device == "auto",
+        )  # fmt: skip
 
 
 def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> "Prepared":

@@ -1,5 +1,6 @@
 """Training loop of a run: evaluations, checkpoints and resumption in a run folder."""
 
+import logging
 import signal
 import threading
 from collections import deque
@@ -16,7 +17,7 @@ import numpy as np
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture, evenly_spread
-from ...errors import StgaError
+from ...errors import DeviceError, StgaError
 from ...files import replacing
 from ...format import format_duration
 from ...selection import select_capture
@@ -62,15 +63,31 @@ def train(
     selection: dict[int, np.ndarray] | None = None,
     resume: bool = False,
     report: Report = lambda progress: False,
+    falls_back: bool = False,
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
     selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
     checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
+    falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
     Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or
     STGA_LPIPS names a file without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar and checkpoint
     are saved, a second one at once.
     """
+    try:
+        return _train(capture, out, run, selection, resume, report)
+    except DeviceError as error:
+        if not falls_back:
+            raise
+        logging.getLogger(__name__).warning("%s; continuing on the CPU from the last checkpoint", error.cause)
+        report(Progress(message="Continuing on the CPU"))
+        return _train(capture, out, replace(run, device="cpu"), selection, True, report)
+
+
+def _train(
+    capture: Capture, out: Path, run: Run, selection: dict[int, np.ndarray] | None, resume: bool, report: Report
+) -> Path:
+    """`train` on the device of the run."""
     lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
@@ -83,7 +100,7 @@ def train(
         has_begun = has_run and read_run(out).identity is not None
         run = replace(run, identity=check_identity(out, run, capture))
         report(Progress(message="Compiling kernels"))
-        precompile_kernels()
+        precompile_kernels(run.device)
         loop = _Loop(capture, out, run, report)
         if has_begun and (out / CHECKPOINT).exists():
             loop.resume()
