@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from . import analyze, ids, monitor, render_video, track
+from . import background, ids, monitor, render_video, track
 from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
@@ -23,6 +23,7 @@ from .pose import PoseHead
 from .preview_images import PreviewImages
 from .render_video import CancelVideo, DismissVideo, RenderVideo
 from .select import CountSelected, HeatMap, Select, ToggleRegion
+from .select_extension import SelectExtension
 from .show import MoreBounces, ShowAvatar, StandardView
 from .track import CancelTracking, DismissTracking, TrackFootage
 from .track_correct import MarkKey, SolveAgain, ViewFootage
@@ -48,6 +49,7 @@ CLASSES = (
     Train,
     Refine,
     Extend,
+    SelectExtension,
     CancelTraining,
     DismissTraining,
     CopyReport,
@@ -97,7 +99,7 @@ def register() -> None:
 def unregister() -> None:
     track.unregister()
     monitor.unregister()
-    analyze.stop()
+    background.stop()
     render_video.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)

@@ -28,6 +28,7 @@ from ..stga_addon.worker.status import WorkerState, inspect_worker, request_canc
 from . import ids, monitor
 from .common import file_path, is_head, reporting, scene_settings
 from .environment import has_training_python, training_python
+from .render_engine import render_device
 
 RECORDING_INTERVAL_S = 0.001
 """Between two recorded images, so that Blender handles its events."""
@@ -261,7 +262,9 @@ class _Recording:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
         self._cache, self._layers = SplatCache(), dict[int, list[PosedSplats]]()
-        job = VideoJob(output, len(frames), frames_per_second(context.scene), srgb_background(context.scene))
+        job = VideoJob(
+            output, len(frames), frames_per_second(context.scene), srgb_background(context.scene), render_device()
+        )
         folder, self._recorder = _start_recording(job)
         self.video = Video(output, folder, len(frames))
         last = _videos.get(context.scene.session_uid)

@@ -66,7 +66,7 @@ class Select(bpy.types.Operator):
         selection = select_capture(capture, SelectionOptions(self.threshold, self.zero_pose, tuple(names)))
         write_selection(head, selection)
         head[tags.KEY_REGIONS] = "\n".join(names)
-        _count(context, head)
+        count_selected(context.scene, head)
         if has_heat_map(head) and not shows_residuals(head):
             show_heat_map(head, _shares(head))
         moving = [faces.mean() for faces in selection.values() if faces.any()]
@@ -114,7 +114,7 @@ class CountSelected(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        _count(context, head_of(context))
+        count_selected(context.scene, head_of(context))
         return {"FINISHED"}
 
 
@@ -209,10 +209,10 @@ def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
     return replace(capture, regions={**capture.regions, **painted})
 
 
-def _count(context: Any, head: Any) -> None:
+def count_selected(scene: Any, head: Any) -> None:
     """Fill the panel's table of selected triangles."""
-    settings, splats = scene_settings(context), scene_settings(context).splats
-    per_face = splats_per_face(splats, head)
+    settings = getattr(scene, ids.SETTINGS)
+    per_face = splats_per_face(settings.splats, head)
     every = (TrainingSettings.lattice + 1) * (TrainingSettings.lattice + 2) // 2  # at the start of a training
     settings.selected_frames.clear()
     for timestep, selected in read_selection(head).items():

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
-from ..stga_addon.scene.display.hints import use_transparent_bounces, view_transform_hint
+from ..stga_addon.scene.display.hints import use_transparent_bounces
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
@@ -39,8 +39,7 @@ class ShowAvatar(bpy.types.Operator, FileImport):
         scene_settings(context).avatar = self.filepath
         if self.hide_head and head.library is not None:
             self.report({"WARNING"}, f"{head.name}: is linked, and covers the splats in renders; hide it in its file")
-        hint = view_transform_hint(context.scene)
-        self.report({"WARNING" if hint else "INFO"}, f"{len(avatar.splats)} splats" + (f". {hint}" if hint else ""))
+        self.report({"INFO"}, f"{len(avatar.splats)} splats")
         return {"FINISHED"}
 
 

@@ -22,6 +22,17 @@ class StgaError(Exception):
         super().__init__(one_line(message))
 
 
+class DeviceError(StgaError):
+    """A GPU that failed while it was in use: lost, or out of memory.
+
+    cause  the part of the sentence before the advice what to do
+    """
+
+    def __init__(self, cause: str, advice: str) -> None:
+        super().__init__(f"--device gpu: {cause}; {advice}")
+        self.cause = one_line(cause)
+
+
 def one_line(message: str) -> str:
     """The message in bounded length, with control characters and lone surrogates (of a path, say) as escapes."""
     return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS))

@@ -40,7 +40,7 @@ def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
         from raster import gpu_device
 
         gpu_device.device()  # or skip
-        from stga_addon.raster.gpu.autograd import render_differentiable
+        from raster.gpu_autograd import render_differentiable
 
         for module in (request.module, sys.modules["raster.test_kernels"]):
             if hasattr(module, "render_differentiable"):

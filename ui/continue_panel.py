@@ -4,10 +4,11 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..operators import ids
+from ..operators import background, ids
 from ..operators.common import is_head, scene_settings
 from ..stga_addon.scene.display.heat_map import shows_residuals
 from .sidebar import SidebarPanel
+from .text import draw_text
 from .train_panel import TrainPanel
 
 
@@ -24,7 +25,7 @@ class ContinuePanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         settings = scene_settings(context)
         _draw_refine(self.layout, settings)
-        _draw_extend(self.layout, settings)
+        _draw_extend(self.layout, context, settings)
 
 
 def _draw_refine(layout: Any, settings: Any) -> None:
@@ -56,10 +57,18 @@ def _draw_refine(layout: Any, settings: Any) -> None:
         refine.first, refine.last = settings.refine_first, max(settings.refine_first, settings.refine_last)
 
 
-def _draw_extend(layout: Any, settings: Any) -> None:
+def _draw_extend(layout: Any, context: Any, settings: Any) -> None:
     column = layout.column()
     column.prop(settings, "take", text="Take")
     column.prop(settings, "extend_seconds", text="Seconds")
     extend = column.operator(ids.EXTEND, icon="ADD")
     extend.directory, extend.device, extend.take = settings.run_folder, settings.device, settings.take
     extend.adapter, extend.seconds = settings.adapter, settings.extend_seconds
+    if background.running(context.scene):
+        row = column.row(align=True)
+        row.label(text="Analyzing…", icon="VIEWZOOM")
+        row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
+    else:
+        column.operator(ids.SELECT_EXTENSION, icon="GROUP_VERTEX").directory = settings.run_folder
+    if settings.extension_error:
+        draw_text(column, context, settings.extension_error, "ERROR")

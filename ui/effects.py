@@ -4,8 +4,7 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..operators import ids
-from ..operators.analyze import is_analyzing
+from ..operators import background, ids
 from ..operators.common import scene_settings
 from .sidebar import SidebarPanel
 from .text import draw_text
@@ -19,9 +18,9 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
-        if is_analyzing(context.scene):
+        if background.running(context.scene):
             row = layout.row(align=True)
-            row.label(text="Analyzing Capture…", icon="VIEWZOOM")
+            row.label(text="Analyzing…", icon="VIEWZOOM")
             row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
         else:
             layout.operator(ids.ANALYZE_CAPTURE, icon="VIEWZOOM")

@@ -103,7 +103,7 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
             layout.label(text="Solid mode shows no splat colors", icon="INFO")
             preview = layout.operator("wm.context_set_enum", text="Use Material Preview")
             preview.data_path, preview.value = "space_data.shading.type", "MATERIAL"
-        if view_transform_hint(context.scene):
+        elif view_transform_hint(context.scene):
             layout.label(text="View transform changes the colors", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)
 

@@ -1,4 +1,4 @@
-"""Preferences of the add-on: the FLAME model and the training environment."""
+"""Preferences of the add-on: the FLAME model, the training environment and the device that renders."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.common import register_classes, unregister_classes
 from ..operators.environment import environment_folder, has_training_python
+from ..operators.render_engine import render_device_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, status_folder
 from ..stga_addon.worker.status import WorkerState
@@ -31,8 +32,11 @@ class Preferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
     )
 
+    render_device: render_device_property()
+
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "flame_model")
+        self.layout.prop(self, "render_device")
         _draw_environment(self.layout.box(), context, self)
 
 

@@ -124,6 +124,7 @@ class SceneSettings(bpy.types.PropertyGroup):
     adapter: adapter_property()
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
+    extension_error: bpy.props.StringProperty(options={"HIDDEN"})  # why it could not be selected what Extend trains
     analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the analysis failed
     live_preview: bpy.props.BoolProperty(
         name="Live Preview", description="Update the splats every few seconds during training", default=True

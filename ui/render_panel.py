@@ -4,10 +4,8 @@ from typing import Any
 
 import bpy
 
-from ..operators import ids
 from ..operators.environment import has_training_python
 from ..stga_addon.raster.render_client import missing_packages
-from ..stga_addon.scene.display.hints import view_transform_hint
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.render.engine import ENGINE
 
@@ -28,9 +26,6 @@ class RenderPanel(bpy.types.Panel):
         layout.use_property_split = True
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
-        if view_transform_hint(context.scene):
-            layout.label(text="View transform changes the colors", icon="INFO")
-            layout.operator(ids.STANDARD_VIEW)
         if missing_packages() and not has_gpu_context():
             has_environment = has_training_python(context)
             renderer = "Rendered by the training environment" if has_environment else "No Python here can render"

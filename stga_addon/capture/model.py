@@ -1,13 +1,16 @@
 """Data model of a capture, independent of its layout on disk."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from ..flame.sequence import FlameSequence
 from .camera import Camera
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -50,3 +53,10 @@ class Capture:
     flame: FlameSequence | None = None
     given_selection: Mapping[int, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+
+def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
+    """At most `limit` of the items, such as views or timesteps: the first, the last, and those evenly between."""
+    if len(items) <= limit:
+        return list(items)
+    return [items[n] for n in np.linspace(0, len(items) - 1, limit).round().astype(int)]

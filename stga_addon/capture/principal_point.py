@@ -6,6 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from .camera import Camera
+from .model import evenly_spread
 from .transforms import PRINCIPAL_POINTS, Frame, with_principal_point
 
 MAX_VIEWS = 4
@@ -22,8 +23,7 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
     if find_spec("PIL") is None:
         return None
     apart = [frame for frame in frames if _conventions_differ(frame)]
-    spread = np.linspace(0, len(apart) - 1, min(MAX_VIEWS, len(apart))).astype(int)
-    outside = [_shares_outside(apart[index], mesh) for index in dict.fromkeys(spread.tolist())]
+    outside = [_shares_outside(frame, mesh) for frame in evenly_spread(apart, MAX_VIEWS)]
     known = [shares for shares in outside if shares is not None]
     if not known:
         return None

@@ -47,14 +47,14 @@ def add_effects(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_device(command: argparse.ArgumentParser, default: str = "auto") -> None:
+def add_device(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--device",
         type=device_name,
-        default=default,
+        default="auto",
         metavar="{auto,cpu,gpu,gpu:NAME}",
         help="gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto: a GPU if it is right "
-        f"and faster than the CPU in a trial of a second, else the CPU (default {default})",
+        "and faster than the CPU in a trial of a second, else the CPU (default)",
     )
 
 

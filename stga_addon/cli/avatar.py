@@ -41,7 +41,7 @@ def run(options: Namespace) -> None:
     _track(options, capture)
     tracked = perf_counter()
     training = training_options(options, capture, run_folder)
-    train_with_bar(run_folder, *prepare(training), training.resume)
+    train_with_bar(run_folder, *prepare(training), training.resume, falls_back=training.device == "auto")
     trained = perf_counter()
     blend = None if options.no_blend else _write_blend(options.out)
     print()

@@ -59,4 +59,5 @@ def resume_continuation(options: Namespace) -> None:
         raise StgaError(f"{options.run_folder}: does not continue another run; resume it with `stga train --resume`")
     device, why = device_of(opened.run, options.device)
     print(why)
-    train_run(options.run_folder, replace(opened.run, device=device), opened.capture, None, resume=True)
+    run = replace(opened.run, device=device)
+    train_run(options.run_folder, run, opened.capture, None, True, options.device == "auto")

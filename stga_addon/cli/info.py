@@ -25,7 +25,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 def run(options: Namespace) -> None:
     from ..capture.summary import summarize_capture
     from ..effects.plan import describe_effects, plan_effects
-    from ..training.optimize.device import choose_device
+    from ..raster.device import choose_device
 
     capture = open_named_capture(options)
     plan: tuple[Any, ...] = ()

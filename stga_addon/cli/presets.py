@@ -16,8 +16,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     from ..format import format_duration
+    from ..raster.device import choose_device
     from ..report.preset_timing import time_presets
-    from ..training.optimize.device import choose_device
 
     capture = open_named_capture(options)
     device, why = choose_device(options.device)

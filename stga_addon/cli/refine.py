@@ -39,4 +39,4 @@ def run(options: Namespace) -> None:
         options.run_folder, options.region, options.frames, options.growth, **budget_of(options, DEFAULT_SECONDS)
     )
     prepared = prepare_refinement(wanted, device, options.flame)
-    train_run(folder, prepared.run, prepared.capture, prepared.selection, resume=False)
+    train_run(folder, prepared.run, prepared.capture, prepared.selection, False, options.device == "auto")

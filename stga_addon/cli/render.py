@@ -68,13 +68,13 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         metavar="FILE",
         help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
     )
-    add_device(parser, default="cpu")
+    add_device(parser)
     parser.add_argument("--background", type=color, default="white", help="white, black or R,G,B in 0…1")
     add_principal_point(parser)
 
 
 def run(options: Namespace) -> None:
-    from ..training.optimize.device import choose_device
+    from ..raster.compose import Composer
 
     if options.video is not None and options.video.suffix.lower() != ".mp4":
         raise StgaError(f"{options.video}: a video's name ends in .mp4")
@@ -84,7 +84,8 @@ def run(options: Namespace) -> None:
     views = None
     if options.cameras is not None:
         views = [frame.view for frame in read_transforms(options.cameras, principal_point)]
-    options.device, _ = choose_device(options.device)
+    options.composer = Composer(options.device)
+    options.composer.choose()
     subject = _subject(options) if options.motion is None else _reenacted(options)
     if options.video is not None or options.turntable is not None:
         _film(options, subject, subject.views if views is None else views)
@@ -177,7 +178,7 @@ def _subject(options: Namespace) -> _Subject:
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
         return _Subject(
-            lambda view: render(splats, view.camera, options.background, device=options.device),
+            lambda view: render(splats, view.camera, options.background, composer=options.composer),
             (),
             lambda: np.median(splats.xyz, axis=0),
         )
@@ -191,7 +192,7 @@ def _subject(options: Namespace) -> _Subject:
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
-        lambda view: render_avatar(avatar, mesh(view), view.camera, options.background, options.device),
+        lambda view: render_avatar(avatar, mesh(view), view.camera, options.background, options.composer),
         capture.timesteps,
         lambda: _middle(capture.mesh(capture.timesteps[0])),
         [view for views in capture.views.values() for view in views],
@@ -217,7 +218,7 @@ def _reenacted(options: Namespace) -> _Subject:
         return sequence_mesh(sequence, timestep)
 
     return _Subject(
-        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background, options.device),
+        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background, options.composer),
         tuple(sequence.timesteps),
         lambda: _middle(mesh(sequence.timesteps[0])),
     )

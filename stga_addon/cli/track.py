@@ -5,6 +5,7 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import StgaError
 from ..jobs.delegate import OpenHead
 from .arguments import real_number, usable_path, whole_number
 
@@ -33,6 +34,11 @@ def add_footage(parser: ArgumentParser) -> None:
     points = parser.add_mutually_exclusive_group()
     points.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")
     points.add_argument("--detector", type=usable_path, metavar="TASK", help="MediaPipe's face_landmarker.task")
+    parser.add_argument(
+        "--download-detector",
+        action="store_true",
+        help="download Google's face_landmarker.task (4 MB) to the file of --detector, where there is none",
+    )
     parser.add_argument("--focal", type=real_number, metavar="PIXELS", help="focal length of a single camera")
     parser.add_argument("--start", type=whole_number(0), default=0, help="first timestep")
     parser.add_argument("--stop", type=whole_number(1), help="timestep to stop before")
@@ -62,6 +68,12 @@ def track_footage(options: Namespace, out: Path) -> "TrackingReport":
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import track
 
+    if options.download_detector:
+        from ..tracking.detector_file import download_task
+
+        if options.detector is None:
+            raise StgaError("--download-detector: give the file to write with --detector")
+        download_task(options.detector)
     frames = FrameRange(options.start, options.stop, options.step, dict(options.offset))
     footage = open_footage(options.footage, options.cameras, frames, options.focal)
     with _Bar() as bar:

@@ -56,7 +56,7 @@ def add_training(parser: ArgumentParser) -> None:
 
 def run(options: Namespace) -> None:
     run, capture, selection = prepare(options)
-    train_run(options.out, run, capture, selection, options.resume)
+    train_run(options.out, run, capture, selection, options.resume, falls_back=options.device == "auto")
 
 
 def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] | None]:
@@ -65,7 +65,7 @@ def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] |
     Raises StgaError.
     """
     from ..effects.plan import with_effect_plan
-    from ..training.optimize.device import choose_device
+    from ..raster.device import choose_device
     from ..training.run.open_run import device_of, open_run
 
     if not options.capture.is_dir():
@@ -88,12 +88,17 @@ def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] |
 
 
 def train_run(
-    folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
+    folder: Path,
+    run: "Run",
+    capture: Capture,
+    selection: dict[int, np.ndarray] | None,
+    resume: bool,
+    falls_back: bool,
 ) -> None:
     """Train a run into its folder with a progress bar, and print its summary."""
     from ..report.run_summary import report_run
 
-    avatar = train_with_bar(folder, run, capture, selection, resume)
+    avatar = train_with_bar(folder, run, capture, selection, resume, falls_back)
     for line in report_run(folder):
         print(line)
     print(f"avatar: {avatar}")
@@ -102,9 +107,16 @@ def train_run(
 
 
 def train_with_bar(
-    folder: Path, run: "Run", capture: Capture, selection: dict[int, np.ndarray] | None, resume: bool
+    folder: Path,
+    run: "Run",
+    capture: Capture,
+    selection: dict[int, np.ndarray] | None,
+    resume: bool,
+    falls_back: bool,
 ) -> Path:
     """Train a run into its folder with a progress bar; returns the avatar's path.
+
+    falls_back: see `run.loop.train`.
 
     Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
     """
@@ -124,7 +136,7 @@ def train_with_bar(
             draw()
             return bar.report(progress)
 
-        return train(capture, folder, run, selection, resume, report)
+        return train(capture, folder, run, selection, resume, report, falls_back)
 
 
 def _refuse_changes(options: Namespace, run: Any) -> None:

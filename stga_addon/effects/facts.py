@@ -6,7 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from ..avatar.strain import RANGE_MARGIN, STRAIN_GAIN
-from ..capture.model import Capture
+from ..capture.model import Capture, evenly_spread
 from ..flame.forward import FlameFrame
 from ..flame.sequence import joint_angles
 from ..flame.teeth import LOWER_LIP, TEETH_VERTICES, TEMPLATE_VERTICES, UPPER_LIP
@@ -104,9 +104,7 @@ class CaptureFacts:
     @cached_property
     def sampled_timesteps(self) -> tuple[int, ...]:
         """At most MAX_TIMESTEPS of the tracked timesteps, evenly spread."""
-        timesteps = self.capture.timesteps
-        rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), MAX_TIMESTEPS)).round().astype(int)
-        return tuple(timesteps[row] for row in rows)
+        return tuple(evenly_spread(self.capture.timesteps, MAX_TIMESTEPS))
 
     @cached_property
     def sampled(self) -> Capture:

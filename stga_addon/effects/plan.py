@@ -9,10 +9,12 @@ from ..errors import StgaError
 from ..training.effect_plan import EffectDecision
 from ..training.settings import TrainingSettings
 from .facts import CaptureFacts
-from .rules import EFFECTS, Effect, Verdict
+from .rules import EFFECTS, Effect, Verdict, strain_color
 
 if TYPE_CHECKING:
     from ..training.run.folder import Run
+
+STRAIN_COLOR = "strain-color"
 
 
 def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
@@ -25,6 +27,21 @@ def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run"
         return run
     settings, plan = plan_effects(capture, run.settings, device)
     return replace(run, settings=settings, effect_plan=plan)
+
+
+def with_effects_of_takes(run: "Run", capture: Capture) -> "Run":
+    """The run with strain color where all its takes together call for it and the run it continues went without.
+
+    Splats can be given no other effect later: coefficients of zero leave their color as it was. A user's choice stays.
+    capture: of all takes.
+    """
+    plan = {decision.effect: decision for decision in run.effect_plan}
+    before = plan.get(STRAIN_COLOR)
+    if before is None or before.on or before.choice != "auto":
+        return run
+    verdict = strain_color(CaptureFacts(capture, run.settings))
+    plan[STRAIN_COLOR] = replace(before, on=verdict.on, reason=verdict.reason)
+    return replace(run, settings=replace(run.settings, strain_color=verdict.on), effect_plan=tuple(plan.values()))
 
 
 def plan_effects(

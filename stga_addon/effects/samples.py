@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, unif
 from ..avatar.strain import color_range, face_strain, strain_basis
 from ..capture.camera import Camera
 from ..capture.images import read_view
-from ..capture.model import Capture, View
+from ..capture.model import Capture, View, evenly_spread
 
 MAX_VIEWS = 48
 MAX_TIMESTEPS = 12
@@ -72,9 +72,7 @@ class Samples:
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
     """At most MAX_VIEWS of them: timesteps evenly spread, cameras about equally often."""
-    timesteps = sorted({view.timestep for view in views})
-    if len(timesteps) > MAX_TIMESTEPS:
-        timesteps = [timesteps[n] for n in np.linspace(0, len(timesteps) - 1, MAX_TIMESTEPS).round().astype(int)]
+    timesteps = evenly_spread(sorted({view.timestep for view in views}), MAX_TIMESTEPS)
     rng = np.random.default_rng(seed)
     left: dict[int, list[View]] = {t: [view for view in views if view.timestep == t] for t in timesteps}
     used = dict.fromkeys((view.camera_index for view in views), 0)

@@ -9,6 +9,18 @@ def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
     return np.concatenate([np.cos(half), vectors * np.sinc(half / np.pi) / 2], axis=-1)
 
 
+def to_matrices(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; of zero ones, the identity."""
+    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(quaternions / np.maximum(length, 1e-12), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
 def to_axis_angle(quaternions: np.ndarray) -> np.ndarray:
     """(..., 3) radians of unit quaternions (..., 4); angles up to pi."""
     quaternions = np.where(quaternions[..., :1] < 0, -quaternions, quaternions)

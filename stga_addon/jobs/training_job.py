@@ -22,7 +22,7 @@ from ..capture.open import open_capture
 from ..capture.region import write_region
 from ..errors import StgaError, shorten
 from ..files import read_json, write_json, write_npz
-from ..training.optimize.device import choose_device
+from ..raster.device import choose_device
 from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
 from ..training.run.request import Extension, Request, request_from_json, request_to_json
@@ -162,12 +162,15 @@ def run_training_job(run: Path, also: "Report | None" = None) -> Path:
 
         job = read_job(run)
         prepared = _prepare(run, job, lambda stage: writer.update(0.0, stage))
-        return train(prepared.capture, run, prepared.run, prepared.selection, job.resumes, _Report(writer, also))
+        return train(
+            prepared.capture, run, prepared.run, prepared.selection, job.resumes, _Report(writer, also),
+            falls_back=job.device == "auto",
+        )  # fmt: skip
 
 
 def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) -> "Prepared":
     """The run to train (new, resumed or one that continues another), its capture and the selection."""
-    from ..effects.plan import with_effect_plan
+    from ..effects.plan import with_effect_plan, with_effects_of_takes
     from ..training.run.continuation import Prepared, prepare
 
     if job.resumes:
@@ -180,7 +183,10 @@ def _prepare(folder: Path, job: TrainingJob, report: Callable[[str], object]) ->
         device, reason = device_of(read_run(job.continues.parent), job.device)
         report(reason)
         report("Comparing the avatar with the images" if isinstance(job.continues, Extension) else "Opening the run")
-        return prepare(job.continues, device, job.flame)
+        prepared = prepare(job.continues, device, job.flame)
+        if isinstance(job.continues, Extension):
+            prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
+        return prepared
     assert job.settings is not None
     capture = open_capture(job.capture, job.flame, job.principal_point)
     device, reason = choose_device(job.device)

@@ -14,10 +14,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..capture.camera import Camera
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import check_writable, read_json, write_json
+from ..raster.compose import Composer
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..raster.render_protocol import pack_layers, receive, send, unpack_layers
+from ..training.settings import is_device
 from ..worker.launch import prepare_status_folder
 from ..worker.status import remove_status_folder, status_writer
 
@@ -34,12 +36,14 @@ class VideoJob:
     output      an .mp4 file, or a folder for PNGs
     images      how many
     background  sRGB in 0…1; None: transparent in PNGs, black in a video
+    device      as `raster.compose.Composer` takes it
     """
 
     output: Path
     images: int
     fps: float
     background: tuple[float, float, float] | None
+    device: str = "auto"
 
     @property
     def is_video(self) -> bool:
@@ -62,6 +66,7 @@ class Recorder:
                 "images": job.images,
                 "fps": job.fps,
                 "background": job.background,
+                "device": job.device,
             },
         )
         self._path = folder / IMAGES
@@ -110,7 +115,10 @@ def read_video_job(folder: Path) -> VideoJob:
         if background is not None:
             red, green, blue = map(float, background)
             background = red, green, blue
-        return VideoJob(Path(values["output"]), int(values["images"]), float(values["fps"]), background)
+        output, images, fps, device = values["output"], values["images"], values["fps"], values["device"]
+        if not is_device(device):
+            raise ValueError(f"device is {shorten(device)}")
+        return VideoJob(Path(output), int(images), float(fps), background, device)
     except (KeyError, TypeError, ValueError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
 
@@ -157,8 +165,7 @@ def _output(job: VideoJob) -> AbstractContextManager[Any]:
 
 
 def _images(folder: Path, job: VideoJob) -> Iterator[ComposedImage]:
-    from ..raster.cpu.compose import compose
-
+    composer = Composer(job.device)
     layers: list[PosedSplats] = []
     path = folder / IMAGES
     try:
@@ -167,6 +174,6 @@ def _images(folder: Path, job: VideoJob) -> Iterator[ComposedImage]:
                 message = receive(stream)
                 layers = unpack_layers(message, layers)
                 width, height, fl_x, fl_y, cx, cy = message["camera"].tolist()
-                yield compose(layers, Camera(int(width), int(height), fl_x, fl_y, cx, cy, message["pose"]))
+                yield composer.compose(layers, Camera(int(width), int(height), fl_x, fl_y, cx, cy, message["pose"]))
     except (OSError, EOFError, KeyError, ValueError) as error:
         raise StgaError(f"{path}: cannot be read as the images of a video ({type(error).__name__})") from error

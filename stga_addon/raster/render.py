@@ -21,8 +21,10 @@ from ..avatar.embedding import WORLD, FaceFrames
 from ..avatar.file import Avatar
 from ..avatar.splats import Splats
 from ..capture.camera import Camera
+from .compose import Composer
 from .cpu.layout import Parameters
 from .cpu.rasterize import frames_in_camera, render_forward
+from .posed_splats import PosedSplats
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -33,21 +35,20 @@ def render(
     background: tuple[float, float, float] = WHITE,
     frames: FaceFrames = WORLD,
     antialiased: bool = False,
-    device: str = "cpu",
+    composer: Composer | None = None,
 ) -> np.ndarray:
     """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
 
     splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH coefficients);
     positions in the frames of their triangles (`avatar.embedding.face_frames`), or in world meters with `WORLD`.
     camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether splats narrower than a
-    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained. device: "cpu", or "gpu:" and the
-    name of one of `gpu.device.adapters`.
+    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained. composer: chooses the device; the
+    CPU without one.
     """
-    if device != "cpu":
-        from .gpu.render import render_image
-
-        image = render_image(device.removeprefix("gpu:"), splats, camera, background, frames, antialiased)
-        return np.clip(image, 0, 1)
+    if composer is not None and composer.choose() != "cpu":
+        composed = composer.compose([PosedSplats(splats, frames, np.eye(4), antialiased)], camera)
+        behind = (1 - composed.alpha) * np.array(background, np.float32)[:, None, None]
+        return np.clip(composed.rgb + behind, 0, 1)
     parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
     output = render_forward(
         parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
@@ -61,10 +62,10 @@ def render_avatar(
     mesh: np.ndarray,
     camera: Camera,
     background: tuple[float, float, float] = WHITE,
-    device: str = "cpu",
+    composer: Composer | None = None,
 ) -> np.ndarray:
     """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of `render`."""
-    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, device)
+    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..errors import StgaError
 from ..worker.launch import start_python
+from .compose import Composer
 from .posed_splats import ComposedImage, PosedSplats
 from .render_protocol import pack_layers, receive, send
 
@@ -27,22 +28,32 @@ class RenderClient:
     """Renders layers for any thread, one image at a time.
 
     find_python: the interpreter of the server where this one lacks REQUIRED_PACKAGES; raises StgaError if none is set.
+    find_device: the device, as `Composer` takes it.
+
+    failure  why the CPU renders instead of a GPU that has failed; "" where none has
     """
 
-    def __init__(self, find_python: Callable[[], str]) -> None:
-        self._find_python = find_python
+    def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
+        self._find_python, self._find_device = find_python, find_device
         self._lock = threading.Lock()
+        self._composer = Composer()
         self._server: tuple[str, subprocess.Popen[bytes]] | None = None
+        self._server_device = self.failure = ""
         self._sent: Sequence[PosedSplats] | None = None
 
     def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
-        """`cpu.compose.compose`, in this process or by the server. Raises StgaError where neither can render."""
+        """`Composer.compose`, in this process or by the server. Raises StgaError where neither can render."""
         with self._lock:
-            if not missing_packages():
-                from .cpu.compose import compose
-
-                return compose(layers, camera, with_depth)
-            return self._request(layers, camera, with_depth)
+            device = self._find_device()
+            if missing_packages():
+                if device != self._server_device:
+                    self.close()
+                return self._request(layers, camera, with_depth)
+            if device != self._composer.wanted:
+                self._composer = Composer(device)
+            image = self._composer.compose(layers, camera, with_depth)
+            self.failure = self._composer.failure
+            return image
 
     def close(self) -> None:
         """End the server, if one is running; the next image starts another."""
@@ -71,14 +82,14 @@ class RenderClient:
             raise StgaError(
                 f"{python}: the render server exited unexpectedly; check the training environment, which needs numba"
             ) from error
-        self._sent = layers
+        self._sent, self.failure = layers, str(reply.get("failure", ""))
         if "error" in reply:
             raise StgaError(f"{python}: the render server could not render the image ({reply['error']})")
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
 
     def _start(self) -> tuple[str, subprocess.Popen[bytes]]:
-        python = self._python()
-        arguments = ["stga_addon.raster.render_server"]
+        python, self._server_device = self._python(), self._find_device()
+        arguments = ["stga_addon.raster.render_server", self._server_device]
         self._server = python, start_python(python, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         return self._server
 

@@ -68,7 +68,7 @@ def seconds_per_iteration(
     iterations have the weight that they have in a real run. Reading files is not measured: in a real run, the loader's
     thread does it.
     """
-    precompile_kernels()
+    precompile_kernels(device)
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)

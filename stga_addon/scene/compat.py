@@ -152,3 +152,16 @@ def has_scene_depth(space: Any) -> bool:
     Before 5.2, render engines leave it zero where overlays are off (seen in 4.3).
     """
     return bpy.app.version >= (5, 2) or space.overlay.show_overlays or space.shading.type in ("SOLID", "WIREFRAME")
+
+
+def working_space() -> str:
+    """The name of the color space that is "scene-linear" in the open file; always the same before Blender 5.0."""
+    spaces = getattr(bpy.data, "colorspace", None)
+    return str(spaces.working_space) if spaces else "Linear Rec.709"
+
+
+def choose_image_file(settings: Any, file_format: str, color_mode: str, color_depth: str) -> None:
+    """Choose the format of a scene's images (ImageFormatSettings), also where it was set to videos."""
+    if hasattr(settings, "media_type"):  # from Blender 5.0 on
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_mode, settings.color_depth = file_format, color_mode, color_depth

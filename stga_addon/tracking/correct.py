@@ -26,8 +26,8 @@ from .solve import (
 )
 from .write_capture import moving_arrays
 
-KEYS_FILE, SOLVED_FILE = "tracking_keys.npz", "tracking_solved.npz"
-"""In a corrected capture: the heads posed by hand, and the parameters as they were solved without them."""
+SOLVED_FILE = "tracking_solved.npz"
+"""In a corrected capture: the parameters as they were solved without keys."""
 DEFAULT_SPAN = 12
 """Timesteps before and after a key that it may change."""
 
@@ -58,7 +58,6 @@ def correct_capture(
     person = with_identity(capture.flame).model
     chosen = SurfacePoints(places.face[used], places.barycentric[used])
     found = corrected(person, chosen, solved, _with_landmarks(out, timesteps), rows, span)
-    write_npz(out / KEYS_FILE, {"timesteps": np.array(sorted(keys), np.int64), "parameters": _stacked(keys, solved)})
     for number, (timestep, values) in enumerate(zip(timesteps, found, strict=True)):
         path = out / PARAMETERS / f"{timestep:05d}.npz"
         write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
@@ -150,10 +149,6 @@ def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
 def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
     interpolated = set(read_json(out / REPORT_FILE)["interpolated"])
     return np.array([timestep not in interpolated for timestep in timesteps])
-
-
-def _stacked(keys: Mapping[int, np.ndarray], solved: np.ndarray) -> np.ndarray:
-    return np.stack([keys[timestep] for timestep in sorted(keys)]) if keys else np.zeros((0, solved.shape[1]))
 
 
 def _report_errors(out: Path, model: Path, places: SurfacePoints, used: np.ndarray) -> None:

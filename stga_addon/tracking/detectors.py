@@ -78,7 +78,8 @@ def make_detector(task: Path | None = None) -> Detector:
     if not hasattr(mediapipe, "solutions"):
         raise StgaError(
             f"mediapipe {mediapipe.__version__} has no network in its wheel; "
-            "give Google's face_landmarker.task with --detector, or install mediapipe==0.10.21 (Python 3.11 or 3.12)"
+            "give Google's face_landmarker.task with --detector, which --download-detector downloads, or install "
+            "mediapipe==0.10.21 (Python 3.11 or 3.12)"
         )
     return FaceMesh(mediapipe.solutions)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.model import evenly_spread
 from .head_model import HeadModel
 from .mesh_image import vertex_normals
 from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
@@ -82,7 +83,7 @@ def fit_head(
     """
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
-    spread = spread_over(several or timesteps, IDENTITY_TIMESTEPS)
+    spread = evenly_spread(several or timesteps, IDENTITY_TIMESTEPS)
     neutral = places.on(head.model.v_template, head.model.faces)
     scale = 1.0  # without several cameras, the head's own size decides
     found = {t: triangulated(take[t], reliable, neutral, scale) for t in spread}
@@ -100,8 +101,8 @@ def fit_head(
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
-        solved[:] = 0
-        solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
+        if not number:
+            solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
         solved = solve_take(subject, places, take_observed, solved)
         seen = {
             t: by_visibility(take[t], subject, places, values, world)
@@ -141,12 +142,6 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
         stretch = 1 + (points - center) @ rotation[2] / place[2]
     local = (points - center) @ rotation.T + place
     return np.asarray((local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3])
-
-
-def spread_over(timesteps: Sequence[int], count: int) -> list[int]:
-    """Up to `count` of the timesteps, evenly."""
-    rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), count)).round().astype(int)
-    return [timesteps[row] for row in rows]
 
 
 def triangulated(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:

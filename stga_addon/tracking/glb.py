@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import file_size, parse_json
+from ..flame.quaternions import to_matrices
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -89,13 +90,8 @@ def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.n
 def _transform(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], float).reshape(4, 4).T
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
     result = np.eye(4)
-    result[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    result[:3, :3] = to_matrices(np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), float), 1))
     result[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), float)
     result[:3, 3] = node.get("translation", (0, 0, 0))
     return result

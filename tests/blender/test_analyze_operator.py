@@ -83,17 +83,17 @@ def analyze(extension, monkeypatch, tmp_path):
 
     def start(body: str) -> None:
         python = write_interpreter(tmp_path / "python", body)
-        monkeypatch.setattr(extension.operators.analyze, "training_python", lambda context: python)
+        monkeypatch.setattr(extension.operators.background, "training_python", lambda context: python)
         assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
 
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     yield start
-    extension.operators.analyze.stop()
+    extension.operators.background.stop()
 
 
 def tick_until_done(extension) -> None:
     for _ in range(300):
-        if extension.operators.analyze.tick() is None:
+        if extension.operators.background.tick() is None:
             return
         time.sleep(0.02)
     raise AssertionError("the analysis did not end")
@@ -124,7 +124,7 @@ def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentenc
     analyze(body)
     tick_until_done(extension)
     assert re.match(sentence, chosen.analysis_error)
-    assert not extension.operators.analyze.is_analyzing(bpy.context.scene)
+    assert not extension.operators.background.running(bpy.context.scene)
 
 
 def test_analysis_can_be_cancelled(chosen, extension, analyze):
@@ -135,5 +135,5 @@ def test_analysis_can_be_cancelled(chosen, extension, analyze):
     assert bpy.ops.stga.cancel_analysis() == {"FINISHED"}
     assert time.monotonic() - begin < 60
     assert bpy.ops.stga.analyze_capture.poll()
-    assert extension.operators.analyze.tick() is None
+    assert extension.operators.background.tick() is None
     assert chosen.analysis_error == ""

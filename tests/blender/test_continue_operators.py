@@ -11,9 +11,10 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
-from stga_addon.files import read_npz  # noqa: E402
+from stga_addon.files import read_npz, write_npz  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 
+from .test_analyze_operator import write_interpreter  # noqa: E402
 from .test_operators import write_ball_avatar  # noqa: E402
 
 
@@ -115,6 +116,29 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
         bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run.parent))
 
 
+def test_what_an_extension_would_train_is_selected(head, run, extension, monkeypatch, tmp_path):
+    """Catches a selection of other frames or triangles than the worker found, and a failure that shows nowhere."""
+    selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
+    selection[3] = ~selection[3]
+    given = tmp_path / "given.npz"
+    write_npz(given, {f"{timestep:05d}": faces for timestep, faces in selection.items()})
+    body = f"import shutil\nshutil.copy({str(given)!r}, sys.argv[-1])"
+    program = write_interpreter(tmp_path / "python", body)
+    monkeypatch.setattr(extension.operators.background, "training_python", lambda context: program)
+    settings = bpy.context.scene.stga
+    assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
+    shown = extension.stga_addon.scene.vertex_groups.read_selection(head)
+    for timestep, faces in selection.items():
+        assert shown[timestep][faces].all()
+        assert shown[timestep].mean() < 0.9 or timestep
+    assert not shown[1].any()
+    assert [row.frame for row in settings.selected_frames if row.triangles] == [0, 3]
+    program = write_interpreter(tmp_path / "python", "sys.exit('stga: no such run')")
+    with pytest.raises(RuntimeError, match="no such run"):
+        bpy.ops.stga.select_extension(directory=str(run))
+    assert settings.extension_error == "no such run"
+
+
 @pytest.mark.slow
 def test_refine_and_extend_end_to_end(head, tmp_path):
     """Catches a job that the worker does not understand, and an avatar that is not that of the continued run."""
@@ -127,6 +151,8 @@ def test_refine_and_extend_end_to_end(head, tmp_path):
     assert not same.all()
     assert same[before.face >= 80].all()
     take = write_mesh_capture(tmp_path / "take")
+    bpy.ops.stga.import_capture(directory=str(take))
+    assert bpy.ops.stga.select_extension(directory=str(tmp_path / "run_2")) == {"FINISHED"}
     assert bpy.ops.stga.extend(directory=str(tmp_path / "run_2"), take=str(take), iterations=4) == {"FINISHED"}
     assert len(read_run(tmp_path / "run_3").takes) == 1
     assert bpy.context.scene.stga.avatar == str(tmp_path / "run_3" / "avatar.npz")

@@ -15,7 +15,7 @@ from mathutils import Matrix  # noqa: E402
 from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.errors import DeviceError, StgaError  # noqa: E402
 from stga_addon.raster.cpu.project import _basis  # noqa: E402
 from stga_addon.raster.render import render as render_splats  # noqa: E402
 from stga_addon.raster.render import render_avatar  # noqa: E402
@@ -23,7 +23,7 @@ from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
-from stga_addon.scene.render import engine  # noqa: E402
+from stga_addon.scene.render import engine, view_transform  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
 from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
@@ -43,6 +43,7 @@ def _engine(empty_scene):
     scene.render.engine = engine.ENGINE
     scene.render.resolution_x, scene.render.resolution_y = WIDTH, HEIGHT
     scene.render.film_transparent = True
+    scene.view_settings.view_transform = "Standard"
     scene.view_layers[0].use_pass_z = True
     yield
     engine.unregister()
@@ -220,6 +221,79 @@ def test_standard_view_transform_shows_trained_colors(tmp_path):
     middle = pixels.reshape(HEIGHT, WIDTH, 4)[HEIGHT // 2, WIDTH // 2]
     np.testing.assert_allclose(middle[:3], trained, atol=0.6 / 255)
     assert middle[3] > 0.99
+
+
+def skin_tones():
+    """A sheet of soft splats in mid-tones of skin, in front of the camera."""
+    rng, count = np.random.default_rng(8), 600
+    base = rng.uniform(0.3, 0.75, (count, 1))
+    colors = base * [1, 0.8, 0.68] + rng.normal(0, 0.02, (count, 3))
+    splats = replace(
+        random_splats(1, count, degree=0),
+        xyz=np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)]).astype(np.float32),
+        log_scale=np.full((count, 3), -3.2, np.float32),
+        opacity=np.full(count, 3, np.float32),
+        sh=((colors - 0.5) / 0.28209479177387814).astype(np.float32).reshape(count, 1, 3),
+    )
+    show_world_splats(splats, "skin")
+    active_camera((0, 0, 1))
+
+
+def saved_picture(folder: Path, **view: object) -> np.ndarray:
+    """(H, W, 4) values 0 to 255 of the image that Blender saves of a render through these view settings."""
+    scene = bpy.context.scene
+    scene.view_settings.look = "None"
+    scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
+    for name, value in {"exposure": 0, "gamma": 1, **view}.items():
+        setattr(scene.view_settings, name, value)
+    file = scene.render.image_settings
+    if hasattr(file, "media_type"):
+        file.media_type = "IMAGE"
+    file.file_format, file.color_mode, file.color_depth = "PNG", "RGBA", "16"
+    scene.render.dither_intensity = 0
+    scene.render.filepath = str(folder / "picture.png")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    image.colorspace_settings.name = "Non-Color"
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return 255 * pixels.reshape(HEIGHT, WIDTH, 4)
+
+
+@pytest.mark.parametrize("transparent", [True, False])
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"view_transform": "AgX"},
+        {"view_transform": "Filmic"},
+        {"view_transform": "AgX", "look": "AgX - Medium High Contrast", "exposure": 0.5, "gamma": 1.1},
+        {"view_transform": "Standard", "exposure": -0.5},
+    ],
+)
+def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
+    """Catches colors that a scene in AgX or Filmic changes, at soft edges too, and data that a measurement leaves."""
+    skin_tones()
+    bpy.context.scene.render.film_transparent = transparent
+    trained = saved_picture(tmp_path, view_transform="Standard")
+    before = len(bpy.data.images), len(bpy.data.scenes)
+    shown = saved_picture(tmp_path, **view)
+    assert (len(bpy.data.images), len(bpy.data.scenes)) == before
+    covered = (trained[..., 3] > 128) & (trained[..., :3].min(-1) > 30)
+    assert covered.mean() > 0.3
+    difference = np.abs(shown - trained)[covered]
+    assert difference.mean() <= 1.5
+    assert np.percentile(difference, 99) <= 6
+
+
+def test_standard_needs_no_table():
+    """Catches a table between the trained colors and the image where the view transform needs none."""
+    scene = bpy.context.scene
+    for name in ("Standard", "Raw"):
+        scene.view_settings.view_transform = name
+        assert not view_transform.needs_inverse(scene)
+    scene.view_settings.view_transform = "AgX"
+    assert view_transform.needs_inverse(scene)
 
 
 def test_depth_in_meters(tmp_path):
@@ -410,6 +484,36 @@ def test_changed_topology_is_refused():
         bpy.ops.render.render()
 
 
+def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
+    """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a silent failure."""
+    from raster import gpu_device
+
+    from stga_addon.raster.gpu import compose as on_gpu
+
+    monkeypatch.setattr(engine, "draw_image", lambda layers, camera: None)
+    wanted = ["cpu"]
+    engine.unregister()
+    engine.register(no_python, lambda: wanted[0])
+    show(textured(avatar_of("stga"), -6))
+    camera_at()
+    on_cpu = render(tmp_path)
+    wanted[0] = f"gpu:{gpu_device.device().name}"
+    passes = render(tmp_path)
+    assert engine._client._composer.device == wanted[0]
+    for channel in "RGBA":
+        np.testing.assert_allclose(passes[channel], on_cpu[channel], atol=1e-4)
+    seen = on_cpu["A"] > 0.05
+    assert seen.any()
+    np.testing.assert_allclose(passes["Depth"][seen], on_cpu["Depth"][seen], rtol=1e-3)
+
+    def lost(*_: object) -> None:
+        raise DeviceError("Card 9000 was lost", "try again")
+
+    monkeypatch.setattr(on_gpu, "compose", lost)
+    with pytest.raises(RuntimeError, match="Card 9000 was lost; try again"):
+        render(tmp_path)
+
+
 def test_panels_drop_the_engine_on_unregister():
     """Catches panels that still list the engine after it was unregistered."""
 
@@ -434,7 +538,7 @@ def test_interpreter_is_looked_up_by_the_main_thread(monkeypatch):
             raise answer
         return answer
 
-    interpreter = engine.Interpreter(find)
+    interpreter = engine.Interpreter(find, lambda: "cpu")
     interpreter.update()
     with pytest.raises(StgaError, match="no environment"):
         interpreter.path()

@@ -158,10 +158,10 @@ def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path, monkeypatch:
     from raster import gpu_device
 
     gpu_device.device()  # or skip
-    from stga_addon.raster.gpu import render as gpu_render
+    from stga_addon.raster.gpu import compose as gpu
 
-    rendered = Mock(side_effect=gpu_render.render_image)
-    monkeypatch.setattr(gpu_render, "render_image", rendered)
+    rendered = Mock(side_effect=gpu.compose)
+    monkeypatch.setattr(gpu, "compose", rendered)
     cameras = root / "transforms_val.json"
     for device in ("cpu", "gpu"):
         out = tmp_path / device

@@ -8,7 +8,8 @@ from capture import factory
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.effects import plan as planning
-from stga_addon.effects.plan import with_effect_plan
+from stga_addon.effects.plan import with_effect_plan, with_effects_of_takes
+from stga_addon.effects.rules import Verdict
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.run.folder import Run, read_run, write_run
@@ -36,6 +37,23 @@ def test_the_run_keeps_its_plan(trained):
     assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == ("off", False, False)
     assert plan["exposure"].choice == "auto"
     assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
+
+
+@pytest.mark.parametrize(("choice", "expected"), [("auto", True), ("off", False)])
+def test_takes_can_call_for_strain_color(root, monkeypatch, choice, expected):
+    """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is overruled."""
+    capture = open_capture(root)
+    settings = make_settings(iterations=1, effects={} if choice == "auto" else {"strain-color": choice})
+    run = with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
+    assert not run.settings.strain_color
+    monkeypatch.setattr(planning, "strain_color", lambda facts: Verdict(True, "two takes say so"))
+    extended = with_effects_of_takes(run, capture)
+    assert extended.settings.strain_color == expected
+    changed = [now for now, then in zip(extended.effect_plan, run.effect_plan, strict=True) if now != then]
+    assert [(each.effect, each.on, each.reason) for each in changed] == expected * [
+        ("strain-color", True, "two takes say so")
+    ]
+    assert with_effects_of_takes(extended, capture) == extended
 
 
 def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):

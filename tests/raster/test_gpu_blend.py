@@ -64,8 +64,9 @@ def on_device(
     v_image, v_transmittance = device.upload("v_image", v[0]), device.upload("v_transmittance", v[1])
     with device.record() as work:
         chosen = choose_tiles(work, count, tiles, **given)
-        lists = list_pairs(work, count, tiles, CAPACITY, depth_key=keys, chosen=chosen, **given)
-        shared |= {"tile_range": chosen.tile_range, "pairs": lists.pairs}
+        projected = shared["projected"]
+        lists = list_pairs(work, count, tiles, CAPACITY, depth_key=keys, projected=projected, chosen=chosen, **given)
+        shared |= {"tile_range": chosen.tile_range, "pair_slot": lists.pair_slot, "slot_splat": lists.slot_splat}
         image, pixels = blend_forward(work, area, tiles, rendered=chosen.rendered, **shared)
         v_pixels = {"v_image": v_image, "v_transmittance": v_transmittance}
         pair_gradients = blend_backward(

@@ -19,7 +19,7 @@ from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, new_pr
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.frames import Embedding
 from stga_addon.raster.gpu.layout import HIDDEN, VIEW, splat_rows, split_rows
-from stga_addon.raster.gpu.project import mark_focus, project, project_backward
+from stga_addon.raster.gpu.project import mark_focus, project, project_backward, projected_tables
 
 FRAME_TOLERANCE = 2e-6
 """Of origins in meters and of rotations times scale: float32 at a few meters from the camera."""
@@ -109,7 +109,8 @@ def run_forward(device: Device, case: Case) -> tuple[np.ndarray, np.ndarray, np.
     """projected (N, PROJECTED), depth keys (N,) and tile bounds (N, 4)."""
     n, buffers = len(case.face), case.upload(device)
     with device.record() as work:
-        out = project(work, n, **buffers)
+        out = projected_tables(device, n)
+        project(work, n, out, **buffers)
     keys, bounds = device.read(out.depth_key, (n,), np.uint32), device.read(out.rect, (n, 4), np.int32)
     return device.read(out.projected, (n, PROJECTED)), keys, bounds
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from raster import gpu_device
+from stga_addon.raster.cpu.layout import PROJECTED, TILE
 from stga_addon.raster.gpu.device import Device
-from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED
-from stga_addon.raster.gpu.tiles import choose_tiles, counts_buffer, list_pairs, sort_keys
+from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED, WORKGROUP
+from stga_addon.raster.gpu.tiles import INCLUDE, choose_tiles, counts_buffer, list_pairs, sort_keys
 
 TILES_X, TILES_Y = 9, 7
 CAPACITY = 1 << 16
@@ -60,22 +61,27 @@ def scene(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 def listed(
     device: Device, depth_key: np.ndarray, rect: np.ndarray, capacity: int = CAPACITY,
-    focus: np.ndarray | None = None, ring: int = 0,
+    focus: np.ndarray | None = None, ring: int = 0, columns: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Run the kernels; the tables by name."""
+    """Run the kernels; the tables by name. columns (N, PROJECTED): splats that fill their bounds by default."""
     count, tiles = len(rect), TILES_X * TILES_Y
+    if columns is None:
+        columns = np.tile(np.float32([0, 0, 1e-9, 0, 1e-9, 1, 0, 0, 0]), (count, 1))
     view, rects = view_of(device, count, capacity, focus is not None, ring), device.upload("rect", rect)
     given = {"view": view, "rect": rects}
     given["focus"] = None if focus is None else device.upload("focus", focus.astype(np.uint32))
     keys = device.upload("depth_key", depth_key)
     with device.record() as work:
         chosen = choose_tiles(work, count, tiles, **given)
-        lists = list_pairs(work, count, tiles, capacity, depth_key=keys, chosen=chosen, **given)
+        projected = device.upload("projected", columns)
+        lists = list_pairs(work, count, tiles, capacity, depth_key=keys, projected=projected, chosen=chosen, **given)
     counts = device.read(counts_buffer(device), (COUNTS,), np.uint32)
     shapes = {"touched": (tiles,), "rendered": (tiles,), "tile_range": (tiles, 2)}
-    shapes |= {"pairs": (int(counts[PAIRS]), 2), "slots": (count, 2), "wanted": (count,)}
+    shapes |= dict.fromkeys(("pair_slot", "slot_splat"), (int(counts[PAIRS]),))
+    shapes |= {"slots": (count, 2), "wanted": (count,)}
     tables = chosen._asdict() | lists._asdict()
-    return {name: device.read(tables[name], shape, np.uint32) for name, shape in shapes.items()} | {"counts": counts}
+    found = {name: device.read(tables[name], shape, np.uint32) for name, shape in shapes.items()}
+    return found | {"counts": counts, "pair_splat": found["slot_splat"][found["pair_slot"]] & (WANTED - 1)}
 
 
 def expected_lists(depth_key: np.ndarray, rect: np.ndarray, rendered: np.ndarray) -> list[list[int]]:
@@ -96,7 +102,7 @@ def test_every_tile_lists_its_splats_near_to_far(device: Device, count: int, foc
     depth_key, rect = scene(count)
     focus = np.random.default_rng(1).random(count) < 3 / count if focused else None
     found = listed(device, depth_key, rect, focus=focus, ring=1)
-    rendered, splat, slot = found["rendered"], found["pairs"][:, 0] & (WANTED - 1), found["pairs"][:, 1]
+    rendered, splat, slot = found["rendered"], found["pair_splat"], found["pair_slot"]
     if focused:
         grid = found["touched"].reshape(TILES_Y, TILES_X)
         padded = np.pad(grid, 1)
@@ -115,7 +121,7 @@ def test_every_tile_lists_its_splats_near_to_far(device: Device, count: int, foc
     assert ((slot >= start[splat]) & (slot < (start + pairs)[splat])).all()
     wanted = (pairs > 0) & (True if focus is None else focus)
     np.testing.assert_array_equal(found["wanted"], wanted)
-    np.testing.assert_array_equal(found["pairs"][:, 0] >= WANTED, wanted[splat])
+    np.testing.assert_array_equal(found["slot_splat"][slot] >= WANTED, wanted[splat])
 
 
 def test_more_tiles_than_a_digit_holds(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +132,7 @@ def test_more_tiles_than_a_digit_holds(device: Device, monkeypatch: pytest.Monke
     found = listed(device, depth_key, rect)
     for tile, members in enumerate(expected_lists(depth_key, rect, found["rendered"])):
         first, past = found["tile_range"][tile]
-        assert (found["pairs"][first:past, 0] & (WANTED - 1)).tolist() == members, tile
+        assert found["pair_splat"][first:past].tolist() == members, tile
 
 
 def test_pairs_that_do_not_fit_change_nothing_until_the_host_makes_room(device: Device) -> None:
@@ -145,9 +151,70 @@ def test_pairs_that_do_not_fit_change_nothing_until_the_host_makes_room(device: 
 
 
 def test_a_count_beyond_32_bits_is_too_many(device: Device) -> None:
-    """Catches a sum that wraps around to a small number."""
-    rect = np.tile(np.int32([0, 0, 60_000, 30_000]), (1000, 1))
-    found = listed(device, np.arange(1000, dtype=np.uint32), rect)
+    """Catches a sum that wraps around to a small number: of three workgroups with 2³¹ − 1 pairs each."""
+    names = ("order", "rect", "rendered", "projected", "focus", "wanted")
+    given = {name: device.upload(f"unused {name}", np.zeros(4, np.uint32)) for name in names}
+    until = device.upload("pairs_until", np.full(3 * WORKGROUP + 3, 0x7FFFFFFF, np.uint32))
+    given |= {"view": view_of(device, 3 * WORKGROUP), "counts": counts_buffer(device), "pairs_until": until}
+    with device.record() as work:
+        work.dispatch(device.kernel("count_pairs", "total", INCLUDE), (1, 1, 1), **given)
+    counts = device.read(counts_buffer(device), (COUNTS,), np.uint32)
     device.upload("counts", np.zeros(COUNTS, np.uint32))
-    assert found["counts"][NEEDED] == 0x7FFFFFFF
-    assert found["counts"][OVERFLOWED] == 1
+    assert counts[NEEDED] == 0x7FFFFFFF
+    assert counts[OVERFLOWED] == 1
+
+
+def ellipses(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Projected columns (count, PROJECTED) of splats on the grid and around it, and their bounds in tiles."""
+    rng, size = np.random.default_rng(5), np.array([TILES_X, TILES_Y]) * TILE
+    longest, shortest = {"round": (30, 2), "needles": (90, 0.6), "tiny": (0.7, 0.55), "huge": (3000, 200)}[kind]
+    turn = rng.uniform(0, np.pi, count)
+    axes = np.stack([np.stack([np.cos(turn), np.sin(turn)], -1), np.stack([-np.sin(turn), np.cos(turn)], -1)], 1)
+    sigma = np.exp(rng.uniform(np.log(shortest), np.log(longest), (count, 2)))
+    if kind == "needles":
+        sigma[:, 1] = shortest
+    covariance = np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes)
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    opacity = rng.uniform(0.005, 1, count)
+    mean = rng.uniform((-20, -20), size + 20, (count, 2))
+    columns = np.zeros((count, PROJECTED), np.float32)
+    columns[:, :6] = np.stack([*mean.T, yy / (xx * yy - xy**2), xy / yy, 1 / yy, opacity], -1)
+    extent = np.sqrt(2 * np.log(255 * opacity))[:, None] * np.sqrt(np.stack([xx, yy], -1))
+    first = np.clip(np.floor((mean - extent) / TILE), 0, (TILES_X, TILES_Y))
+    past = np.clip(np.ceil((mean + extent) / TILE), 0, (TILES_X, TILES_Y))
+    rect = np.concatenate([first, past], 1).astype(np.int32)
+    return columns, np.where((past > first).all(1)[:, None], rect, 0)
+
+
+def reached(columns: np.ndarray, spare: float) -> np.ndarray:
+    """(N, tiles) bool: whether a pixel of the tile has its center in the outline, made larger by a share `spare`."""
+    x, y = (np.arange(side * TILE) + 0.5 for side in (TILES_X, TILES_Y))
+    found = []
+    for mean_x, mean_y, precision_x, shear, precision_y, opacity in columns[:, :6].astype(np.float64):
+        dy = (y - mean_y)[:, None]
+        inside = precision_x * (x - mean_x - shear * dy) ** 2 + precision_y * dy**2 <= 2 * np.log(255 * opacity) * (
+            1 + spare
+        )
+        found.append(inside.reshape(TILES_Y, TILE, TILES_X, TILE).any(axis=(1, 3)).ravel())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("kind", ["round", "needles", "tiny", "huge"])
+def test_a_splat_is_listed_where_its_outline_reaches(device: Device, kind: str) -> None:
+    """Catches a tile whose pixels lose a splat, and lists as long as those of bounding boxes."""
+    columns, rect = ellipses(kind, 300)
+    depth = np.random.default_rng(2).integers(1, 90, 300).astype(np.uint32)
+    visible = rect[:, 2] > rect[:, 0]
+    found = listed(device, np.where(visible, depth, np.uint32(HIDDEN)), rect, columns=columns)
+    np.testing.assert_array_equal(found["wanted"], visible)  # as on the CPU, also where no pixel is reached
+    pairs = np.zeros((300, TILES_X * TILES_Y), bool)
+    for tile, (first, past) in enumerate(found["tile_range"]):
+        members = found["pair_splat"][first:past]
+        assert (np.diff(depth[members].astype(int)) >= 0).all(), tile
+        pairs[members, tile] = True
+    assert not (reached(columns, -1e-5) & ~pairs).any()
+    boxes = np.prod(rect[:, 2:] - rect[:, :2], axis=1).sum()
+    assert pairs.sum() == found["counts"][PAIRS] <= boxes
+    assert (pairs & ~reached(columns, 0.02)).sum() <= 0.02 * pairs.sum() + (60 if kind == "tiny" else 10)
+    if kind == "needles":
+        assert pairs.sum() < 0.5 * boxes

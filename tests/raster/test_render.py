@@ -83,6 +83,7 @@ def test_a_gpu_renders_the_same_picture() -> None:
     from raster import gpu_device
     from stga_addon.avatar.embedding import face_frames
     from stga_addon.avatar.strain import strain_basis
+    from stga_addon.raster.compose import Composer
 
     posed, neutral, faces = bent_ball()
     count, random = len(faces), np.random.default_rng(3)
@@ -100,6 +101,7 @@ def test_a_gpu_renders_the_same_picture() -> None:
     camera = look_at((0, 0, 2.5 * size), posed.mean(0), width=90, height=70, focal_length=150)
     frames = face_frames(posed, faces, neutral, "stga", strain_basis(neutral, faces))
     expected = render(splats, camera, (0.2, 0.9, 0.4), frames, antialiased=True)
-    got = render(splats, camera, (0.2, 0.9, 0.4), frames, True, device=f"gpu:{gpu_device.device().name}")
+    composer = Composer(f"gpu:{gpu_device.device().name}")
+    got = render(splats, camera, (0.2, 0.9, 0.4), frames, True, composer)
     assert np.abs(got - np.float32([0.2, 0.9, 0.4])[:, None, None]).max() > 0.2
     np.testing.assert_allclose(got, expected, atol=1e-5)

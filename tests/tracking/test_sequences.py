@@ -90,6 +90,14 @@ def test_other_size_than_calibrated(tmp_path):
         open_footage(tmp_path)
 
 
+def test_size_that_changes_in_the_take(tmp_path):
+    """Catches a resolution that was changed while recording, which is noticed only when all cameras have been read."""
+    write_folders(tmp_path)
+    write_image(tmp_path / "images/b/frame_3.png", size=(20, 15))
+    with pytest.raises(StgaError, match=r"frame_3.png: has 20 x 15 pixels at timestep 2, but camera b has 40 x 30"):
+        open_footage(tmp_path)
+
+
 def test_masks_beside_the_images(tmp_path):
     """Catches masks of another camera or frame, and COLMAP's names of masks."""
     write_folders(tmp_path)

@@ -165,6 +165,18 @@ def test_a_camera_that_does_not_fit_is_named(recorded, capsys):
     assert not (folder / "out/transforms_train.json").exists()
 
 
+def test_a_camera_out_of_step_is_named(recorded, capsys):
+    """Catches a camera that was started later, whose head is averaged into everyone's."""
+    folder, _ = recorded
+    arrays = dict(np.load(folder / "points/cam3.npz"))
+    arrays["points"] = np.roll(arrays["points"], 3, axis=0)
+    write_npz(folder / "points/cam3.npz", arrays)
+    assert command(folder) == 2
+    message = capsys.readouterr().err
+    assert re.search(r"camera cam3: .* at timestep \d, .* check its calibration, synchronization", message)
+    assert not (folder / "out/transforms_train.json").exists()
+
+
 @pytest.mark.parametrize("factor", [0.95, 1.05])
 def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
     """Catches a camera whose focal length is 5 % off, which moves landmarks less than a detector's own errors."""

@@ -3,7 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,14 @@ import pytest
 from capture import factory
 from PIL import Image
 
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
-from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
+from stga_addon.files import read_npz
+from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_SHARE, ExtendStrategy
+from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
@@ -56,8 +60,8 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
-def extend(parent: Path, take: Path, out: Path, stop: int | None = None) -> Path:
-    prepared = prepare_extension(Extension(parent, (take,), iterations=ITERATIONS), "cpu")
+def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0) -> Path:
+    prepared = prepare_extension(Extension(parent, (take,), growth, iterations=ITERATIONS), "cpu")
 
     def report(progress: Progress) -> bool:
         return progress.iteration == stop
@@ -100,6 +104,18 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
     assert selected[front & (height < 0)].mean() < 0.1
 
 
+def test_selection_is_written_without_training(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches a selection at the joined takes' timesteps instead of the new take's own, and a run that is begun."""
+    path = tmp_path / "selection.npz"
+    assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
+    expected = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu").selection
+    written = read_npz(path)
+    assert list(written) == ["00000", "00001", "00003"]
+    assert all(np.array_equal(written[f"{timestep - 4:05d}"], faces) for timestep, faces in expected.items())
+    assert not parent.with_name("run_2").exists()
+    assert main(["extend", str(parent), str(takes[1]), str(takes[0]), "--select-only", str(path)]) == 2
+
+
 def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
     """Catches what was forgotten hidden in a mean, and an extension that does not learn the new take."""
     first, *_, last = read_metrics(extend(parent, takes[1], tmp_path / "extended"))
@@ -108,32 +124,57 @@ def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tm
     assert last["psnr_take_1"] != last["psnr_take_2"]
 
 
+@pytest.mark.parametrize("growth", [0.0, 0.5])
 def test_a_stopped_extension_is_continued_to_the_same_bits(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path, growth: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches an order, a selection or a take that a resumed extension does not find again."""
-    whole = extend(parent, takes[1], tmp_path / "whole")
-    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7)
+    """Catches an order, a selection, a take or a count of splats that a resumed extension does not find again."""
+    monkeypatch.setattr(continuation, "DENSITY_INTERVAL", 3)
+    whole = extend(parent, takes[1], tmp_path / "whole", growth=growth)
+    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7, growth=growth)
+    before, after = (len(read_avatar(run / "avatar.npz").splats) for run in (parent, whole))
+    assert (after > before) == bool(growth)
     opened = open_run(stopped)
     train(opened.capture, stopped, opened.run, resume=True)
     assert_same_state(stopped, whole)
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
-def test_old_and_new_views_take_turns(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that forgets because it sees the new take only."""
+def test_strain_color_can_begin_with_a_further_take(takes: tuple[Path, Path], tmp_path: Path) -> None:
+    """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they change at once."""
+    capture = open_capture(takes[0])
+    settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
+    train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
+    prepared = prepare_extension(Extension(tmp_path / "run", (takes[1],), iterations=6), "cpu")
+    run = replace(prepared.run, settings=replace(prepared.run.settings, strain_color=True))
+    train(prepared.capture, tmp_path / "new", run, prepared.selection)
+    before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
+    assert first["psnr_take_1"] == pytest.approx(before["psnr"], abs=0.01)
+    avatar = read_avatar(tmp_path / "new" / "avatar.npz")
+    assert avatar.splats.strain_color.shape[1:] == (3, 3)
+    assert avatar.splats.strain_color.any()
+    assert avatar.strain_range is not None
+
+
+def test_global_iterations_replay_old_views(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches an extension that forgets because it sees the new take only, or trains all splats on it."""
     prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
-    assert sum(view.timestep < 4 for view in views) == 13
+    strategy = ExtendStrategy(np.ones(1, bool))
+    is_global = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(40)]
+    assert [view.timestep < 4 for view in views] == is_global
+    assert 0 < sum(is_global) < 40
 
 
-def test_every_so_often_all_splats_are_trained() -> None:
+def test_local_and_global_iterations_take_turns() -> None:
     """Catches an extension whose global iterations are lost, or are all there is."""
     region = np.array([True, False])
     strategy = ExtendStrategy(region)
-    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(2 * (EXTEND_GLOBAL_INTERVAL + 1))]
-    assert kinds == 2 * [*EXTEND_GLOBAL_INTERVAL * [False], True]
+    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(100)]
+    assert sum(kinds) == round(100 * EXTEND_GLOBAL_SHARE)
+    assert not any(first and second for first, second in pairwise(kinds))
+    assert strategy.triangles(0, 0, 0, 0.0) is region
     assert ExtendStrategy(~region & region).triangles(0, 0, 0, 0.0) is None
 
 
@@ -142,7 +183,6 @@ def test_takes_that_do_not_fit(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches another head, or a take without images, that is found out after minutes of training."""
-    from stga_addon.training.run import continuation
 
     def changed(path: Path, *rest: Any) -> Capture:
         capture = open_capture(path, *rest)

@@ -13,6 +13,7 @@ from raster import gpu_device
 
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture
+from stga_addon.errors import DeviceError, StgaError
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize.backend import Backend, Batch
@@ -23,7 +24,7 @@ from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.folder import Run
+from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.schedule import learning_rates
@@ -137,7 +138,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
     first.step(whole)
     second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
-    device = second._device
+    device = second.device
     for name in ("image", "pixels", "v_image", "pair_gradients", "projected", "gradients", "screen"):
         device.upload(name, np.full(device.buffer(name, 0).size // 4, np.nan, np.float32))
     second.step(part)
@@ -171,12 +172,59 @@ def test_an_iteration_is_one_submit(toy: Capture, part: str | None) -> None:
     _, gpu = pair(toy, settings)
     batch = batch_of(toy, settings, selected=None if part is None else toy.regions[part])
     gpu.step(batch)
-    device = gpu._device
+    device = gpu.device
     before = device.dispatches, device.submits, device.waits
     gpu.step(batch)
     assert device.dispatches - before[0] <= 30
     assert device.submits - before[1] == 1
     assert device.waits == before[2]
+
+
+def test_everything_is_compiled_before_the_first_iteration(toy: Capture) -> None:
+    """Catches a kernel that is compiled in the time that is given to training."""
+    gpu_device.device()  # or skip
+    settings, device = settings_of(), Device()
+    device._kernels = {}  # instead of those that other tests have compiled
+    lengths, frames = limit_units(toy, settings.convention), FrameStore(toy, settings.convention, True)
+    gpu = GpuBackend(device, settings, lengths, frames, disturbed(toy, settings))
+    compiled = set(device._kernels)
+    view, target = large(view_of(toy, 1))
+    for part in (None, toy.regions["mouth"]):
+        gpu.step(batch_of(toy, settings, selected=part))
+    gpu.step(batch_of(toy, settings, view=view, target=target))
+    gpu.render(view, np.ones(3, np.float32), 3)
+    assert set(device._kernels) == compiled
+
+
+def test_a_lost_gpu_is_followed_by_the_cpu(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Catches a run that ends, begins again or loses its checkpoint where a driver is reset, and a CPU unasked."""
+    device = f"gpu:{gpu_device.device().name}"
+    run = replace(make_run(toy, "selective", iterations=12, strain_color=True), device=device)
+    train(toy, tmp_path, run, report=stop_at(5))
+    step, done = GpuBackend.step, []
+
+    def breaks(self: GpuBackend, batch: Batch) -> float | None:
+        done.append(batch)
+        if len(done) == 3:
+            raise DeviceError("Card 9000 was lost", "try again, with --device cpu if it happens again")
+        return step(self, batch)
+
+    monkeypatch.setattr(GpuBackend, "step", breaks)
+    with pytest.raises(StgaError, match="Card 9000 was lost; try again, with --device cpu"):
+        train(toy, tmp_path, run, resume=True)
+    assert read_checkpoint(tmp_path).iteration == 5
+    done.clear()
+    stages: list[str] = []
+    train(
+        toy, tmp_path, run, resume=True, report=lambda progress: bool(stages.append(progress.message)), falls_back=True
+    )
+    assert len(done) == 3
+    assert "Continuing on the CPU" in stages
+    assert "Card 9000 was lost; continuing on the CPU from the last checkpoint" in caplog.messages
+    assert read_checkpoint(tmp_path).iteration == read_metrics(tmp_path)[-1]["iteration"] == 12
+    assert read_run(tmp_path).device == "cpu"
 
 
 def test_states_are_the_same_bits_on_both(toy: Capture) -> None:

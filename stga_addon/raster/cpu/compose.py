@@ -33,7 +33,7 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
         splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
         parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
         project_forward(
-            np.arange(len(splats)), everywhere, with_strain_color(parameters), splats.face, _layer_frames(layer,
+            np.arange(len(splats)), everywhere, with_strain_color(parameters), splats.face, layer_frames(layer,
             camera), splats.sh_degree, False, layer.antialiased, Projection(*(array[rows] for array in projection)),
         )  # fmt: skip
         begin = rows.stop
@@ -51,7 +51,7 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
     return ComposedImage(rgb, alpha, blended.image[0] / np.maximum(alpha, np.finfo(np.float32).tiny))
 
 
-def _layer_frames(layer: PosedSplats, camera: Camera) -> CameraFrames:
+def layer_frames(layer: PosedSplats, camera: Camera) -> CameraFrames:
     """A layer's frames in camera space; its splats' directions stay those of the space they were trained in."""
     to_camera = camera.world_to_camera @ layer.to_world
     frames = frames_in_camera(layer.frames, replace(camera, world_to_camera=to_camera))

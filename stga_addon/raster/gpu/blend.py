@@ -3,23 +3,22 @@
 from typing import Any
 
 from ..cpu.layout import PROJECTED
-from .device import Recording
+from .device import Device, Recording
 
 INCLUDE = ("blend",)
 
 
-def blend_forward(
-    work: Recording, area: int, tiles: int, *, view: Any, rendered: Any, tile_range: Any, pairs: Any, projected: Any
-) -> tuple[Any, Any]:
+def blend_forward(work: Recording, area: int, tiles: int, **buffers: Any) -> tuple[Any, Any]:
     """Record the blending of the rendered tiles; area: the image's pixels.
 
+    buffers: view, rendered, tile_range, pair_slot, slot_splat, projected.
     Returns image (3, H, W) f32 over the background, and `pixels` (see `layout.py`), both undefined in other tiles.
     """
     device = work.device
     image, pixels = device.buffer("image", 3 * area), device.buffer("pixels", 2 * area)
     work.dispatch(
-        device.kernel("blend_forward", include=INCLUDE), device.groups_of(tiles), view=view, rendered=rendered,
-        tile_range=tile_range, pairs=pairs, projected=projected, image=image, pixels=pixels,
+        device.kernel("blend_forward", include=INCLUDE), device.groups_of(tiles), image=image, pixels=pixels,
+        **buffers,
     )  # fmt: skip
     return image, pixels
 
@@ -30,7 +29,7 @@ def blend_backward(
     """Record the gradient of every wanted pair of the touched tiles; returns `pair_gradients`.
 
     v_image (3, H, W), v_transmittance (H, W) or None: gradients of the image and of the transmittance.
-    buffers: view, touched, tile_range, pairs, projected, pixels.
+    buffers: view, touched, tile_range, pair_slot, slot_splat, projected, pixels.
     """
     device, has_v_transmittance = work.device, v_transmittance is not None
     kernel = device.kernel("blend_backward", include=INCLUDE, HAS_V_TRANSMITTANCE=has_v_transmittance)
@@ -40,3 +39,9 @@ def blend_backward(
         v_transmittance=v_transmittance if has_v_transmittance else v_image, **buffers,
     )  # fmt: skip
     return pair_gradients
+
+
+def compile_kernels(device: Device) -> None:
+    """Compile what this module dispatches in training."""
+    device.kernel("blend_forward", include=INCLUDE)
+    device.kernel("blend_backward", include=INCLUDE, HAS_V_TRANSMITTANCE=False)

@@ -1,6 +1,6 @@
 // What blending forward and backward share. A workgroup is a tile, in the forward a thread a pixel.
 //
-// Needs the uniform `view` and the table `projected`.
+// Needs the uniform `view` and the tables `projected`, `pair_slot` and `slot_splat`.
 
 struct Splat {
   mean: vec2f, // from the tile's corner
@@ -21,6 +21,11 @@ fn fetch(i: u32, corner: vec2f) -> Splat {
     projected[at + OPACITY],
     vec3f(projected[at + RED], projected[at + GREEN], projected[at + BLUE]),
   );
+}
+
+// The splat of a pair, with WANTED.
+fn marked_splat(pair: u32) -> u32 {
+  return slot_splat[pair_slot[pair]];
 }
 
 fn tile_corner(tile: u32) -> vec2u {

@@ -10,12 +10,13 @@ override HAS_V_TRANSMITTANCE: bool = false;
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> touched: array<u32>;
 @group(0) @binding(2) var<storage, read> tile_range: array<vec2u>;
-@group(0) @binding(3) var<storage, read> pairs: array<vec2u>;
-@group(0) @binding(4) var<storage, read> projected: array<f32>;
-@group(0) @binding(5) var<storage, read> pixels: array<vec2u>;
-@group(0) @binding(6) var<storage, read> v_image: array<f32>; // (3, H, W)
-@group(0) @binding(7) var<storage, read> v_transmittance: array<f32>; // (H, W), if HAS_V_TRANSMITTANCE
-@group(0) @binding(8) var<storage, read_write> pair_gradients: array<f32>;
+@group(0) @binding(3) var<storage, read> pair_slot: array<u32>;
+@group(0) @binding(4) var<storage, read> slot_splat: array<u32>;
+@group(0) @binding(5) var<storage, read> projected: array<f32>;
+@group(0) @binding(6) var<storage, read> pixels: array<vec2u>;
+@group(0) @binding(7) var<storage, read> v_image: array<f32>; // (3, H, W)
+@group(0) @binding(8) var<storage, read> v_transmittance: array<f32>; // (H, W), if HAS_V_TRANSMITTANCE
+@group(0) @binding(9) var<storage, read_write> pair_gradients: array<f32>;
 
 const BATCH: u32 = 8u;
 const PAIR_THREADS: u32 = WORKGROUP / BATCH;
@@ -66,9 +67,9 @@ fn main(
     var any_wanted = 0u;
     for (var k = 0u; k < end - begin; k++) {
       let q = end - begin - 1u - k;
-      let pair = pairs[begin + q].x;
-      any_wanted |= pair & WANTED;
-      let splat = fetch(pair & ~WANTED, vec2f(corner));
+      let marked = marked_splat(begin + q);
+      any_wanted |= marked & WANTED;
+      let splat = fetch(marked & ~WANTED, vec2f(corner));
       let offset = center - splat.mean;
       let raw = raw_alpha(splat, offset.x, offset.y);
       let a = min(MAX_ALPHA, raw);
@@ -91,7 +92,7 @@ fn main(
       let q = local / PAIR_THREADS;
       var sums: array<f32, PROJECTED>;
       if begin + q < end {
-        sums = sum_pixels(pairs[begin + q].x & ~WANTED, q, local % PAIR_THREADS, vec2f(corner));
+        sums = sum_pixels(marked_splat(begin + q) & ~WANTED, q, local % PAIR_THREADS, vec2f(corner));
       }
       workgroupBarrier();
       for (var c = 0u; c < PROJECTED; c++) {
@@ -115,7 +116,7 @@ fn find_walk(range: vec2u, last: u32, local: u32) -> vec2u {
   workgroupBarrier();
   atomicMax(&deepest_last, last);
   for (var j = range.x + local; j < range.y; j += WORKGROUP) {
-    if pairs[j].x >= WANTED {
+    if marked_splat(j) >= WANTED {
       atomicMin(&nearest_wanted, j);
       break;
     }
@@ -126,9 +127,9 @@ fn find_walk(range: vec2u, last: u32, local: u32) -> vec2u {
   }
   let found = workgroupUniformLoad(&walk);
   for (var j = found.y + local; j < range.y; j += WORKGROUP) {
-    if pairs[j].x >= WANTED {
+    if marked_splat(j) >= WANTED {
       for (var c = 0u; c < PROJECTED; c++) {
-        pair_gradients[pairs[j].y * PROJECTED + c] = 0.0;
+        pair_gradients[pair_slot[j] * PROJECTED + c] = 0.0;
       }
     }
   }
@@ -169,13 +170,13 @@ fn sum_pixels(i: u32, q: u32, thread: u32, corner: vec2f) -> array<f32, PROJECTE
 
 // Add up the threads' shares of one column of one pair.
 fn write_sum(begin: u32, number: u32) {
-  let pair = pairs[begin + number / PROJECTED];
-  if pair.x < WANTED {
+  let slot = pair_slot[begin + number / PROJECTED];
+  if slot_splat[slot] < WANTED {
     return;
   }
   var sum = 0.0;
   for (var thread = 0u; thread < PAIR_THREADS; thread++) {
     sum += scratch[number * SUM_STRIDE + thread];
   }
-  pair_gradients[pair.y * PROJECTED + number % PROJECTED] = sum;
+  pair_gradients[slot * PROJECTED + number % PROJECTED] = sum;
 }

@@ -3,10 +3,11 @@
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> rendered: array<u32>;
 @group(0) @binding(2) var<storage, read> tile_range: array<vec2u>;
-@group(0) @binding(3) var<storage, read> pairs: array<vec2u>;
-@group(0) @binding(4) var<storage, read> projected: array<f32>;
-@group(0) @binding(5) var<storage, read_write> image: array<f32>; // (3, H, W)
-@group(0) @binding(6) var<storage, read_write> pixels: array<vec2u>; // (H, W)
+@group(0) @binding(3) var<storage, read> pair_slot: array<u32>;
+@group(0) @binding(4) var<storage, read> slot_splat: array<u32>;
+@group(0) @binding(5) var<storage, read> projected: array<f32>;
+@group(0) @binding(6) var<storage, read_write> image: array<f32>; // (3, H, W)
+@group(0) @binding(7) var<storage, read_write> pixels: array<vec2u>; // (H, W)
 
 // Splats are fetched a workgroup's worth at a time.
 var<workgroup> batch: array<Splat, WORKGROUP>;
@@ -36,7 +37,7 @@ fn main(
       break;
     }
     if begin + local < range.y {
-      batch[local] = fetch(pairs[begin + local].x & ~WANTED, vec2f(corner));
+      batch[local] = fetch(marked_splat(begin + local) & ~WANTED, vec2f(corner));
     }
     workgroupBarrier();
     let length = min(WORKGROUP, range.y - begin);

@@ -11,21 +11,21 @@
 // (N + workgroups,) by place in `order`: pairs within the workgroup up to this splat; then the pairs of each workgroup,
 // and in the end those before it.
 @group(0) @binding(5) var<storage, read_write> pairs_until: array<u32>;
+@group(0) @binding(6) var<storage, read> projected: array<f32>;
+@group(0) @binding(7) var<storage, read> focus: array<u32>;
+@group(0) @binding(8) var<storage, read_write> wanted: array<u32>;
 
 const TOO_MANY: u32 = 0x7fffffffu; // sums end here instead of overflowing
 
 var<workgroup> sums: array<u32, WORKGROUP>;
 
-// How many tiles to be rendered a splat reaches.
-fn pairs_of(i: u32) -> u32 {
-  let r = rect[i];
-  if view.focused == 0u {
-    return u32(max(0, r.z - r.x)) * u32(max(0, r.w - r.y));
-  }
+// How many tiles to be rendered a visible splat reaches.
+fn pairs_of(i: u32, r: vec4u) -> u32 {
+  let outline = outline_of(i);
   var found = 0u;
   for (var y = r.y; y < r.w; y++) {
     for (var x = r.x; x < r.z; x++) {
-      found += rendered[u32(y) * view.tiles_x + u32(x)];
+      found += u32(is_listed(outline, vec2u(x, y)));
     }
   }
   return found;
@@ -57,7 +57,13 @@ fn count(
   let n = thread_number(workgroup, workgroups, local);
   var found = 0u;
   if n < view.splats {
-    found = pairs_of(order[n]);
+    let i = order[n];
+    let is_visible = rect[i].z > rect[i].x;
+    if is_visible {
+      found = pairs_of(i, vec4u(rect[i]));
+    }
+    // Also where no pixel sees it, as on the CPU.
+    wanted[i] = u32(is_visible && (view.focused == 0u || focus[i] == 1u));
   }
   let until = sum_until(found, local);
   if n < view.splats {

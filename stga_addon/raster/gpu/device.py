@@ -1,7 +1,7 @@
 """WebGPU device: adapters by name, buffers that grow, kernels from WGSL files, recorded work, late readback.
 
 Work is recorded into one command encoder and submitted at once; nothing waits for the device except `read` and
-`Readback.result`. A failure of driver or memory becomes a StgaError.
+`Readback.result`. A failure of driver or memory becomes a DeviceError.
 """
 
 import logging
@@ -21,7 +21,7 @@ import numpy as np
 import wgpu
 from wgpu.backends.wgpu_native.extras import set_instance_extras
 
-from ...errors import StgaError
+from ...errors import DeviceError, StgaError
 from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class Device:
         self.dispatches = self.submits = self.waits = 0
         self.kernel_times: KernelTimes | None = None
         self._buffers: dict[str, Any] = {}
-        self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
+        self._groups: dict[tuple[int | str, ...], tuple[Any, tuple[Any, ...]]] = {}
 
     @property
     def bytes(self) -> int:
@@ -130,9 +130,10 @@ class Device:
     def new_buffer(self, name: str, size: int, usage: int) -> Any:
         """A buffer of so many bytes; usage: flags of WebGPU."""
         if size > self.max_bytes:
-            raise StgaError(
-                f"--device gpu: {self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of "
-                f"{size >> 20} MiB for {name}; train smaller images or fewer splats, or give --device cpu"
+            raise DeviceError(
+                f"{self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of {size >> 20} MiB "
+                f"for {name}",
+                "train smaller images or fewer splats, or continue on the CPU (--device cpu)",
             )
         with self.errors():
             return self.gpu.create_buffer(label=name, size=size, usage=usage)
@@ -199,7 +200,7 @@ class Device:
 
     def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
         """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
-        key = id(kernel), *(id(buffers.get(name)) for name in kernel.bindings)
+        key: tuple[int | str, ...] = id(kernel), *buffers, *map(id, buffers.values())
         found = self._groups.get(key)
         if found is None:
             if buffers.keys() != kernel.bindings.keys():
@@ -229,20 +230,20 @@ class Device:
 
     @contextmanager
     def errors(self) -> Iterator[None]:
-        """Turn what driver and library raise into a StgaError; mistakes in kernels and calls pass as they are."""
+        """Turn what driver and library raise into a DeviceError; mistakes in kernels and calls pass as they are."""
         try:
             yield
         except wgpu.GPUOutOfMemoryError as error:
-            raise StgaError(_memory_sentence(self.name)) from error
+            raise _full_memory(self.name) from error
         except (wgpu.GPUError, RuntimeError) as error:
             text = str(error).lower()
             if "memory" in text and "out of" in text:
-                raise StgaError(_memory_sentence(self.name)) from error
+                raise _full_memory(self.name) from error
             if "lost" in text or "could not map" in text:
                 _open.cache_clear()
-                raise StgaError(
-                    f"--device gpu: {self.name} was lost (the driver was reset, or took too long); "
-                    "resume the run, with --device cpu if it happens again"
+                raise DeviceError(
+                    f"{self.name} was lost (the driver was reset, or took too long)",
+                    "try again, on the CPU (--device cpu) if it happens again; a run's checkpoint is kept for --resume",
                 ) from error
             raise
 
@@ -399,8 +400,8 @@ def _source(name: str) -> str:
     return files(__package__).joinpath(f"{name}.wgsl").read_text(encoding="utf-8")
 
 
-def _memory_sentence(name: str) -> str:
-    return (
-        f"--device gpu: the memory of {name} is full; close other programs that use it, train smaller images or "
-        "fewer splats, or give --device cpu"
+def _full_memory(name: str) -> DeviceError:
+    return DeviceError(
+        f"the memory of {name} is full",
+        "close other programs that use it, train smaller images or fewer splats, or continue on the CPU (--device cpu)",
     )

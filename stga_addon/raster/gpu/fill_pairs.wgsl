@@ -6,9 +6,9 @@
 @group(0) @binding(3) var<storage, read> pairs_until: array<u32>; // see count_pairs.wgsl
 @group(0) @binding(4) var<storage, read> rect: array<vec4i>;
 @group(0) @binding(5) var<storage, read> rendered: array<u32>;
-@group(0) @binding(6) var<storage, read> focus: array<u32>;
+@group(0) @binding(6) var<storage, read> projected: array<f32>;
 @group(0) @binding(7) var<storage, read_write> slots: array<vec2u>;
-@group(0) @binding(8) var<storage, read_write> wanted: array<u32>;
+@group(0) @binding(8) var<storage, read_write> wanted: array<u32>; // see count_pairs.wgsl; 0 where nothing fits
 @group(0) @binding(9) var<storage, read_write> slot_tile: array<u32>; // (P,)
 @group(0) @binding(10) var<storage, read_write> slot_splat: array<u32>; // (P,) with WANTED
 
@@ -33,21 +33,20 @@ fn main(
   }
   var slot = pairs_until[view.splats + n / WORKGROUP] + pairs_until[n] - found;
   slots[i] = vec2u(slot, found);
-  var is_wanted = found > 0u;
-  if view.focused == 1u {
-    is_wanted = is_wanted && focus[i] == 1u;
+  if counts[OVERFLOWED] == 1u {
+    wanted[i] = 0u;
   }
-  wanted[i] = u32(is_wanted);
   if found == 0u {
     return;
   }
-  let r = rect[i];
+  let marked = i | (wanted[i] * WANTED);
+  let outline = outline_of(i);
+  let r = vec4u(rect[i]);
   for (var y = r.y; y < r.w; y++) {
     for (var x = r.x; x < r.z; x++) {
-      let tile = u32(y) * view.tiles_x + u32(x);
-      if rendered[tile] == 1u {
-        slot_tile[slot] = tile;
-        slot_splat[slot] = i | (u32(is_wanted) * WANTED);
+      if is_listed(outline, vec2u(x, y)) {
+        slot_tile[slot] = y * view.tiles_x + x;
+        slot_splat[slot] = marked;
         slot++;
       }
     }

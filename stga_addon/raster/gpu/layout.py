@@ -10,13 +10,14 @@ N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs
 | projected      | PROJECTED f32    | a splat on the screen: the columns of `cpu.layout`                               |
 | rect           | 4 i32            | tile bounds x0, y0, x1, y1 of a splat, as in `cpu.layout.Projection`             |
 | depth_key      | 1 u32            | bits of a splat's depth; HIDDEN where it is not visible                          |
-| slots          | 2 u32            | a splat's first row in pair_gradients, and how many there are                    |
-| pair_gradients | PROJECTED f32    | gradient of a pair with respect to the splat's projected columns; by splat       |
+| slots          | 2 u32            | a splat's first slot, and how many it has: one for each of its pairs             |
+| slot_splat     | 1 u32            | the splat of a slot, with WANTED                                                 |
+| pair_gradients | PROJECTED f32    | by slot: gradient of the pair with respect to the splat's projected columns      |
 | wanted         | 1 u32            | 1 for splats that are visible and in focus: only their gradients are written     |
 | touched        | 1 u32            | 1 for the tiles that a splat in focus reaches                                    |
 | rendered       | 1 u32            | 1 for those and the tiles around them, as far as their gradient depends on       |
 | tile_range     | 2 u32            | a tile's first pair and one past its last                                        |
-| pairs          | 2 u32            | splat, with WANTED, and row in pair_gradients; by tile, near to far              |
+| pair_slot      | 1 u32            | a pair's slot; by tile, near to far                                              |
 | pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile           |
 """
 
@@ -32,7 +33,7 @@ WORKGROUP = 256
 """Threads of a workgroup: a tile's pixels, and the largest size that every adapter has."""
 HIDDEN = 0xFFFFFFFF
 WANTED = 0x80000000
-"""Marks the pairs of wanted splats in `pairs`, beside the splat's number."""
+"""Marks the pairs of wanted splats in `slot_splat`, beside the splat's number."""
 MAX_GROUPS = 65535
 """Workgroups along one dimension of a dispatch."""
 DIGIT_BITS = 11
@@ -64,6 +65,7 @@ VIEW = np.dtype(
             "focused",  # 0 where every splat is in focus
             "ring",  # tiles that are rendered around those which the focus touches
             "capacity",  # pairs that the buffers hold
+            "first",  # row of the first of these splats in the tables of projected ones
         )
     ]
 )

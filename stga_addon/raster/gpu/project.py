@@ -24,17 +24,24 @@ def mark_focus(work: Recording, count: int, *, view: Any, face: Any, selected: A
     return focus
 
 
-def project(work: Recording, count: int, *, view: Any, splats: Any, face: Any, frames: Any) -> ProjectedSplats:
-    """Record the projection of `count` splats; face (N,): the triangle of each."""
-    device = work.device
-    out = ProjectedSplats(
+def projected_tables(device: Device, count: int) -> ProjectedSplats:
+    """Room for `count` projected splats."""
+    return ProjectedSplats(
         device.buffer("projected", count * PROJECTED),
         device.buffer("depth_key", count),
         device.buffer("rect", 4 * count),
     )
-    given = {"view": view, "splats": splats, "face": face, "frames": frames}
+
+
+def project(
+    work: Recording, count: int, out: ProjectedSplats, *, view: Any, splats: Any, face: Any, frames: Any
+) -> None:
+    """Record the projection of `count` splats to the rows of `out` from the view's first on.
+
+    face (N,): the triangle of each.
+    """
+    device, given = work.device, {"view": view, "splats": splats, "face": face, "frames": frames}
     work.dispatch(device.kernel("project", include=INCLUDE), device.groups(count), **given, **out._asdict())
-    return out
 
 
 def project_backward(work: Recording, count: int, **buffers: Any) -> Any:

@@ -10,7 +10,6 @@
 
 const NOTHING = vec4i(0); // the tile bounds of a splat that is not visible
 const BROKEN = vec4i(-1); // and of one that is not finite
-const REACH_MARGIN: f32 = 1.0e-5; // for the error that WGSL allows a logarithm
 
 @compute @workgroup_size(WORKGROUP)
 fn main(
@@ -22,8 +21,8 @@ fn main(
   if i >= view.splats {
     return;
   }
-  depth_key[i] = HIDDEN;
-  rect[i] = project(i);
+  depth_key[view.first + i] = HIDDEN;
+  rect[view.first + i] = project(i);
 }
 
 // Write a visible splat's columns and depth; returns its tile bounds.
@@ -58,7 +57,7 @@ fn project(i: u32) -> vec4i {
   if !(255.0 * visible > 1.0) {
     return NOTHING;
   }
-  let reach = 2.0 * log(255.0 * visible) + REACH_MARGIN;
+  let reach = reach_of(visible);
   let extent = vec2f(sqrt(reach * xx), sqrt(reach * yy));
   let limit = vec2f(f32(view.tiles_x), f32(view.tiles_y));
   let first = vec2i(clamp(floor((mean - extent) / f32(TILE)), vec2f(0.0), limit));
@@ -75,8 +74,8 @@ fn project(i: u32) -> vec4i {
   if view.depth_as_color == 1u {
     color = vec3f(position.z, 0.0, 0.0);
   }
-  depth_key[i] = bitcast<u32>(position.z); // positive floats are ordered like their bits
-  let row = i * PROJECTED;
+  depth_key[view.first + i] = bitcast<u32>(position.z); // positive floats are ordered like their bits
+  let row = (view.first + i) * PROJECTED;
   projected[row + MEAN_X] = mean.x;
   projected[row + MEAN_Y] = mean.y;
   projected[row + PRECISION_X] = yy / det;

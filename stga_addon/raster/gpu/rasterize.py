@@ -9,14 +9,16 @@ import numpy as np
 from ...capture.camera import Camera
 from ..cpu.layout import TILE, CameraFrames, Parameters
 from ..cpu.rasterize import tile_grid
+from . import blend, tiles
+from . import project as projection
 from .blend import blend_backward, blend_forward
 from .device import Device, Recording
 from .layout import COUNTS, NEEDED, OVERFLOWED, SH, VIEW, splat_rows
-from .project import project, project_backward
+from .project import ProjectedSplats, project, project_backward, projected_tables
 from .tiles import PairLists, Tiles, choose_tiles, counts_buffer, list_pairs
 
 INITIAL_PAIR_CAPACITY = 1 << 18
-"""Pairs that a rasterizer has room for at first: 17 MB."""
+"""Pairs that a rasterizer has room for at first: 14 MB."""
 
 
 @dataclass(frozen=True)
@@ -88,18 +90,23 @@ class Rasterizer:
         focus: Any | None = None,
     ) -> Rendering:  # fmt: skip
         """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if `options.focused`."""
-        size = options.camera.width, options.camera.height
-        columns, rows = tile_grid(*size)
+        seen = projected_tables(self.device, splats.count)
+        project(work, splats.count, seen, view=view, splats=splats.rows, face=splats.face, frames=frames)
+        return self.draw(work, seen, splats.count, options.camera, view, frames, focus)
+
+    def draw(
+        self, work: Recording, seen: ProjectedSplats, count: int, camera: Camera, view: Any, frames: Any = None,
+        focus: Any | None = None,
+    ) -> Rendering:  # fmt: skip
+        """Record the rendering of `count` projected splats; frames: kept for the backward pass."""
+        columns, rows = tile_grid(camera.width, camera.height)
         tiles = columns * rows
-        shared = {"view": view, "focus": focus}
-        seen = project(work, splats.count, view=view, splats=splats.rows, face=splats.face, frames=frames)
-        chosen = choose_tiles(work, splats.count, tiles, rect=seen.rect, **shared)
-        lists = list_pairs(
-            work, splats.count, tiles, self.capacity, depth_key=seen.depth_key, rect=seen.rect, chosen=chosen, **shared
-        )
+        chosen = choose_tiles(work, count, tiles, rect=seen.rect, view=view, focus=focus)
+        lists = list_pairs(work, count, tiles, self.capacity, chosen=chosen, focus=focus, view=view, **seen._asdict())
         image, pixels = blend_forward(
-            work, size[0] * size[1], tiles, view=view, rendered=chosen.rendered, tile_range=chosen.tile_range,
-            pairs=lists.pairs, projected=seen.projected,
+            work, camera.width * camera.height, tiles, view=view, rendered=chosen.rendered,
+            tile_range=chosen.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
+            projected=seen.projected,
         )  # fmt: skip
         return Rendering(image, pixels, seen.projected, chosen, lists, view, frames, tiles)
 
@@ -116,7 +123,8 @@ class Rasterizer:
         shared = {"view": rendering.view, "projected": rendering.projected}
         pair_gradients = blend_backward(
             work, self.capacity, rendering.tiles, v_image=v_image, v_transmittance=v_transmittance,
-            touched=chosen.touched, tile_range=chosen.tile_range, pairs=lists.pairs, pixels=rendering.pixels, **shared,
+            touched=chosen.touched, tile_range=chosen.tile_range, pair_slot=lists.pair_slot,
+            slot_splat=lists.slot_splat, pixels=rendering.pixels, **shared,
         )  # fmt: skip
         return project_backward(
             work, splats.count, splats=splats.rows, face=splats.face, frames=rendering.frames, wanted=lists.wanted,
@@ -131,17 +139,25 @@ class Rasterizer:
         return not counts[OVERFLOWED]
 
     def make_room(self, needed: int) -> None:
-        """Hold at least so many pairs from now on, and a quarter to spare, and let renderings begin again."""
-        self.capacity = max(self.capacity, needed + needed // 4)
+        """Hold at least so many pairs from now on, and an eighth to spare, and let renderings begin again."""
+        self.capacity = max(self.capacity, needed + needed // 8)
         self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
 
-    def upload_view(self, splats: SplatTable, options: ViewOptions) -> Any:
-        """Send the uniform `view` of the next rendering."""
+    def upload_view(
+        self, splats: SplatTable, options: ViewOptions, to_world: np.ndarray | None = None, first: int = 0,
+        name: str = "view",
+    ) -> Any:  # fmt: skip
+        """Send the uniform of that name for the next rendering.
+
+        to_world (3, 3): from the camera to the space of the harmonics' directions, where that is not the world; first:
+        row of the splats in the tables of projected ones.
+        """
         camera, view = options.camera, np.zeros((), VIEW)
+        to_world = camera.world_to_camera[:3, :3].T if to_world is None else to_world
         columns, rows = tile_grid(camera.width, camera.height)
         values = (
             *(camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns, rows),
-            *camera.world_to_camera[:3, :3].T.ravel(),
+            *to_world.ravel(),
             *options.background,
             splats.count,
             splats.coefficients,
@@ -154,23 +170,30 @@ class Rasterizer:
             options.focused,
             -(-options.reach // TILE),
             self.capacity,
+            first,
         )
         view[...] = values
-        return self.device.upload("view", view, "uniform")
+        return self.device.upload(name, view, "uniform")
 
 
-def upload_splats(device: Device, splats: Parameters, face: np.ndarray) -> SplatTable:
-    """Numpy arrays of splats as a table on the device."""
+def upload_splats(device: Device, splats: Parameters, face: np.ndarray, layer: str = "") -> SplatTable:
+    """Numpy arrays of splats as a table on the device; layer: part of its name where there are several."""
     rows = splat_rows(splats)
     strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
     return SplatTable(
-        device.upload("splats", rows), device.upload("face", face.astype(np.uint32)), len(rows), splats.sh.shape[1],
-        strain_colors,
+        device.upload(f"splats{layer}", rows), device.upload(f"face{layer}", face.astype(np.uint32)), len(rows),
+        splats.sh.shape[1], strain_colors,
     )  # fmt: skip
 
 
-def upload_frames(device: Device, frames: CameraFrames) -> Any:
-    """Frames in camera space, computed on the CPU, as a table on the device."""
+def upload_frames(device: Device, frames: CameraFrames, layer: str = "") -> Any:
+    """Frames in camera space, computed on the CPU, as a table on the device; layer: as in `upload_splats`."""
     count = len(frames.origin)
     parts = (frames.origin, frames.matrix.reshape(count, 9), frames.strain)
-    return device.upload("frames", np.concatenate(parts, axis=1, dtype=np.float32))
+    return device.upload(f"frames{layer}", np.concatenate(parts, axis=1, dtype=np.float32))
+
+
+def compile_kernels(device: Device) -> None:
+    """Compile what a `Rasterizer` dispatches in training."""
+    for stage in (projection, tiles, blend):
+        stage.compile_kernels(device)

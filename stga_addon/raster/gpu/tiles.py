@@ -1,6 +1,7 @@
 """Projected splats to tiles: the tiles to be rendered, and every tile's list of pairs, near to far.
 
 The splats are sorted by depth, write their (tile, splat) pairs in that order, and a stable sort by tile alone keeps it.
+A splat has a pair with each rendered tile that its outline reaches; its bounding box alone counts a third more.
 How many pairs there are is known on the device only, so everything that follows is dispatched indirectly.
 """
 
@@ -9,7 +10,8 @@ from typing import Any, NamedTuple
 from .device import Device, Groups, Recording
 from .layout import COUNTS, DIGIT_BITS, PAIR_GROUPS, SORT_BLOCK, SORT_GROUPS, WORKGROUP
 
-DEPTH_BITS = 32
+DEPTH_BITS, MAX_TILE_BITS = 32, 22
+INCLUDE = ("numbers", "outline")
 
 
 class Tiles(NamedTuple):
@@ -23,7 +25,8 @@ class Tiles(NamedTuple):
 class PairLists(NamedTuple):
     """The (tile, splat) pairs, by tile and by splat; tables as in `layout.py`."""
 
-    pairs: Any
+    pair_slot: Any
+    slot_splat: Any
     slots: Any
     wanted: Any
 
@@ -48,31 +51,32 @@ def choose_tiles(work: Recording, count: int, tiles: int, *, view: Any, rect: An
 
 
 def list_pairs(
-    work: Recording, count: int, tiles: int, capacity: int, *, view: Any, depth_key: Any, rect: Any,
+    work: Recording, count: int, tiles: int, capacity: int, *, view: Any, depth_key: Any, rect: Any, projected: Any,
     chosen: Tiles, focus: Any | None,
 ) -> PairLists:  # fmt: skip
     """Record the lists of the chosen tiles, with room for `capacity` pairs, and fill `chosen.tile_range`."""
     device, counts, groups = work.device, counts_buffer(work.device), work.device.groups(count)
     kernel, buffer = device.kernel, device.buffer
     _, order = sort_keys(work, depth_key, count, DEPTH_BITS, view=view)
+    wanted, slots = buffer("wanted", count), buffer("slots", 2 * count)
     counted = {
-        "view": view, "order": order, "rect": rect, "rendered": chosen.rendered, "counts": counts,
-        "pairs_until": buffer("pairs_until", count + -(-count // WORKGROUP)),
+        "view": view, "order": order, "rect": rect, "projected": projected, "rendered": chosen.rendered,
+        "counts": counts, "pairs_until": buffer("pairs_until", count + -(-count // WORKGROUP)), "wanted": wanted,
     }  # fmt: skip
-    work.dispatch(kernel("count_pairs", "count"), groups, **counted)
-    work.dispatch(kernel("count_pairs", "total"), (1, 1, 1), **counted)
-    lists = PairLists(buffer("pairs", 2 * capacity), buffer("slots", 2 * count), buffer("wanted", count))
+    given = {**counted, "focus": rect if focus is None else focus}
+    work.dispatch(kernel("count_pairs", "count", INCLUDE), groups, **given)
+    work.dispatch(kernel("count_pairs", "total", INCLUDE), (1, 1, 1), **given)
     slot_tile, slot_splat = buffer("slot_tile", capacity), buffer("slot_splat", capacity)
     work.dispatch(
-        kernel("fill_pairs"), groups, **counted, focus=rect if focus is None else focus, slots=lists.slots,
-        wanted=lists.wanted, slot_tile=slot_tile, slot_splat=slot_splat,
+        kernel("fill_pairs", include=INCLUDE), groups, **counted, slots=slots, slot_tile=slot_tile,
+        slot_splat=slot_splat,
     )  # fmt: skip
     pair_tile, pair_slot = sort_keys(work, slot_tile, capacity, tiles.bit_length(), view=view, of_pairs=True)
     work.dispatch(
-        kernel("tile_lists"), (counts, 4 * PAIR_GROUPS), view=view, counts=counts, pair_tile=pair_tile,
-        pair_slot=pair_slot, slot_splat=slot_splat, pairs=lists.pairs, tile_range=chosen.tile_range,
+        kernel("tile_lists"), (counts, 4 * PAIR_GROUPS), counts=counts, pair_tile=pair_tile,
+        tile_range=chosen.tile_range,
     )  # fmt: skip
-    return lists
+    return PairLists(pair_slot, slot_splat, slots, wanted)
 
 
 def sort_keys(
@@ -87,10 +91,12 @@ def sort_keys(
     buffer, kernel, blocks = device.buffer, device.kernel, -(-room // SORT_BLOCK)
     groups: Groups = (counts, 4 * SORT_GROUPS) if of_pairs else (blocks, 1, 1)
     name, values = "pair" if of_pairs else "splat", counts  # the first pass reads no values
-    targets = [(buffer(f"{name}_keys", room), buffer(f"{name}_numbers", room))]
-    targets.append((keys, buffer(f"{name}_numbers 2", room)))
-    for n, shift in enumerate(range(0, bits, DIGIT_BITS)):
-        constants: dict[str, Any] = {"SHIFT": shift, "FIRST": n == 0, "OF_PAIRS": of_pairs}
+    # The gradients of the pairs are written when the sorted tiles have been read.
+    first = "pair_gradients" if of_pairs else "splat_keys"
+    targets = [(buffer(first, room), buffer(f"{name}_numbers", room))]
+    if bits > DIGIT_BITS:
+        targets.append((keys, buffer(f"{name}_numbers 2", room)))
+    for n, constants in enumerate(_passes(bits, of_pairs)):
         buffers = {
             "view": view, "counts": counts, "keys": keys, "values": values, "sorted_keys": targets[n % 2][0],
             "sorted_values": targets[n % 2][1], "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
@@ -101,3 +107,21 @@ def sort_keys(
         work.dispatch(kernel("sort", "scatter", **constants), groups, **buffers)
         keys, values = targets[n % 2]
     return keys, values
+
+
+def _passes(bits: int, of_pairs: bool) -> list[dict[str, Any]]:
+    """The constants of sort.wgsl in each pass."""
+    return [{"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs} for shift in range(0, bits, DIGIT_BITS)]
+
+
+def compile_kernels(device: Device) -> None:
+    """Compile what this module dispatches, for images of up to 2²² tiles."""
+    for entry in ("mark", "choose"):
+        device.kernel("tiles", entry)
+    for entry in ("count", "total"):
+        device.kernel("count_pairs", entry, INCLUDE)
+    device.kernel("fill_pairs", include=INCLUDE)
+    device.kernel("tile_lists")
+    for constants in (*_passes(DEPTH_BITS, False), *_passes(MAX_TILE_BITS, True)):
+        for entry in ("count", "place", "scatter"):
+            device.kernel("sort", entry, **constants)

@@ -7,7 +7,7 @@ TRANSPARENT_BOUNCES = 64
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
-    """A sentence where the view transform changes the colors that the splats were trained in, else None."""
+    """A sentence where the view transform changes the colors of splats that EEVEE and Cycles render, else None."""
     if scene.view_settings.view_transform == "Standard":
         return None
     return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"

@@ -22,6 +22,7 @@ from ..display.display_modes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
 from ..render.camera import viewport_camera
 from ..render.scene_splats import SplatCache, visible_layers
+from ..render.view_transform import keeps_colors
 from .packing import NEAR_M, View
 from .renderer import COMPACT, SplatRenderer
 
@@ -127,13 +128,6 @@ def is_drawn_by_engine(context: Any) -> bool:
     It draws before the view transform. Where that would change colors, the display draws them, after it.
     """
     return is_engine_view(context) and keeps_colors(context.scene)
-
-
-def keeps_colors(scene: Any) -> bool:
-    """Whether the scene's color management shows sRGB colors as they are."""
-    settings = scene.view_settings
-    plain = settings.view_transform == "Standard" and settings.look == "None" and not settings.use_curve_mapping
-    return bool(plain and settings.exposure == 0 and settings.gamma == 1)
 
 
 def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float, ...]]:

@@ -13,6 +13,7 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
+from bpy.app.handlers import persistent
 
 from ...capture.camera import Camera
 from ...errors import StgaError
@@ -27,23 +28,33 @@ from ..layers import SceneLayer
 from . import redraw
 from .camera import render_camera, viewport_camera
 from .scene_splats import SplatCache, visible_layers
+from .view_transform import InverseView, inverse_view, measure, needs_inverse
 from .viewport import RenderRequest, ViewportImage, ViewportRenderer
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
 MIN_DEPTH_ALPHA = 1 / 255  # pixels with less show nothing
+VIEW_TRANSFORM_UNKNOWN = (
+    "The view transform could not be measured in time and changes the splats' colors; render again, or choose Standard"
+)
 # Blender's panels that are for some engines only and apply to this one too.
 SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
 
 
 class Interpreter:
-    """The Python that renders where Blender's own cannot: looked up by the main thread, used by render threads."""
+    """The Python that renders where Blender's own cannot, and the device: looked up by the main thread, used by render
+    threads.
 
-    def __init__(self, find: Callable[[], str]) -> None:
-        self._find = find
+    device  as `raster.compose.Composer` takes it
+    """
+
+    def __init__(self, find: Callable[[], str], find_device: Callable[[], str]) -> None:
+        self._find, self._find_device = find, find_device
         self._path = self._error = ""
+        self.device = "auto"
 
     def update(self) -> None:
-        """Look it up again; reads preferences and files, so only where another Python is needed."""
+        """Look them up again; reads preferences, and files where another Python is needed."""
+        self.device = self._find_device()
         if missing_packages():
             try:
                 self._path, self._error = self._find(), ""
@@ -57,8 +68,8 @@ class Interpreter:
         return self._path
 
 
-_interpreter = Interpreter(lambda: "")
-_client = RenderClient(_interpreter.path)
+_interpreter = Interpreter(lambda: "", lambda: "auto")
+_client = RenderClient(_interpreter.path, lambda: _interpreter.device)
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -94,9 +105,14 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         if image is None:
             _interpreter.update()
             image = _client.compose([layer.posed() for layer in layers], camera, with_depth=True)
+            if _client.failure:
+                self.report({"WARNING"}, _client.failure)
+        view = inverse_view(scene)
+        if view is None and needs_inverse(scene):
+            self.report({"WARNING"}, VIEW_TRANSFORM_UNKNOWN)
         result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
         passes = result.layers[0].passes
-        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, _background(scene)))
+        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, _background(scene), view))
         if "Depth" in passes:
             assert image.depth is not None
             covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
@@ -215,20 +231,25 @@ def _render_request(client: RenderClient, request: RenderRequest, scale: float) 
     return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])
 
 
-def combined(rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None) -> np.ndarray:
+def combined(
+    rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None, view: InverseView | None = None
+) -> np.ndarray:
     """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W), alpha (H, W).
 
-    Splats are blended in sRGB. So `background`, scene-linear (3,), is added in sRGB, before the conversion. Where it is
-    None the image stays transparent, and the color is converted as if it covered its pixel.
+    Splats are blended in sRGB. So `background`, scene-linear (3,), is added as the sRGB that it is shown as, before the
+    conversion. Where it is None the image stays transparent, and the color is converted as if it covered its pixel.
+    view: the inverse of the view transform, None where that shows sRGB as it is.
     """
-    image = np.empty((*alpha.shape, 4), np.float32)
+    to_linear = srgb_to_linear if view is None else view.to_linear
+    image, covered = np.zeros((*alpha.shape, 4), np.float32), alpha > 0
+    color, share = rgb[:, covered].T, alpha[covered][:, None]
     if background is None:
-        straight = rgb.transpose(1, 2, 0) / np.maximum(alpha, np.finfo(np.float32).tiny)[..., None]
-        image[..., :3], image[..., 3] = srgb_to_linear(straight) * alpha[..., None], alpha
+        image[covered, :3], image[..., 3] = to_linear(color / share) * share, alpha
     else:
-        behind = linear_to_srgb(np.clip(np.array(background, np.float32), 0, 1))
-        color = rgb.transpose(1, 2, 0) + (1 - alpha)[..., None] * behind
-        image[..., :3], image[..., 3] = srgb_to_linear(np.clip(color, 0, 1)), 1
+        linear = np.array(background, np.float32)
+        behind = linear_to_srgb(np.clip(linear, 0, 1)) if view is None else view.show(linear)
+        image[...] = *background, 1
+        image[covered, :3] = to_linear(np.clip(color + (1 - share) * behind, 0, 1))
     return image
 
 
@@ -266,12 +287,21 @@ def _write_pass(render_pass: Any, values: np.ndarray) -> None:
     render_pass.rect.foreach_set(np.ascontiguousarray(values[::-1], np.float32).ravel())
 
 
-def register(find_python: Callable[[], str]) -> None:
-    """find_python as in `raster.render_client.RenderClient`."""
+@persistent
+def _before_render(*_: Any) -> None:
+    """Measure the view transforms of all scenes that a render may ask this engine for; a compositor may ask for any."""
+    for scene in list(bpy.data.scenes):
+        if scene.render.engine == ENGINE:
+            measure(scene)
+
+
+def register(find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
+    """find_python, find_device: as in `raster.render_client.RenderClient`."""
     global _interpreter, _client
-    _interpreter = Interpreter(find_python)
-    _client = RenderClient(_interpreter.path)
+    _interpreter = Interpreter(find_python, find_device)
+    _client = RenderClient(_interpreter.path, lambda: _interpreter.device)
     bpy.utils.register_class(SplatsEngine)
+    bpy.app.handlers.render_pre.append(_before_render)
     for panel in _shared_panels():
         panel.COMPAT_ENGINES.add(ENGINE)
 
@@ -279,6 +309,7 @@ def register(find_python: Callable[[], str]) -> None:
 def unregister() -> None:
     for panel in _panels_by_engine():
         panel.COMPAT_ENGINES.discard(ENGINE)
+    bpy.app.handlers.render_pre.remove(_before_render)
     bpy.utils.unregister_class(SplatsEngine)
     redraw.stop()
     _client.close()

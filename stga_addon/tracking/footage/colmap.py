@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import StgaError, shorten
+from ...flame.quaternions import to_matrices
 from .lens import Lens
 from .reading import numbers, pinhole, read_bytes, read_text
 from .shots import Shot
@@ -141,14 +142,7 @@ def _rotation(quaternion: np.ndarray, where: str) -> np.ndarray:
     length = np.linalg.norm(quaternion)
     if not 0.5 < length < 2:
         raise StgaError(f"{where}: expected a rotation quaternion of length 1, not {length:g}")
-    w, x, y, z = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return to_matrices(quaternion)
 
 
 # Text

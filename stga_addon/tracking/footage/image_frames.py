@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import read_image, read_mask
+from ...capture.images import image_size, read_image, read_mask
 from ...capture.model import View
+from ...errors import StgaError
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,16 @@ class ImageFrames:
     @property
     def timesteps(self) -> tuple[int, ...]:
         return tuple(self.views)
+
+    def require_sizes(self, name: str) -> None:
+        """Read the headers of all images. Raises StgaError for one of another size than camera `name` has."""
+        for timestep, view in self.views.items():
+            size, camera = image_size(view.image), view.camera
+            if size != (camera.width, camera.height):
+                found, expected = f"{size[0]} x {size[1]}", f"{camera.width} x {camera.height}"
+                raise StgaError(
+                    f"{view.image}: has {found} pixels at timestep {timestep}, but camera {name} has {expected}"
+                )
 
     def image(self, timestep: int) -> np.ndarray:
         return read_image(self.views[timestep])

@@ -106,6 +106,8 @@ def _rig(
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
+    if isinstance(frames, ImageFrames):
+        frames.require_sizes(name)
     found = undistortion(shot.camera, shot.lens, shot.where)
     return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
 from ...capture.images import read_image, read_mask
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 from ...selection import SelectionOptions, select_capture
 
 MAX_EVALUATION_VIEWS = 16
@@ -41,14 +41,7 @@ class EvaluationView:
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
     """The held-out views that are evaluated during training: at most MAX_EVALUATION_VIEWS, evenly spread."""
-    return spread_views(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
-
-
-def spread_views(views: Sequence[View], limit: int) -> Sequence[View]:
-    """At most `limit` of the views, evenly spread."""
-    if len(views) <= limit:
-        return views
-    return [views[n] for n in np.linspace(0, len(views) - 1, limit).round().astype(int)]
+    return evenly_spread(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
 
 
 def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:

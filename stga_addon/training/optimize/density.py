@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from ...avatar.splats import Splats
+from ...flame.quaternions import to_matrices
 from .state import TrainState, join, keep_rows, new_state
 
 MIN_OPACITY = 0.005
@@ -71,7 +72,7 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
 
 def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
     """Two smaller splats per parent, on either side of its center along its longest axis."""
-    axes = _rotation_matrices(parents.rotation)
+    axes = to_matrices(parents.rotation)
     longest = np.argmax(parents.log_scale, axis=1)
     n = np.arange(len(parents))
     offset = axes[n, :, longest] * np.exp(parents.log_scale[n, longest])[:, None] * 0.5
@@ -108,15 +109,3 @@ def _prunable(state: TrainState) -> np.ndarray:
 def _sigmoid(x: np.ndarray) -> np.ndarray:
     """In float64."""
     return np.asarray(1 / (1 + np.exp(-x.astype(np.float64))))
-
-
-def _rotation_matrices(q: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of quaternions (N, 4), w first, of any length."""
-    q = q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
-    w, x, y, z = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)

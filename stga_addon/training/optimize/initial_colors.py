@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ...capture.images import read_view
 from ...capture.mesh_raster import rasterize
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -44,9 +44,8 @@ def _later_views(views: Sequence[View]) -> list[View]:
     """A few views of timesteps that are evenly spread, by other cameras in each."""
     timesteps = sorted({view.timestep for view in views})
     chosen: list[View] = []
-    count = min(len(timesteps), MAX_LATER_TIMESTEPS)
-    for n in np.linspace(0, len(timesteps) - 1, count).round().astype(int):
-        at_once = [view for view in views if view.timestep == timesteps[n]]
+    for n, timestep in enumerate(evenly_spread(timesteps, MAX_LATER_TIMESTEPS)):
+        at_once = [view for view in views if view.timestep == timestep]
         step = -(-len(at_once) // MAX_LATER_VIEWS)
         chosen += at_once[n % step :: step]
     return chosen

@@ -1,4 +1,4 @@
-"""Compilation of all CPU kernels before the timed part of a training run."""
+"""Compilation of all kernels before the timed part of a training run."""
 
 import os
 import subprocess
@@ -16,6 +16,7 @@ from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
 from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
+from ...raster.device import adapter_name
 from ...worker.launch import same_interpreter_environment
 from . import adam
 from .losses import image_gradient, whole_image
@@ -26,11 +27,11 @@ HELPER_TIMEOUT_S = 120.0
 CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
 
 
-def precompile_kernels() -> None:
-    """Run each kernel once on two splats, with the argument types of real training.
+def precompile_kernels(device: str = "cpu") -> None:
+    """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
 
-    If the cache is empty, a second process compiles half of them at the same time, because Numba compiles one function
-    at a time per process.
+    Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
+    second process compiles half of them at the same time, because Numba compiles one function at a time per process.
     """
     helper = _second_process()
     _render()
@@ -41,6 +42,11 @@ def precompile_kernels() -> None:
         except subprocess.TimeoutExpired:
             helper.kill()
     _second_half()  # loads from the cache what the second process has compiled
+    if device != "cpu":
+        from ...raster.gpu.device import Device
+        from .gpu_backend import compile_kernels
+
+        compile_kernels(Device(adapter_name(device)))
 
 
 def _second_process() -> "subprocess.Popen[bytes] | None":

@@ -1,13 +1,14 @@
 """State of the splats in training: parameters, optimizer moments and statistics for density control."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from ...avatar.splats import Splats
+from ...avatar.strain import STRAIN_COMPONENTS
 from ...raster.cpu.layout import Parameters
 
 
@@ -83,6 +84,24 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
 def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
     """The rows at `keep`, a mask (N,) or indices, of every tensor."""
     return _map(lambda tensors: tensors[0][keep], state)
+
+
+def with_strain_color(state: TrainState) -> TrainState:
+    """The state with strain coefficients; they and their moments are zero where there were none."""
+    if state.parameters.strain_color.shape[1]:
+        return state
+
+    def added(tensors: Parameters) -> Parameters:
+        return tensors._replace(strain_color=torch.zeros(len(state), STRAIN_COMPONENTS, 3))
+
+    return replace(
+        state,
+        parameters=added(state.parameters),
+        gradients=added(state.gradients),
+        first=added(state.first),
+        second=added(state.second),
+        average=added(state.average),
+    )
 
 
 def join(state: TrainState, other: TrainState) -> TrainState:

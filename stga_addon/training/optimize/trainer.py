@@ -7,8 +7,7 @@ import numpy as np
 from ...capture.model import Capture, View
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
-from .backend import Batch
-from .device import make_backend
+from .backend import Batch, make_backend
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .losses import limit_units

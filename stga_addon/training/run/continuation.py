@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ...avatar.file import read_avatar
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import open_capture
 from ...capture.region import find_region
 from ...capture.takes import first_timesteps, join_takes, require_same_head
@@ -19,12 +19,11 @@ from ..evaluate.evaluation_views import (
     MIN_REGION_PIXELS,
     EvaluationView,
     read_evaluation_view,
-    spread_views,
     visible_pixels,
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
-from ..optimize.state import TrainState, new_state
+from ..optimize.state import TrainState, new_state, with_strain_color
 from ..optimize.tracking import with_refined_tracking
 from ..settings import Rates, TrainingSettings, validate
 from .checkpoint import read_checkpoint
@@ -34,7 +33,7 @@ from .open_run import OpenedRun, open_run
 from .replay import replayed_views
 from .request import Extension, Refinement, Request
 
-START_SHARE = 0.5
+START_SHARE = {"refine": 0.5, "extend": 0.3}
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
@@ -148,8 +147,8 @@ def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
     return take
 
 
-def starting_state(continuation: Continuation) -> TrainState:
-    """The parent's avatar as a state of training.
+def starting_state(continuation: Continuation, strain_color: bool) -> TrainState:
+    """The parent's avatar as a state of training; strain_color: with coefficients of strain, zero where it had none.
 
     The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
     Raises StgaError where the avatar is not the one that the continuation was made for.
@@ -164,8 +163,10 @@ def starting_state(continuation: Continuation) -> TrainState:
         if all(np.array_equal(array, getattr(kept, name)) for name, array in vars(splats).items()):
             parameters = Parameters(*(tensor.clone() for tensor in state.average))
             zero = torch.zeros(len(state))
-            return replace(state, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
-    return new_state(splats)
+            state = replace(state, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
+            return with_strain_color(state) if strain_color else state
+    state = new_state(splats)
+    return with_strain_color(state) if strain_color else state
 
 
 def late_rates(rates: Rates, share: float) -> Rates:
@@ -192,7 +193,7 @@ def continued_settings(
         seconds=seconds,
         iterations=iterations,
         seed=seed,
-        rates=late_rates(settings.rates, START_SHARE),
+        rates=late_rates(settings.rates, START_SHARE[strategy]),
         views_per_visit=1,
         warm_up_share=0.0,
         sh_steps=(0.0,) * settings.sh_degree,
@@ -220,7 +221,7 @@ def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | 
     limit, chosen = max(MIN_GROUP_VIEWS, MAX_EVALUATION_VIEWS // max(1, len(groups))), []
     for name, members in groups.items():
         group = name if len(groups) > 1 else ""
-        for view in spread_views(members, limit):
+        for view in evenly_spread(members, limit):
             found = replace(read_evaluation_view(capture, view), group=group)
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= MIN_REGION_PIXELS:

@@ -1,5 +1,6 @@
 """Training loop of a run: evaluations, checkpoints and resumption in a run folder."""
 
+import logging
 import signal
 import threading
 from collections import deque
@@ -15,14 +16,14 @@ import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import ViewLoader
-from ...capture.model import Capture
-from ...errors import StgaError
+from ...capture.model import Capture, evenly_spread
+from ...errors import DeviceError, StgaError
 from ...files import replacing
 from ...format import format_duration
 from ...selection import select_capture
 from ..effect_plan import TRACKING
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view, spread_views
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
 from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
@@ -62,15 +63,31 @@ def train(
     selection: dict[int, np.ndarray] | None = None,
     resume: bool = False,
     report: Report = lambda progress: False,
+    falls_back: bool = False,
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
     selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
     checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
+    falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
     Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or
     STGA_LPIPS names a file without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar and checkpoint
     are saved, a second one at once.
     """
+    try:
+        return _train(capture, out, run, selection, resume, report)
+    except DeviceError as error:
+        if not falls_back:
+            raise
+        logging.getLogger(__name__).warning("%s; continuing on the CPU from the last checkpoint", error.cause)
+        report(Progress(message="Continuing on the CPU"))
+        return _train(capture, out, replace(run, device="cpu"), selection, True, report)
+
+
+def _train(
+    capture: Capture, out: Path, run: Run, selection: dict[int, np.ndarray] | None, resume: bool, report: Report
+) -> Path:
+    """`train` on the device of the run."""
     lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
@@ -83,7 +100,7 @@ def train(
         has_begun = has_run and read_run(out).identity is not None
         run = replace(run, identity=check_identity(out, run, capture))
         report(Progress(message="Compiling kernels"))
-        precompile_kernels()
+        precompile_kernels(run.device)
         loop = _Loop(capture, out, run, report)
         if has_begun and (out / CHECKPOINT).exists():
             loop.resume()
@@ -142,7 +159,7 @@ class _Loop:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
         if continuation is not None:
-            state = starting_state(continuation)
+            state = starting_state(continuation, self.settings.strain_color)
             self._check(state)
         self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
@@ -316,7 +333,7 @@ class _Loop:
         self.report(self._progress("Measuring residuals"))
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
         mean = triangle_residuals(
-            read_avatar(self.out / "avatar.npz"), self._refined_capture(), spread_views(views, RESIDUAL_VIEWS),
+            read_avatar(self.out / "avatar.npz"), self._refined_capture(), evenly_spread(views, RESIDUAL_VIEWS),
             exposure_correction(self.settings), RESIDUAL_SCALE,
         ).mean()  # fmt: skip
         write_residuals(self.out, mean)

@@ -7,7 +7,7 @@ from ...capture.model import Capture
 from ...capture.open import open_capture
 from ...capture.takes import join_takes
 from ...errors import StgaError
-from ..optimize.device import GPU, adapter_names, choose_device
+from ...raster.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, read_run
 from .identity import Identity, difference, identity_of
 

@@ -1,12 +1,12 @@
 """Range of strain that a run has trained on, within which its avatar's colors follow strain."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from ...avatar.file import read_avatar
 from ...avatar.strain import color_range, seen_range, strain_basis
-from ...capture.model import Capture
+from ...capture.model import Capture, evenly_spread
 from .folder import Continuation
 
 MAX_TIMESTEPS = 64
@@ -22,17 +22,15 @@ def trained_strain_range(
     """
     limits = color_range(len(capture.faces))
     basis = strain_basis(capture.neutral, capture.faces, limits)
-    seen = seen_range(basis, (mesh(timestep) for timestep in _measured(capture)))
+    timesteps = evenly_spread(sorted({view.timestep for view in capture.views["train"]}), MAX_TIMESTEPS)
+    seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     if continuation is None:
         return seen
-    earlier = read_avatar(continuation.parent / "avatar.npz").strain_range
+    parent = read_avatar(continuation.parent / "avatar.npz")
+    earlier = parent.strain_range
+    if not parent.splats.strain_color.shape[1]:
+        return seen  # its colors follow strain only from here on
     if earlier is None:
         return limits
     lowest, highest = np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])
     return np.stack([np.maximum(lowest, limits[:, 0]), np.minimum(highest, limits[:, 1])], axis=1)
-
-
-def _measured(capture: Capture) -> Sequence[int]:
-    timesteps = sorted({view.timestep for view in capture.views["train"]})
-    rows = np.linspace(0, len(timesteps) - 1, min(len(timesteps), MAX_TIMESTEPS)).round().astype(int)
-    return [timesteps[row] for row in rows]

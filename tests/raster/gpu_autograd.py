@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...avatar.embedding import WORLD, FaceFrames
-from ...capture.camera import Camera
-from ..cpu.layout import CameraFrames, Parameters
-from ..cpu.rasterize import frames_in_camera
-from .device import Device
-from .layout import split_rows
-from .rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
+from stga_addon.avatar.embedding import WORLD, FaceFrames
+from stga_addon.capture.camera import Camera
+from stga_addon.raster.cpu.layout import CameraFrames, Parameters
+from stga_addon.raster.cpu.rasterize import frames_in_camera
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import split_rows
+from stga_addon.raster.gpu.rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
 
 
 def render_differentiable(

@@ -1,47 +1,41 @@
-"""Choice of the training device: the GPU where it is right and faster, else the CPU."""
+"""Choice of the device that trains or renders: the GPU where it is right and faster, else the CPU."""
 
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-import numpy as np
+from ..errors import StgaError
 
-from ...errors import StgaError
-
-if TYPE_CHECKING:  # choosing a device needs neither torch nor numba
-    from ...raster.gpu.trial import Trial
-    from ..settings import TrainingSettings
-    from .backend import Backend
-    from .frames import FrameStore
-    from .state import TrainState
+if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
+    from .gpu.trial import Trial
 
 GPU = "gpu:"
-"""Before the adapter's name in the device of a run."""
+"""Before the adapter's name in a device."""
 
 
-def choose_device(wanted: str) -> tuple[str, str]:
-    """The device to train on, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
+def choose_device(wanted: str, task: str = "Training") -> tuple[str, str]:
+    """The device, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
 
     wanted: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with this
-    part in its name). "auto" takes the first adapter that is no software, right and faster than the CPU. Raises
-    StgaError if a GPU is wanted and none works.
+    part in its name). "auto" takes the first adapter that is no software, right and faster than the CPU. task: what is
+    done there. Raises StgaError if a GPU is wanted and none works.
     """
     if wanted == "cpu":
-        return "cpu", "Training on the CPU (--device cpu)"
+        return "cpu", f"{task} on the CPU (--device cpu)"
     if wanted == "auto":
-        return _fastest()
-    adapter = _adapter(wanted)
+        return _fastest(task)
+    adapter = adapter_name(wanted)
     trial = _trial(adapter)
     if not trial.is_right:
         raise StgaError(f"--device {wanted}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu")
-    return GPU + adapter, f"Training on {adapter}, {_comparison(trial)}"
+    return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
 
 
 def adapter_names(software: bool = True) -> list[str]:
     """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is none."""
     if find_spec("wgpu") is None:
         raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
-    from ...raster.gpu.device import adapters, is_software
+    from .gpu.device import adapters, is_software
 
     names = [name for name, adapter in adapters().items() if software or not is_software(adapter)]
     if not names:
@@ -50,27 +44,8 @@ def adapter_names(software: bool = True) -> list[str]:
     return names
 
 
-def make_backend(
-    device: str, settings: "TrainingSettings", units: np.ndarray, frames: "FrameStore", state: "TrainState"
-) -> "Backend":
-    """The backend of a device of `choose_device`.
-
-    units (F,): see `losses.limit_units`. Raises StgaError if the device does not support the settings.
-    """
-    if device == "cpu":
-        from .cpu_backend import CpuBackend
-
-        return CpuBackend(settings, units, frames, state)
-    if settings.tracking:
-        raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
-    from ...raster.gpu.device import Device
-    from .gpu_backend import GpuBackend
-
-    return GpuBackend(Device(_adapter(device)), settings, units, frames, state)
-
-
-def _adapter(device: str) -> str:
-    """The adapter's name for "gpu" or "gpu:NAME"."""
+def adapter_name(device: str) -> str:
+    """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError where there is none, or several."""
     names, wanted = adapter_names(), device.removeprefix(GPU)
     if device == "gpu" or wanted in names:
         return names[0] if device == "gpu" else wanted
@@ -81,33 +56,34 @@ def _adapter(device: str) -> str:
     raise StgaError(f"--device {device}: {which} of that name; there are: {', '.join(names)}")
 
 
-def _fastest() -> tuple[str, str]:
+def _fastest(task: str) -> tuple[str, str]:
     """The first real GPU that is right and faster than the CPU, or the CPU and why."""
     try:
         names = adapter_names(software=False)
     except Exception as error:  # whatever a driver raises, the CPU can still train
-        return "cpu", f"Training on the CPU: {_first_line(error)}"
+        return "cpu", f"{task} on the CPU: {first_line(error)}"
     reasons = []
     for adapter in names:
         try:
             trial = _trial(adapter)
         except Exception as error:
-            reasons.append(f"{adapter} fails ({_first_line(error)})")
+            reasons.append(f"{adapter} fails ({first_line(error)})")
             continue
         if trial.is_right and trial.device_s < trial.cpu_s:
-            return GPU + adapter, f"Training on {adapter}, {_comparison(trial)}"
+            return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
         reasons.append(f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial))
-    return "cpu", f"Training on the CPU: {'; '.join(reasons)}"
+    return "cpu", f"{task} on the CPU: {'; '.join(reasons)}"
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
+    """What a driver's error says, without its details."""
     return (str(error).strip() or repr(error)).splitlines()[0].removeprefix("--device gpu: ")
 
 
 @cache
 def _trial(adapter: str) -> "Trial":
-    from ...raster.gpu.device import Device
-    from ...raster.gpu.trial import try_device
+    from .gpu.device import Device
+    from .gpu.trial import try_device
 
     return try_device(Device(adapter))
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.training.optimize import device as device_module
-from stga_addon.training.optimize.device import adapter_names, choose_device
+from stga_addon.raster import device as device_module
+from stga_addon.raster.device import adapter_names, choose_device
 from stga_addon.training.settings import is_device
 
 pytest.importorskip("wgpu")
@@ -130,7 +130,7 @@ def test_what_is_a_device() -> None:
 def test_wgpu_is_imported_only_where_it_works() -> None:
     """Catches a run on the CPU that needs wgpu, or waits for a driver."""
     script = (
-        "import sys; from stga_addon.training.optimize import device; from stga_addon.training.run import loop; "
+        "import sys; from stga_addon.raster import device; from stga_addon.training.run import loop; "
         "device.choose_device('cpu'); sys.exit('wgpu' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0

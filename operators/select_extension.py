@@ -1,0 +1,65 @@
+"""Selects, frame by frame, the triangles that extending a run by this take would train, before anything is trained."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar
+
+import bpy
+import numpy as np
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.files import read_npz
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.vertex_groups import write_selection
+from . import background, ids, monitor
+from .analyze import needs_idle
+from .background import Command
+from .common import file_path, head_of, is_head, needs_own_head, reporting
+from .select import count_selected
+
+
+class SelectExtension(bpy.types.Operator):
+    """Select the triangles that extending the run by this head's take would train in each frame: those that move, and
+    those that look different than in the run's images"""
+
+    bl_idname = ids.SELECT_EXTENSION
+    bl_label = "Select What Extend Trains"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    directory: bpy.props.StringProperty(
+        name="Run Folder", description="Folder of the run to extend", subtype="DIR_PATH", options=PATH_OPTIONS
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_idle(cls, context) and needs_own_head(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head, run = head_of(context), file_path(self.directory, "run folder")
+        folder = TemporaryDirectory(prefix="stga_")
+        found = Path(folder.name) / "selection.npz"
+
+        take = head[tags.CAPTURE]
+
+        def show(scene: Any, output: str) -> None:
+            with folder:
+                selection = {int(timestep): faces for timestep, faces in read_npz(found).items()}
+            _show(scene, take, selection)
+
+        arguments = ["extend", str(run), take, "--select-only", str(found)]
+        if head.get(tags.FLAME_MODEL):
+            arguments += ["--flame", head[tags.FLAME_MODEL]]
+        background.start(context, Command(arguments, show, "extension_error"))
+        return {"FINISHED"}
+
+
+def _show(scene: Any, take: str, selection: dict[int, np.ndarray]) -> None:
+    head = getattr(scene, ids.SETTINGS).head
+    if not is_head(head) or head[tags.CAPTURE] != take:
+        raise StgaError(f"{take}: its head is no longer that of the scene")
+    write_selection(head, selection)
+    count_selected(scene, head)
+    if monitor.has_timer() and bpy.ops.ed.undo_push.poll():
+        bpy.ops.ed.undo_push(message=SelectExtension.bl_label)

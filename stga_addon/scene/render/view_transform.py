@@ -1,0 +1,189 @@
+"""The inverse of a scene's view transform: scene-linear colors that it shows as given sRGB colors.
+
+Blender's own color management converts a grid of scene-linear colors to a picture; that table is inverted.
+"""
+
+import tempfile
+import threading
+from contextlib import suppress
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..compat import choose_image_file, working_space
+
+DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
+"""View transforms that show data instead of colors; they are left alone."""
+GRID, INVERSE_GRID = 41, 25
+"""Samples along an axis of the table measured, and of its inverse."""
+DARKEST, BRIGHTEST = -14.0, 6.0
+"""Range of the scene-linear samples, in log2; the first sample is 0."""
+INVERSE_STEPS = 15
+REC709 = "Linear Rec.709"
+"""The scene-linear color space of new files, and of all before Blender 5.0."""
+CHUNK = 1 << 16
+"""Pixels converted at a time, which bounds the memory."""
+MAIN_THREAD_TIMEOUT_S = 10.0
+
+_measured: dict[tuple[Any, ...], "InverseView"] = {}
+
+
+class InverseView:
+    """The inverse of a view transform.
+
+    shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors whose red, green and blue are `axis` (G,), in that order.
+    """
+
+    def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
+        self._axis, self._shown = axis, shown
+        nodes = np.linspace(0, 1, INVERSE_GRID) ** 2  # denser in the dark
+        grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
+        self._inverse = self._solve(grid).reshape(*(INVERSE_GRID,) * 3, 3)
+
+    def show(self, linear: np.ndarray) -> np.ndarray:
+        """sRGB (…, 3) that the view transform shows of scene-linear colors."""
+        place = np.interp(linear, self._axis, np.arange(len(self._axis)))
+        return interpolate(self._shown, place.reshape(-1, 3)).reshape(linear.shape)
+
+    def to_linear(self, srgb: np.ndarray) -> np.ndarray:
+        """Scene-linear colors (…, 3) float32 that the view transform shows as `srgb`, or as nearly as it can."""
+        flat = np.sqrt(np.clip(srgb, 0, 1)).reshape(-1, 3) * (INVERSE_GRID - 1)
+        linear = np.empty(flat.shape, np.float32)
+        for begin in range(0, len(flat), CHUNK):
+            place = interpolate(self._inverse, flat[begin : begin + CHUNK])
+            linear[begin : begin + CHUNK] = np.interp(place, np.arange(len(self._axis)), self._axis)
+        return linear.reshape(srgb.shape)
+
+    def _solve(self, target: np.ndarray) -> np.ndarray:
+        """Places (M, 3) in the table, in samples, that show colors (M, 3) most nearly, by Levenberg-Marquardt steps."""
+        last = len(self._axis) - 1
+        gray = np.maximum.accumulate(np.einsum("iiic->i", self._shown) / 3)
+        place = np.interp(target, gray, np.arange(last + 1))
+        rest, damping = interpolate(self._shown, place) - target, np.full((len(target), 1, 1), 1e-4)
+        for _ in range(INVERSE_STEPS):
+            ends = [np.clip(place + step, 0, last) for step in (*np.eye(3), *-np.eye(3))]
+            values = np.stack([interpolate(self._shown, end) for end in ends], -1)
+            jacobian = (values[..., :3] - values[..., 3:]) / 2
+            transposed = jacobian.transpose(0, 2, 1)
+            step = np.linalg.solve(transposed @ jacobian + damping * np.eye(3), transposed @ rest[..., None])[..., 0]
+            moved = np.clip(place - np.clip(step, -4, 4), 0, last)
+            rest_moved = interpolate(self._shown, moved) - target
+            better = (rest_moved**2).sum(-1) < (rest**2).sum(-1)
+            place[better], rest[better] = moved[better], rest_moved[better]
+            damping = np.clip(np.where(better[:, None, None], damping / 4, damping * 8), 1e-7, 1e3)
+        return place
+
+
+def interpolate(table: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Values (M, C) of a table (G, G, G, C) at places (M, 3) in samples, trilinearly."""
+    size = len(table)
+    low = np.minimum(place.astype(np.int64), size - 2)
+    part = place - low
+    flat, first = table.reshape(size**3, -1), (low[:, 0] * size + low[:, 1]) * size + low[:, 2]
+    values = np.zeros((len(place), flat.shape[1]))
+    for corner in product((0, 1), repeat=3):
+        weight = np.prod(np.where(corner, part, 1 - part), axis=1)
+        values += weight[:, None] * flat[first + (corner[0] * size + corner[1]) * size + corner[2]]
+    return values
+
+
+def keeps_colors(scene: Any) -> bool:
+    """Whether the scene's color management shows scene-linear Rec. 709 as sRGB."""
+    view = scene.view_settings
+    plain = view.view_transform == "Standard" and view.look == "None" and not view.use_curve_mapping
+    balanced = not getattr(view, "use_white_balance", False)  # from Blender 4.3 on
+    return bool(plain and balanced and view.exposure == 0 and view.gamma == 1 and working_space() == REC709)
+
+
+def needs_inverse(scene: Any) -> bool:
+    """Whether the scene's color management changes colors, and shows colors at all."""
+    return not keeps_colors(scene) and scene.view_settings.view_transform not in DATA_VIEWS
+
+
+def inverse_view(scene: Any) -> InverseView | None:
+    """The inverse of the scene's view transform as `measure` found it, None where it did not."""
+    return _measured.get(_settings(scene))
+
+
+def measure(scene: Any) -> None:
+    """Find `inverse_view` if it is needed, before rendering.
+
+    Blender calls this in its render thread, and data may be changed by the main thread only; that is waited for. Once
+    the render engine has the GPU, it must not be: the main thread then waits for the GPU to draw.
+    """
+    key = _settings(scene)
+    if key in _measured or not needs_inverse(scene):
+        return
+    measured = threading.Event()
+
+    def work() -> None:
+        try:
+            axis = np.append(0, 2 ** (np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure))
+            shown = _shown(scene, axis)
+            _measured.clear()  # an animated exposure would pile them up
+            _measured[key] = InverseView(axis, shown)
+        finally:
+            measured.set()
+
+    if threading.current_thread() is threading.main_thread():
+        work()
+    else:
+        bpy.app.timers.register(work)
+        measured.wait(MAIN_THREAD_TIMEOUT_S)
+
+
+def _settings(scene: Any) -> tuple[Any, ...]:
+    """What the view transform depends on, less the display device."""
+    view = scene.view_settings
+    scalars = [each for each in view.bl_rna.properties if each.type in {"BOOLEAN", "FLOAT", "ENUM"}]
+    names = [each.identifier for each in scalars if not getattr(each, "is_array", False)]
+    curves = view.curve_mapping.curves if view.use_curve_mapping else ()
+    points = [tuple(point.location) for curve in curves for point in curve.points]
+    return working_space(), *(getattr(view, name) for name in names), *points
+
+
+def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
+    """(G, G, G, 3) sRGB 0…1 that Blender shows on an sRGB display of the scene-linear colors of an `axis` (G,)."""
+    size = len(axis)
+    pixels = np.ones((size, size, size, 4), np.float32)
+    pixels[..., :3] = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    copy = scene.copy()
+    image = bpy.data.images.new("view transform", size * size, size, float_buffer=True)
+    try:
+        image.colorspace_settings.name = working_space()
+        image.pixels.foreach_set(pixels.ravel())
+        _show_on_srgb(copy)
+        choose_image_file(copy.render.image_settings, "PNG", "RGB", "16")
+        copy.render.dither_intensity = 0
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "shown.png"
+            image.save_render(str(path), scene=copy)
+            return _read(path, pixels.size).reshape(pixels.shape)[..., :3]
+    finally:
+        bpy.data.images.remove(image)
+        bpy.data.scenes.remove(copy)
+
+
+def _show_on_srgb(scene: Any) -> None:
+    """Choose the sRGB display, and again the view transform and look, which that may change."""
+    view, device = scene.view_settings, scene.display_settings
+    chosen = {name: getattr(view, name) for name in ("view_transform", "look")}
+    scene.render.image_settings.color_management = "FOLLOW_SCENE"
+    device.display_device = "sRGB"
+    for name, value in chosen.items():
+        with suppress(TypeError):  # there is no such one for this display
+            setattr(view, name, value)
+
+
+def _read(path: Path, count: int) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    try:
+        image.colorspace_settings.name = "Non-Color"
+        values = np.empty(count, np.float32)
+        image.pixels.foreach_get(values)
+        return values
+    finally:
+        bpy.data.images.remove(image)
