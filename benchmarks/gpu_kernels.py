@@ -1,16 +1,19 @@
 """What an iteration costs a GPU, kernel by kernel: the part of `iteration.py --device gpu`."""
 
 import statistics
-from collections.abc import Callable
-from time import perf_counter
+from dataclasses import replace
+from time import perf_counter, thread_time
 
 import numpy as np
 
 from stga_addon.raster.cpu.layout import PROJECTED
+from stga_addon.raster.cpu.rasterize import tile_grid
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import COUNTS, DIGIT_BITS, NEEDED
 from stga_addon.raster.gpu.tiles import counts_buffer
 from stga_addon.raster.gpu.timing import KernelTimes
+from stga_addon.training.optimize.backend import Batch
+from stga_addon.training.optimize.gpu_backend import GpuBackend
 
 COPIED_BYTES, COPIES = 1 << 26, 8
 SPLAT_WORDS = 59
@@ -22,41 +25,47 @@ def wait(device: Device) -> None:
     device.read(counts_buffer(device), (1,), np.uint32)
 
 
-def queued_ms(device: Device, step: Callable[[], object], repeats: int) -> float:
+def queued_ms(step: GpuBackend, repeats: int, batch: Batch) -> float:
     """Mean wall time in milliseconds of iterations that follow each other without waiting, after five of them."""
     for count in (5, repeats):
-        wait(device)
+        wait(step.device)
         begin = perf_counter()
         for _ in range(count):
-            step()
-        wait(device)
+            step.step(batch)
+        wait(step.device)
     return 1e3 * (perf_counter() - begin) / repeats
 
 
-def host_ms(device: Device, step: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Median milliseconds that the host takes for an iteration of an idle device: uploads and recording, submit.
+def host_ms(step: GpuBackend, batch: Batch, repeats: int) -> tuple[float, float]:
+    """Median CPU time in milliseconds that the host's thread takes for an iteration: without the submit, and in it.
 
-    Software Vulkan computes in the submit.
+    Of an idle device. Software Vulkan computes in the submit, so that only a tiny image shows what the latter costs.
     """
-    queue, inside = device.gpu.queue, 0.0
+    queue, inside = step.device.gpu.queue, 0.0
     submit = queue.submit
 
     def timed(commands: object) -> None:
         nonlocal inside
-        begin = perf_counter()
+        begin = thread_time()
         submit(commands)
-        inside = perf_counter() - begin
+        inside = thread_time() - begin
 
     queue.submit = timed
     times = []
     for _ in range(repeats):
-        wait(device)
-        begin = perf_counter()
-        step()
-        times.append((perf_counter() - begin - inside, inside))
+        wait(step.device)
+        begin = thread_time()
+        step.step(batch)
+        times.append((thread_time() - begin - inside, inside))
     del queue.submit
     recording, submitting = (1e3 * statistics.median(column) for column in zip(*times, strict=True))
     return recording, submitting
+
+
+def tiny(batch: Batch) -> Batch:
+    """The same view as an image of 16 × 16 pixels."""
+    camera = replace(batch.view.camera, width=16, height=16)
+    return replace(batch, view=replace(batch.view, camera=camera), target=batch.target[:16, :16].copy())
 
 
 def copy_bandwidth(device: Device) -> float:
@@ -84,7 +93,7 @@ def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, i
         "sort.scatter": 16 * sorted_keys,
         "count_pairs.count": splats * 24,
         "fill_pairs.main": splats * 36 + pairs * 8,
-        "tile_lists.main": pairs * 20,
+        "tile_lists.main": pairs * 4,
         "blend_forward.main": pairs * (8 + projected) + pixels * 20,
         "image_loss.gradient": pixels * 27,
         "blend_backward.main": pairs * (8 + 2 * projected) + pixels * 20,
@@ -95,19 +104,26 @@ def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, i
     }
 
 
-def kernel_table(
-    device: Device, step: Callable[[], object], splats: int, pixels: int, tiles: int, repeats: int
-) -> dict[str, float]:
+def kernel_table(step: GpuBackend, batch: Batch, repeats: int) -> dict[str, float]:
     """Print each kernel's time beside its floor, and what an iteration asks of the host; returns milliseconds."""
+    device, camera = step.device, batch.view.camera
+    if device.is_software:
+        print("This adapter is a CPU: its times say nothing of a GPU's")
+    step.step(batch)
     before = device.dispatches, device.submits, device.waits
     for _ in range(repeats):
-        step()
+        step.step(batch)
     after = device.dispatches, device.submits, device.waits
     counts = [(b - a) / repeats for a, b in zip(before, after, strict=True)]
     print("{:g} dispatches, {:g} submits, {:g} waits an iteration".format(*counts))
-    recording, submitting = host_ms(device, step, repeats)
-    print(f"host: {recording:.2f} ms an iteration and {submitting:.2f} in the submit")
+    recording, submitting = host_ms(step, batch, repeats)
+    print(
+        f"host thread: {recording:.2f} ms of CPU time to upload and record an iteration; {submitting:.2f} in the submit"
+    )
+    _, submitting = host_ms(step, tiny(batch), repeats)
+    print(f"of an image of 16 × 16 pixels, which leaves next to nothing to compute: {submitting:.2f} ms in the submit")
     print(f"buffers: {device.bytes / 2**20:.0f} MiB")
+    step.step(batch)
     wait(device)
     pairs = int(device.read(counts_buffer(device), (COUNTS,), np.uint32)[NEEDED])
     bandwidth = copy_bandwidth(device)
@@ -117,10 +133,11 @@ def kernel_table(
         return {}
     device.kernel_times = KernelTimes(device)
     for _ in range(repeats):
-        step()
+        step.step(batch)
     found = {name: ms / repeats for name, ms in device.kernel_times.read().items()}
     device.kernel_times = None
-    moved = least_bytes(splats, pixels, tiles, pairs)
+    tiles_x, tiles_y = tile_grid(camera.width, camera.height)
+    moved = least_bytes(len(step), camera.width * camera.height, tiles_x * tiles_y, pairs)
     print(f"{'kernel':<26}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, ms in found.items():
         floor = 1e3 * moved.get(name, 0) / bandwidth

@@ -15,10 +15,10 @@ import json
 import statistics
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
-import gpu_kernels
 import numpy as np
 import trimesh
 
@@ -34,12 +34,9 @@ from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render
 from stga_addon.raster.cpu.threads import threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.raster.device import choose_device
-from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.backend import Backend, Batch
-from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.backend import Backend, Batch, make_backend
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.losses import image_gradient, whole_image
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.settings import make_settings
@@ -167,13 +164,13 @@ def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str
 
 
 def device_step(
-    device: Device | None, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
+    device: str, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
 ) -> tuple[Backend, Batch]:
-    """A whole iteration on a GPU or the CPU, from the posed mesh's frames on, and the global batch to give it."""
+    """A whole iteration on a device of `choose_device`, from the posed mesh's frames on, and its global batch."""
     lengths = np.sqrt(2 * face_areas(mesh, faces)).astype(np.float32)
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
     given = make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats)
-    step = CpuBackend(*given) if device is None else GpuBackend(device, *given)
+    step = make_backend(device, *given)
     view = View(0, 0, camera, "benchmark", Path())
     return step, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
 
@@ -202,26 +199,17 @@ def main() -> None:
     target = rng.integers(0, 256, (options.height, options.width, 3)).astype(np.uint8)
     chosen, why = choose_device(options.device)
     print(why)
-    device = None if chosen == "cpu" else Device(chosen.partition(":")[2])
-    if device is not None and device.is_software:
-        print("This adapter is a CPU: its times say nothing of a GPU's")
-    step, batch = device_step(device, splats, mesh, faces, camera, target)
-
-    def measure(batch: Batch) -> float:
-        if device is None:
-            return median_ms(lambda: step.step(batch), options.repeats)
-        return gpu_kernels.queued_ms(device, lambda: step.step(batch), options.repeats)
-
-    whole = measure(batch)
-    if device is None:
+    step, batch = device_step(chosen, splats, mesh, faces, camera, target)
+    if chosen == "cpu":
+        measure = partial(cpu_ms, step, options.repeats)
         frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
         found = cpu_table(splats, frames, target, options.repeats)
     else:
-        tiles_x, tiles_y = tile_grid(options.width, options.height)
-        found = gpu_kernels.kernel_table(
-            device, lambda: step.step(batch), len(splats), options.width * options.height, tiles_x * tiles_y,
-            options.repeats,
-        )  # fmt: skip
+        import gpu_kernels  # needs wgpu
+
+        measure = partial(gpu_kernels.queued_ms, step, options.repeats)
+        found = gpu_kernels.kernel_table(step, batch, options.repeats)
+    whole = measure(batch)
     print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
     print(f"{'whole iteration':<22}{whole:8.2f}")
     parts = {}
@@ -231,6 +219,10 @@ def main() -> None:
     if options.out:
         result = {"stages_ms": found, "global_ms": whole, "local_ms": parts}
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def cpu_ms(step: Backend, repeats: int, batch: Batch) -> float:
+    return median_ms(lambda: step.step(batch), repeats)
 
 
 def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, float]:

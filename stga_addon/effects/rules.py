@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..flame.sequence import MIN_JOINT_ANGLE_DEG
+from ..tracking.folder import is_tracked
 from .facts import CaptureFacts
 
 MIN_CAMERAS_FOR_VIEW_COLOR = 4
@@ -199,6 +200,8 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
         return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", only=True)
     if facts.timesteps == 1:
         return Verdict(False, "the splats of a single frame follow its images without it", only=True)
+    if is_tracked(facts.capture.root):
+        return Verdict(True, "the capture is from `stga track`: splats see motion more sharply than landmarks do")
     if np.isnan(facts.outside):
         return Verdict(False, "without masks, the mesh cannot be compared with the images")
     return Verdict(facts.outside > MAX_OUTSIDE_SHARE, f"{facts.outside:.2%} of the mesh sticks out of the masks")

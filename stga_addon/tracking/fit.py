@@ -101,8 +101,8 @@ def fit_head(
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
-        solved[:] = 0
-        solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
+        if not number:
+            solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
         solved = solve_take(subject, places, take_observed, solved)
         seen = {
             t: by_visibility(take[t], subject, places, values, world)

@@ -9,8 +9,8 @@ from ..flame.model import FlameModel
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
-ANGLE_STEP = 1e-5
-"""Radians, for derivatives by joint angles."""
+SMALL_ANGLE = 1e-4
+"""Radians, below which a quotient by the squared angle is its limit."""
 
 
 @dataclass(frozen=True)
@@ -54,48 +54,112 @@ class PosedPoints:
 
     def positions(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
         """(N, 3) meters; rigid (18,): pose, then translation."""
-        shaped = self.template + self.dirs @ coefficients
-        return self._place(shaped, self.joints + self.joint_dirs @ coefficients, rigid)
+        return self._posed(coefficients, rigid).positions
 
     def linearized(self, coefficients: np.ndarray, rigid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) and their derivatives (N, 3, K + 18), exact but for the step of the joint angles."""
-        shaped = self.template + self.dirs @ coefficients
+        """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
+        posed, count = self._posed(coefficients, rigid), len(self.barycentric)
+        turns = [_left_jacobian(angles) for angles in posed.angles]
+        moved = _moves(posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs)
+        shapes = np.concatenate([self.dirs, self._corrective_dirs(posed, turns)], axis=2)
+        # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
+        skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
+        found = np.concatenate([skin @ shapes.reshape(count, 9, -1), np.zeros((count, 3, TRANSLATION_SIZE))], axis=2)
+        first = self.dirs.shape[2]
+        found[..., :first] += np.tensordot(self._weighted(self.weights).sum(1), moved, 1)
+        for joint, turn in enumerate(turns):
+            found[..., first + 3 * joint : first + 3 * joint + 3] += self._by_joint(posed, turn, joint)
+        found[..., -TRANSLATION_SIZE:] = np.eye(3)
+        return posed.positions, found
+
+    def _posed(self, coefficients: np.ndarray, rigid: np.ndarray) -> "_Posed":
+        local = axis_angle_matrices(rigid[:POSE_SIZE].reshape(-1, 3))
+        rotations = local.copy()
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                rotations[joint] = rotations[parent] @ rotations[joint]
         joints = self.joints + self.joint_dirs @ coefficients
-        positions = self._place(shaped, joints, rigid)
-        rotations, moved = self._transforms(rigid[:POSE_SIZE], self.joint_dirs)
-        skin = np.einsum("vj,jab->vab", self.weights, rotations)
-        by_coefficient = skin @ self.dirs + np.einsum("vj,jak->vak", self.weights, moved)
-        columns = [self._blend(by_coefficient)]
-        for number in range(POSE_SIZE):
-            turned = rigid.copy()
-            turned[number] += ANGLE_STEP
-            columns.append((self._place(shaped, joints, turned) - positions)[..., None] / ANGLE_STEP)
-        columns.append(np.broadcast_to(np.eye(3), (len(positions), 3, 3)))
-        return positions, np.concatenate(columns, axis=2)
+        places = self._placed(rotations, joints[..., None])[..., 0]
+        moved = _moves(rotations, places[..., None], joints[..., None])[..., 0]
+        corrected = self.template + self.dirs @ coefficients + self.posedirs @ (local[1:] - np.eye(3)).ravel()
+        skin = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
+        posed = (skin @ corrected[..., None])[..., 0] + self.weights @ moved
+        positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:]
+        return _Posed(positions, rigid[:POSE_SIZE].reshape(-1, 3), local, rotations, places, moved, corrected, skin)
 
-    def _place(self, shaped: np.ndarray, joints: np.ndarray, rigid: np.ndarray) -> np.ndarray:
-        rotations, moved = self._transforms(rigid[:POSE_SIZE], joints[..., None])
-        local = axis_angle_matrices(rigid[:POSE_SIZE].reshape(5, 3))
-        corrected = shaped + self.posedirs @ (local[1:] - np.eye(3)).ravel()
-        skin = np.einsum("vj,jab->vab", self.weights, rotations)
-        posed = np.einsum("vab,vb->va", skin, corrected) + self.weights @ moved[..., 0]
-        return np.asarray(self._blend(posed) + rigid[POSE_SIZE:])
+    def _corrective_dirs(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
+        """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root has none."""
+        bent = np.zeros((self.posedirs.shape[2], POSE_SIZE))
+        for joint in range(1, len(turns)):
+            changes = _cross_matrices(turns[joint].T) @ posed.local[joint]
+            bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.reshape(3, 9).T
+        return np.asarray((self.posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
-    def _transforms(self, pose: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World rotations (5, 3, 3), and (5, 3, K) by which each joint moves what it carries after rotating it.
+    def _by_joint(self, posed: "_Posed", turn: np.ndarray, joint: int) -> np.ndarray:
+        """Derivatives (N, 3, 3) by a joint's axis-angle, of which `turn` is the `_left_jacobian`, but for correctives.
 
-        joints (5, 3, K): joint positions, or their derivatives, in which the result is linear.
+        Turning a joint turns about it what it and the joints below it carry, each with its share of the skin.
         """
-        rotations = axis_angle_matrices(pose.reshape(5, 3))
+        parent = self.parents[joint]
+        carried = [k for k in range(len(self.parents)) if self._is_below(k, joint)]
+        share = self.weights[:, carried]
+        turned = (share @ posed.rotations[carried].reshape(-1, 9)).reshape(-1, 3, 3)
+        arms = (turned @ posed.corrected[..., None])[..., 0]
+        arms += share @ (posed.moved[carried] - posed.places[joint])
+        world = turn if parent < 0 else posed.rotations[parent] @ turn
+        return np.asarray(-_cross_matrices(self._weighted(arms).sum(1)) @ world)
+
+    def _is_below(self, joint: int, above: int) -> bool:
+        """Whether `above` is the joint or one that carries it."""
+        while joint >= 0 and joint != above:
+            joint = self.parents[joint]
+        return joint == above
+
+    def _placed(self, rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
+        """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result is linear."""
         place = joints.copy()
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
                 place[joint] = place[parent] + rotations[parent] @ (joints[joint] - joints[parent])
-                rotations[joint] = rotations[parent] @ rotations[joint]
-        return rotations, place - rotations @ joints
+        return place
 
-    def _blend(self, values: np.ndarray) -> np.ndarray:
-        """Values (N, …) at the points from those (3 N, …) at their triangles' corners."""
-        return np.asarray(
-            np.einsum("nk,nk...->n...", self.barycentric, values.reshape(len(self.barycentric), 3, *values.shape[1:]))
-        )
+    def _weighted(self, values: np.ndarray) -> np.ndarray:
+        """Values (3 N, …) at the triangles' corners as (N, 3 corners, …), times the barycentric coordinates."""
+        shaped = values.reshape(len(self.barycentric), 3, *values.shape[1:])
+        return np.asarray(shaped * self.barycentric.reshape(len(shaped), 3, *([1] * (values.ndim - 1))))
+
+
+@dataclass(frozen=True)
+class _Posed:
+    """One evaluation: positions (N, 3); of J joints axis-angles (J, 3), local and world rotations (J, 3, 3), places in
+    the world (J, 3) and `_moves` (J, 3); of the 3 N corners, corrected positions and blended rotations (3 N, 3, 3)."""
+
+    positions: np.ndarray
+    angles: np.ndarray
+    local: np.ndarray
+    rotations: np.ndarray
+    places: np.ndarray
+    moved: np.ndarray
+    corrected: np.ndarray
+    skin: np.ndarray
+
+
+def _moves(rotations: np.ndarray, places: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """(J, 3, K) by which each joint moves what it carries after rotating it about the origin."""
+    return np.asarray(places - rotations @ joints)
+
+
+def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2)
+
+
+def _left_jacobian(angles: np.ndarray) -> np.ndarray:
+    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of it amounts to."""
+    angle = float(np.linalg.norm(angles))
+    cross = _cross_matrices(angles[None])[0]
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
+    third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
+    return np.asarray(np.eye(3) + second * cross + third * cross @ cross)

@@ -159,7 +159,8 @@ def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stif
     """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure weights."""
     size = state.shape[1]
     second = state[:-2] - 2 * state[1:-1] + state[2:]
-    weight = stiffness / (1 + second**2 * stiffness / JUMP_SCALE**2) ** 2
+    jump = second**2 * stiffness / JUMP_SCALE**2
+    weight = stiffness / ((1 + jump) * (1 + jump.mean(axis=1, keepdims=True))) ** 2  # a cut changes all parameters
     for number, (difference, share) in enumerate(zip(second, weight, strict=True)):
         for row, first in enumerate((1.0, -2.0, 1.0)):
             right[number + row] -= share * first * difference

@@ -19,15 +19,25 @@ from .fit import (
 from .head_model import HeadModel
 from .landmarks import Report
 from .mesh_image import vertex_normals
+from .outline import outline_offsets
 from .photo_consistency import Sweep, facing, gray_view, in_sight, surface_offsets
 from .posed_points import RIGID_SIZE, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 from .write_capture import posed_mesh
 
-IDENTITY_SWEEPS = (Sweep(0.010, 0.001, 0.0015), Sweep(0.004, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001))
-TAKE_SWEEP = Sweep(0.004, 0.0005, 0.001)
-SURFACE_POINTS, MAX_TAKE_POINTS = 2000, 1000
-"""Points over the whole head, and how many of those that are usually found are looked for at every timestep."""
+IDENTITY_SWEEPS = (
+    Sweep(0.010, 0.001, 0.0015),
+    Sweep(0.004, 0.0005, 0.001),
+    Sweep(0.003, 0.0005, 0.001),
+    Sweep(0.003, 0.0005, 0.001),
+)
+FIRST_OFFSET_SWEEP = 2
+"""Before it, what is left between head and surface is mostly a pose and identity that have not converged."""
+TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
+"""At every timestep, and how many of the points that are usually found are looked for. The first starts at the pose of
+the landmarks, from which patches do not lie on the skin that they are of yet."""
+SURFACE_POINTS = 2000
+"""Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
 SURFACE_SIGMA_M = 0.0005
@@ -51,8 +61,13 @@ OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
 
+MAX_OUTLINE_CAMERAS = 8
+"""Cameras whose masks are compared at every timestep."""
+OUTLINE_RADIUS_M = 0.01
+"""Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
+
 Images = Callable[[int], Sequence[tuple[Camera, np.ndarray]]]
-"""Timestep -> cameras, in the footage's world, and their images (H, W, 3) uint8."""
+"""Timestep -> cameras, in the footage's world, and their images (H, W, 3) or masks (H, W), uint8."""
 
 Sights = dict[tuple[int, ...], np.ndarray]
 """Direction from the head, rounded -> (N,) bool: points that are not hidden from there."""
@@ -69,12 +84,13 @@ class SeenSurface:
 
 @dataclass(frozen=True)
 class Take:
-    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, and images."""
+    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, images, masks."""
 
     places: SurfacePoints
     reliable: np.ndarray
     landmarks: Mapping[int, TimestepLandmarks]
     images: Images
+    masks: Images = lambda timestep: ()
 
 
 def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lambda stage, done, total: None) -> HeadFit:
@@ -97,19 +113,22 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
     take = replace(take, landmarks=visible)
     steps = len(IDENTITY_SWEEPS) * len(chosen) + len(timesteps)
     points, offset = surface_points(head, SURFACE_POINTS), np.zeros_like(head.model.v_template)
+    near = _near_landmarks(head, points, take)
     found = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
     for number, sweep in enumerate(IDENTITY_SWEEPS):
         seen: dict[int, SeenSurface] = {}
         for t in chosen:
             report("Surface", number * len(chosen) + len(seen), steps)
             seen[t] = seen_surface(found, t, points, take.images(t), sweep, {})
+            seen[t] = with_outlines(seen[t], found, t, points, take.masks(t), near, sweep.reach)
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return fit
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
-        if number:
+        if number >= FIRST_OFFSET_SWEEP:
             offset = offset + _offsets(found, points, seen)
             found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
-    return _whole_take(found, fit, take, _often_seen(points, seen), lambda left: report("Surface", steps - left, steps))
+    often = [_often_seen(points, seen, count) for _, count in TAKE_SWEEPS]
+    return _whole_take(found, fit, take, often, lambda left: report("Surface", steps - left, steps))
 
 
 def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
@@ -163,6 +182,37 @@ def seen_surface(
         cosines.append(facing(camera, at, normals) * sights[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
     return SeenSurface(at + offset[:, None] * normals, normals, POINT_SHARE * correlation)
+
+
+def with_outlines(
+    seen: SeenSurface,
+    fit: HeadFit,
+    timestep: int,
+    points: SurfacePoints,
+    masks: Sequence[tuple[Camera, np.ndarray]],
+    near: np.ndarray,
+    reach: float,
+) -> SeenSurface:
+    """The surface with what masks say about points at the head's outline; near (N,) bool: those that count."""
+    vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
+    at = points.on(vertices, faces)
+    total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
+    for camera, mask in masks:
+        posed = fit.to_capture.camera(camera)
+        offset, known = outline_offsets(posed, mask, vertices, faces, at[near], seen.normal[near], reach)
+        total[near] += POINT_SHARE * known
+        moved[near] += POINT_SHARE * offset
+    mean = moved / np.maximum(total, 1e-9)
+    return replace(seen, position=at + mean[:, None] * seen.normal, weight=total)
+
+
+def _near_landmarks(head: HeadModel, points: SurfacePoints, take: Take) -> np.ndarray:
+    """(N,) bool: points within OUTLINE_RADIUS_M of a reliable landmark."""
+    from scipy.spatial import cKDTree
+
+    template, faces = head.model.v_template, head.model.faces
+    distance, _ = cKDTree(take.places.on(template, faces)[take.reliable]).query(points.on(template, faces))
+    return np.asarray(distance < OUTLINE_RADIUS_M)
 
 
 def smooth_offsets(
@@ -239,18 +289,20 @@ def _offsets(fit: HeadFit, points: SurfacePoints, seen: Mapping[int, SeenSurface
     return np.asarray(values[:, None] * vertex_normals(model.v_template, model.faces))
 
 
-def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface]) -> SurfacePoints:
+def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface], count: int) -> SurfacePoints:
+    """Up to `count` of the points that are found at most timesteps."""
     often = np.flatnonzero(np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE)
-    rows = often[:: 1 + len(often) // MAX_TAKE_POINTS]
+    rows = often[:: 1 + len(often) // count]
     return SurfacePoints(points.face[rows], points.barycentric[rows])
 
 
 def _whole_take(
-    fit: HeadFit, first: HeadFit, take: Take, points: SurfacePoints, report: Callable[[int], None]
+    fit: HeadFit, first: HeadFit, take: Take, points: Sequence[SurfacePoints], report: Callable[[int], None]
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 
-    What a landmark misses at the timesteps of `fit`, it misses in all: it is taken off.
+    points: for each of TAKE_SWEEPS. What a landmark misses at the timesteps of `fit`, it misses in all: it is taken
+    off.
     """
     timesteps, model = sorted(take.landmarks), fit.head.model
     bias = _landmark_bias(fit, take)
@@ -261,13 +313,19 @@ def _whole_take(
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
-    rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
-    together, sights = [], Sights()
+    together, near = [], [_near_landmarks(fit.head, on, take) for on in points]
+    sights: list[Sights] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
-        seen = seen_surface(rough, t, points, take.images(t), TAKE_SWEEP, sights)
-        together.append(_joined(own, LANDMARK_SHARE, seen))
-    solved = solve_take(fit.head, _both(take.places, points), together, start)
+        images, masks = take.images(t), evenly_spread(take.masks(t), MAX_OUTLINE_CAMERAS)
+        for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
+            rough = replace(fit, parameters={t: start[number]})
+            seen = seen_surface(rough, t, on, images, sweep, sights[stage])
+            seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
+            joined = _joined(own, LANDMARK_SHARE, seen)
+            start[number] = solve_take(fit.head, _both(take.places, on), [joined], start[number : number + 1])[0]
+        together.append(joined)
+    solved = solve_take(fit.head, _both(take.places, points[-1]), together, start)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 

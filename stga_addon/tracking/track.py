@@ -96,7 +96,9 @@ def track(
     take = {timestep: _at(footage, found, timestep, len(places)) for timestep in seen}
     fit = fit_head(head, places, reliable, take, report)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
-    fit = fit_surface(head, fit, Take(places, reliable, take, partial(_images, footage)), report)
+    fit = fit_surface(
+        head, fit, Take(places, reliable, take, partial(_images, footage), partial(_masks, footage)), report
+    )
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
     result = TrackingReport(
@@ -202,6 +204,12 @@ def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, c
 
 def _images(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:
     return [(camera.camera, camera.image(timestep)) for camera in footage.cameras if timestep in camera.timesteps]
+
+
+def _masks(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:
+    seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
+    found = [(camera.camera, camera.mask(timestep)) for camera in seen]
+    return [(camera, mask) for camera, mask in found if mask is not None]
 
 
 def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:

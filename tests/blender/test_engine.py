@@ -15,7 +15,7 @@ from mathutils import Matrix  # noqa: E402
 from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.errors import DeviceError, StgaError  # noqa: E402
 from stga_addon.raster.cpu.project import _basis  # noqa: E402
 from stga_addon.raster.render import render as render_splats  # noqa: E402
 from stga_addon.raster.render import render_avatar  # noqa: E402
@@ -482,6 +482,36 @@ def test_changed_topology_is_refused():
     set_input(shown, splat_nodes.HEAD, None)
     with pytest.raises(RuntimeError, match="has no head to follow"):
         bpy.ops.render.render()
+
+
+def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
+    """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a silent failure."""
+    from raster import gpu_device
+
+    from stga_addon.raster.gpu import compose as on_gpu
+
+    monkeypatch.setattr(engine, "draw_image", lambda layers, camera: None)
+    wanted = ["cpu"]
+    engine.unregister()
+    engine.register(no_python, lambda: wanted[0])
+    show(textured(avatar_of("stga"), -6))
+    camera_at()
+    on_cpu = render(tmp_path)
+    wanted[0] = f"gpu:{gpu_device.device().name}"
+    passes = render(tmp_path)
+    assert engine._client._composer.device == wanted[0]
+    for channel in "RGBA":
+        np.testing.assert_allclose(passes[channel], on_cpu[channel], atol=1e-4)
+    seen = on_cpu["A"] > 0.05
+    assert seen.any()
+    np.testing.assert_allclose(passes["Depth"][seen], on_cpu["Depth"][seen], rtol=1e-3)
+
+    def lost(*_: object) -> None:
+        raise DeviceError("Card 9000 was lost", "try again")
+
+    monkeypatch.setattr(on_gpu, "compose", lost)
+    with pytest.raises(RuntimeError, match="Card 9000 was lost; try again"):
+        render(tmp_path)
 
 
 def test_panels_drop_the_engine_on_unregister():

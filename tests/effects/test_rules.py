@@ -14,6 +14,7 @@ from stga_addon.effects.samples import MAX_VIEWS, sample_views, take_samples
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
+from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
 from stga_addon.training.effect_plan import EFFECTS, parse_choices
 from stga_addon.training.settings import TrainingSettings, make_settings
 
@@ -227,6 +228,19 @@ def test_mesh_and_mask_disagree(painted):
         verdict = rules.tracking(impossible)
         assert (verdict.on, verdict.only) == (False, True)
     assert "on the CPU only, not on cuda:0" in verdict.reason
+
+
+def test_a_capture_that_was_tracked_here(painted, tmp_path):
+    """Catches the effect left off where masks are filled and the tracking is known to be that of landmarks."""
+    facts = off_track(painted(), 0.0)
+    facts.capture = replace(facts.capture, root=tmp_path)
+    assert not rules.tracking(facts).on
+    (tmp_path / LANDMARKS_FOLDER).mkdir()
+    for name in (REPORT_FILE, f"{LANDMARKS_FOLDER}/{PLACES_FILE}"):
+        (tmp_path / name).touch()
+    assert rules.tracking(facts).on
+    facts.device = "gpu:0"
+    assert not rules.tracking(facts).on
 
 
 def test_what_a_mesh_sequence_has_not(painted):

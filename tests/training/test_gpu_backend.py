@@ -138,7 +138,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
     first.step(whole)
     second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
-    device = second._device
+    device = second.device
     for name in ("image", "pixels", "v_image", "pair_gradients", "projected", "gradients", "screen"):
         device.upload(name, np.full(device.buffer(name, 0).size // 4, np.nan, np.float32))
     second.step(part)
@@ -172,7 +172,7 @@ def test_an_iteration_is_one_submit(toy: Capture, part: str | None) -> None:
     _, gpu = pair(toy, settings)
     batch = batch_of(toy, settings, selected=None if part is None else toy.regions[part])
     gpu.step(batch)
-    device = gpu._device
+    device = gpu.device
     before = device.dispatches, device.submits, device.waits
     gpu.step(batch)
     assert device.dispatches - before[0] <= 30

@@ -3,7 +3,7 @@
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from ...cli.arguments import duration, usable_path
+from ...cli.arguments import add_device, duration, usable_path, whole_number
 from ...jobs.delegate import OpenHead
 
 NAME, HELP = "demo", "make a synthetic capture, train an avatar on it and show it in Blender"
@@ -11,13 +11,20 @@ NAME, HELP = "demo", "make a synthetic capture, train an avatar on it and show i
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--out", type=usable_path, default=Path("out/demo"))
-    parser.add_argument("--budget", type=duration, default=40.0, metavar="TIME")
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument("--budget", type=duration, default=40.0, metavar="TIME")
+    budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
+    add_device(parser)
     parser.add_argument("--footage", action="store_true", help="make an avatar from the capture's images alone as well")
 
 
 def run(options: Namespace) -> None:
+    from ...raster.device import choose_device
     from .run import avatar_from_footage, run_demo
 
-    run_demo(options.out, options.budget)
+    device, why = choose_device(options.device)
+    print(why)
+    budget = {"seconds": options.budget} if options.iterations is None else {"iterations": options.iterations}
+    run_demo(options.out, budget, device=device)
     if options.footage:
-        avatar_from_footage(options.out, options.budget)
+        avatar_from_footage(options.out, options.budget, options.device)

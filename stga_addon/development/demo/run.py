@@ -1,7 +1,9 @@
 """Demo: make a synthetic capture, train an avatar on it, show it in Blender and compare the pictures."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -37,8 +39,10 @@ MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
 
-def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -> None:
+def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | None = None, device: str = "cpu") -> None:
     """Make a capture of a synthetic head, import it into Blender, select, train, and show the avatar.
+
+    budget: the setting that limits training, `seconds` or `iterations`; device: one of `choose_device`.
 
     Leaves avatar.npz, avatar.html, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's
     bpy.
@@ -50,7 +54,7 @@ def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -
         model = make_capture(folder, SEED, options, progress=lambda done, total: _advance(bar, done, total))
     capture = open_capture(folder, model)
     head, selection = _import_and_select(capture, model)
-    avatar = _train(capture, model, out, seconds, selection)
+    avatar = _train(capture, model, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
@@ -62,7 +66,7 @@ def run_demo(out: Path, seconds: float, options: CaptureOptions | None = None) -
     print(f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
 
 
-def avatar_from_footage(out: Path, seconds: float) -> None:
+def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
     """Make an avatar in OUT/footage from the images and cameras of the demo's capture, without its meshes.
 
     Needs the landmark detector. Raises StgaError.
@@ -70,7 +74,7 @@ def avatar_from_footage(out: Path, seconds: float) -> None:
     from ...cli.main import make_parser
 
     model = ["--model", str(out / "capture/flame_model.npz"), "--cameras", str(out / "capture/transforms.json")]
-    more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED)]
+    more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED), "--device", device]
     options = make_parser().parse_args(["avatar", str(out / "capture"), *model, *more])
     options.head = None
     options.run(options)
@@ -93,10 +97,12 @@ def _import_and_select(capture: Capture, model: Path) -> tuple[object, dict[int,
     return head, read_selection(head)
 
 
-def _train(capture: Capture, model: Path, out: Path, seconds: float, selection: dict[int, np.ndarray]) -> Avatar:
+def _train(
+    capture: Capture, model: Path, out: Path, budget: Mapping[str, Any], selection: dict[int, np.ndarray], device: str
+) -> Avatar:
     # The tracking of a synthetic capture is exact, and Blender shows it unrefined.
-    settings = make_settings(seconds=seconds, seed=SEED, effects={"tracking": "off"})
-    run = with_effect_plan(Run(capture.root, model.resolve(), "vhap", settings), capture)
+    settings = make_settings(**budget, seed=SEED, effects={"tracking": "off"})
+    run = with_effect_plan(Run(capture.root, model.resolve(), "vhap", settings, device=device), capture, device)
     folder = out / "run"
     if (folder / "run.json").exists():
         (folder / "run.json").unlink()  # the demo always starts a new run

@@ -106,7 +106,7 @@ class Device:
         self.dispatches = self.submits = self.waits = 0
         self.kernel_times: KernelTimes | None = None
         self._buffers: dict[str, Any] = {}
-        self._groups: dict[tuple[int, ...], tuple[Any, tuple[Any, ...]]] = {}
+        self._groups: dict[tuple[int | str, ...], tuple[Any, tuple[Any, ...]]] = {}
 
     @property
     def bytes(self) -> int:
@@ -133,7 +133,7 @@ class Device:
             raise DeviceError(
                 f"{self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of {size >> 20} MiB "
                 f"for {name}",
-                "train smaller images or fewer splats, or continue with --device cpu",
+                "train smaller images or fewer splats, or continue on the CPU (--device cpu)",
             )
         with self.errors():
             return self.gpu.create_buffer(label=name, size=size, usage=usage)
@@ -200,7 +200,7 @@ class Device:
 
     def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
         """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
-        key = id(kernel), *(id(buffers.get(name)) for name in kernel.bindings)
+        key: tuple[int | str, ...] = id(kernel), *buffers, *map(id, buffers.values())
         found = self._groups.get(key)
         if found is None:
             if buffers.keys() != kernel.bindings.keys():
@@ -243,7 +243,7 @@ class Device:
                 _open.cache_clear()
                 raise DeviceError(
                     f"{self.name} was lost (the driver was reset, or took too long)",
-                    "try again, with --device cpu if it happens again; a run's last checkpoint is kept for --resume",
+                    "try again, on the CPU (--device cpu) if it happens again; a run's checkpoint is kept for --resume",
                 ) from error
             raise
 
@@ -403,5 +403,5 @@ def _source(name: str) -> str:
 def _full_memory(name: str) -> DeviceError:
     return DeviceError(
         f"the memory of {name} is full",
-        "close other programs that use it, train smaller images or fewer splats, or continue with --device cpu",
+        "close other programs that use it, train smaller images or fewer splats, or continue on the CPU (--device cpu)",
     )

@@ -39,12 +39,14 @@ class Embedding:
     def upload(self, vertices: np.ndarray, camera: Camera) -> None:
         """Send a posed mesh (V, 3), world meters, and its camera before the recording is submitted.
 
-        Shaders have no float64: a position becomes the float32 of its distance to the mesh's center and the rest.
+        Shaders have no float64: a position becomes the float32 of its distance to the first vertex and the rest.
         """
-        center = vertices.mean(0) if len(vertices) else np.zeros(3)
+        center = vertices[0] if len(vertices) else np.zeros(3)
         local = vertices - center
-        nearest = local.astype(np.float32)
-        self._device.upload("vertices", np.concatenate([nearest, local - nearest], axis=1, dtype=np.float32))
+        parts = np.empty((len(vertices), 6), np.float32)
+        parts[:, :3] = local
+        parts[:, 3:] = local - parts[:, :3]
+        self._device.upload("vertices", parts)
         pose = np.zeros(1, POSE)
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         pose["rows"] = np.c_[turn, turn @ center + shift]

@@ -1,11 +1,11 @@
 // Camera-space frames and strain of a posed mesh's triangles, as `avatar/embedding.py` and `avatar/strain.py` define
 // them.
 //
-// Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's center, of
+// Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's first vertex, of
 // which only differences and means are formed: an edge is as exact as float32 can hold it.
 
 struct Pose {
-  // The matrix from the mesh, relative to its center, to the camera.
+  // The matrix from the mesh, relative to its first vertex, to the camera.
   row_x: vec4f,
   row_y: vec4f,
   row_z: vec4f,

@@ -62,7 +62,7 @@ class GpuBackend:
     ) -> None:
         """units (F,): see `losses.limit_units`."""
         capture = frames.capture
-        self._settings, self._frames, self._device = settings, frames, device
+        self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = Rasterizer(device)
         self._embedding = Embedding(device, capture.neutral, capture.faces, frames.convention, frames.strain)
         self._limits = np.column_stack([*scale_limits(capture, settings), settings.distance_limit * units])
@@ -80,7 +80,7 @@ class GpuBackend:
         """A copy in host memory, after all queued iterations."""
         self._finish_all()
         count, stride, coefficients = len(self), self._splats.stride, self._splats.coefficients
-        read, buffer = self._device.read, self._device.buffer
+        read, buffer = self.device.read, self.device.buffer
         tables = {
             name: Parameters(*map(torch.from_numpy, split_rows(read(buffer(name, 0), (count, stride)), coefficients)))
             for name in ("splats", *TABLES)
@@ -101,7 +101,7 @@ class GpuBackend:
     @state.setter
     def state(self, state: TrainState) -> None:
         self._finish_all()
-        upload = self._device.upload
+        upload = self.device.upload
         rows = {name: upload(name, splat_rows(_arrays(getattr(state, name)))) for name in TABLES}
         self._gradients = rows.pop("gradients")
         history = np.stack(
@@ -117,7 +117,7 @@ class GpuBackend:
             **rows, history=upload("history", history), traits=upload("traits", traits),
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
-        self._splats = upload_splats(self._device, _arrays(state.parameters), state.face.numpy())
+        self._splats = upload_splats(self.device, _arrays(state.parameters), state.face.numpy())
 
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last if it was a global one."""
@@ -136,10 +136,10 @@ class GpuBackend:
         self._finish_all()
         average = replace(self._splats, rows=self._tables.average)
         while True:
-            with self._device.record() as work:
+            with self.device.record() as work:
                 rendering = self._render(work, average, view, background, sh_degree)
             if self._rasterizer.pairs_fit():
-                return self._device.read(rendering.image, (3, view.camera.height, view.camera.width))
+                return self.device.read(rendering.image, (3, view.camera.height, view.camera.width))
 
     def _finish_all(self) -> None:
         """Wait until all queued iterations are done."""
@@ -168,7 +168,7 @@ class GpuBackend:
         batch, whole = queued.batch, queued.batch.selected is None
         self._upload_target(batch)
         self._upload_step(batch)
-        with self._device.record() as work:
+        with self.device.record() as work:
             splats, camera = self._splats, batch.view.camera
             rendering = self._render(work, splats, batch.view, batch.background, batch.sh_degree, batch.selected)
             v_image, loss = image_loss(
@@ -181,7 +181,7 @@ class GpuBackend:
                 work, splats.count, splats.stride, self._tables, limited, view=rendering.view, splats=splats.rows,
                 gradients=self._gradients, face=splats.face, wanted=rendering.lists.wanted, screen=screen,
             )  # fmt: skip
-            queued.readback.copy_from(work, (counts_buffer(self._device), COUNTS), (loss, 1))
+            queued.readback.copy_from(work, (counts_buffer(self.device), COUNTS), (loss, 1))
         queued.readback.start()
 
     def _render(
@@ -197,20 +197,20 @@ class GpuBackend:
         uniform = self._rasterizer.upload_view(splats, options)
         focus = None
         if selected is not None:
-            marked = self._device.upload("selected", selected)
+            marked = self.device.upload("selected", selected)
             focus = mark_focus(work, splats.count, view=uniform, face=splats.face, selected=marked)
         return self._rasterizer.forward(work, splats, self._embedding.compose(work), options, uniform, focus)
 
     def _upload_target(self, batch: Batch) -> None:
         change = 255 * batch.background - 255 * np.array(self._settings.background, np.float32)
-        upload_target(self._device, batch.target, self._settings.ssim_weight, batch.mask, change)
+        upload_target(self.device, batch.target, self._settings.ssim_weight, batch.mask, change)
 
     def _upload_step(self, batch: Batch) -> None:
         settings = self._settings
         epsilon = float(image_epsilon(settings.adam_epsilon, batch.view.camera))
         weights = settings.scale_weight, settings.distance_weight, settings.unseen_opacity_weight / max(len(self), 1)
         upload_step(
-            self._device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
+            self.device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
             statistics=batch.accumulate,
         )  # fmt: skip
 

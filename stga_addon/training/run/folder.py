@@ -24,9 +24,7 @@ from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_
 from ..settings import TrainingSettings, from_json, is_device, to_json
 from .identity import Identity, identity_from_json
 
-FORMAT, VERSION, OLDEST_VERSION = "stga-run", 3, 2
-OLD_DEVICES = ("cuda", "cuda:0", "warp-cpu")
-"""What runs of earlier versions call a GPU."""
+FORMAT, VERSION = "stga-run", 3
 CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
 
 
@@ -108,15 +106,13 @@ def read_run(folder: Path) -> Run:
     values = read_json(path)
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
-    if values.get("version") not in range(OLDEST_VERSION, VERSION + 1):
-        found, known = shorten(values.get("version")), f"{OLDEST_VERSION} to {VERSION}"
-        raise StgaError(f"{path}: has run format version {found}, this add-on reads {known}")
+    if values.get("version") != VERSION:
+        found = shorten(values.get("version"))
+        raise StgaError(f"{path}: has run format version {found}, this add-on reads {VERSION}")
     try:
         flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
         if principal_point not in PRINCIPAL_POINTS:
             raise ValueError(f"principal_point is {shorten(principal_point)}")
-        if device in OLD_DEVICES:
-            device = "gpu"
         if not is_device(device):
             raise ValueError(f"device is {shorten(device)}")
         return Run(
@@ -127,8 +123,8 @@ def read_run(folder: Path) -> Run:
             effect_plan_from_json(values["effect_plan"]),
             device,
             identity_from_json(values["identity"]),
-            tuple(_take_from_json(take) for take in values.get("takes", ())),
-            _continuation_from_json(values.get("continuation")),
+            tuple(_take_from_json(take) for take in values["takes"]),
+            _continuation_from_json(values["continuation"]),
         )
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error

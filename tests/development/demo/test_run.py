@@ -7,8 +7,11 @@ import pytest
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.cli.main import main
 from stga_addon.development.demo.capture import CaptureOptions
 from stga_addon.development.demo.run import run_demo
+from stga_addon.training.run.folder import read_run
+from stga_addon.training.run.metrics_log import read_metrics
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
@@ -18,7 +21,7 @@ SMALL = CaptureOptions(train=2, test=1, cameras=6, width=72, height=100, samples
 @pytest.mark.slow
 def test_demo_writes_its_files(tmp_path):
     """Catches a break anywhere in the chain of the README's first command."""
-    run_demo(tmp_path, 6.0, SMALL)
+    run_demo(tmp_path, {"seconds": 6.0}, SMALL)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).
@@ -33,9 +36,25 @@ def test_demo_writes_its_files(tmp_path):
 
 
 @pytest.mark.slow
+def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, capsys):
+    """Catches `stga demo --device gpu` that trains on the CPU, or whose files need it."""
+    from raster import gpu_device
+
+    adapter = gpu_device.device().name
+    monkeypatch.setattr(
+        "stga_addon.development.demo.run.run_demo", lambda out, budget, device: run_demo(out, budget, SMALL, device)
+    )
+    assert main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"]) == 0
+    assert f"Training on {adapter}" in capsys.readouterr().out
+    assert read_run(tmp_path / "run").device == f"gpu:{adapter}"
+    assert read_metrics(tmp_path / "run")[-1]["iteration"] == 4
+    assert (tmp_path / "demo.blend").exists()
+
+
+@pytest.mark.slow
 def test_the_blend_file_opens_with_head_groups_and_splats(tmp_path):
     """Catches a demo.blend that an artist opens to find empty or unanimated."""
-    run_demo(tmp_path, 2.0, SMALL)
+    run_demo(tmp_path, {"seconds": 2.0}, SMALL)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
     heads = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "head"]
     splats = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]

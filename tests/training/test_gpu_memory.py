@@ -1,0 +1,108 @@
+"""Bytes that training takes per splat, pixel and pair: the GPU's buffers against the CPU's arrays, as documented."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from raster import gpu_device
+
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.model import Capture
+from stga_addon.raster.gpu import rasterize
+from stga_addon.raster.gpu.device import Device
+from stga_addon.training.optimize.backend import Batch
+from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.gpu_backend import GpuBackend
+from stga_addon.training.optimize.losses import limit_units
+from stga_addon.training.optimize.state import new_state, tensors_of
+from stga_addon.training.schedule import learning_rates
+
+from .test_trainer import view_of
+from .toys import quick_settings
+
+SETTINGS = quick_settings("global", scale_limit=0.2)
+Counts = tuple[int, int, int]
+"""Splats, pixels, and pairs: found on the CPU, room for them on the GPU."""
+
+
+def splats_on(capture: Capture, count: int, log_scale: float) -> Splats:
+    """Splats of SH degree 3 on the first triangles."""
+    turn = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    return Splats(
+        xyz=np.zeros((count, 3), np.float32),
+        rotation=turn,
+        log_scale=np.full((count, 3), log_scale, np.float32),
+        opacity=np.zeros(count, np.float32),
+        sh=np.zeros((count, 16, 3), np.float32),
+        face=(np.arange(count) % len(capture.faces)).astype(np.int32),
+        unbound=np.zeros(count, bool),
+    )
+
+
+def batch_of(capture: Capture, width: int, height: int) -> Batch:
+    view = view_of(capture, 1)
+    view = replace(view, camera=replace(view.camera, width=width, height=height))
+    target, mask = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
+    for array in (target, mask):
+        array.setflags(write=False)
+    return Batch(view, target, mask, np.ones(3, np.float32), 3, None, learning_rates(SETTINGS.rates, 0.0))
+
+
+def cpu_bytes(capture: Capture, count: int, size: tuple[int, int], log_scale: float) -> tuple[Counts, int]:
+    """Of the state and of the buffers that iterations share; without what a kernel allocates for itself."""
+    state = new_state(splats_on(capture, count, log_scale))
+    frames = FrameStore(capture, SETTINGS.convention)
+    backend = CpuBackend(SETTINGS, limit_units(capture, SETTINGS.convention), frames, state)
+    backend.step(batch_of(capture, *size))
+    buffers = backend._buffers._buffers
+    arrays = [tensor.numpy() for tensor in tensors_of(backend.state).values()] + list(buffers.values())
+    pairs = buffers["pair_rows"].size // 4 * 8 // 9  # an eighth to spare
+    return (count, size[0] * size[1], pairs), sum(array.nbytes for array in arrays)
+
+
+def gpu_bytes(capture: Capture, count: int, size: tuple[int, int], capacity: int) -> tuple[Counts, int]:
+    rasterize.INITIAL_PAIR_CAPACITY = capacity
+    device, frames = Device(), FrameStore(capture, SETTINGS.convention)
+    state = new_state(splats_on(capture, count, -9.0))
+    backend = GpuBackend(device, SETTINGS, limit_units(capture, SETTINGS.convention), frames, state)
+    backend.step(batch_of(capture, *size))
+    assert len(backend.state) == count
+    assert backend._rasterizer.capacity == capacity
+    return (count, size[0] * size[1], capacity), device.bytes
+
+
+def per_item(measured: list[tuple[Counts, int]]) -> np.ndarray:
+    """Bytes a splat, a pixel and a pair, from four measurements: the rest is constant."""
+    counts = np.array([[*found, 1] for found, _ in measured], np.float64)
+    return np.linalg.solve(counts, [size for _, size in measured])[:3]
+
+
+def test_memory_is_the_cpus_and_as_documented(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a table added to the GPU's iterations, and figures in the documentation that no longer hold."""
+    gpu_device.device()  # or skip
+    monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", 1)  # restored at the end
+    small, wide = (320, 160), (640, 160)
+    on_cpu = per_item(
+        [
+            cpu_bytes(toy, 4096, small, -1.0),
+            cpu_bytes(toy, 8192, small, -1.0),
+            cpu_bytes(toy, 4096, wide, -1.0),
+            cpu_bytes(toy, 4096, small, 1.0),
+        ]
+    )
+    on_gpu = per_item(
+        [
+            gpu_bytes(toy, 4096, small, 1 << 16),
+            gpu_bytes(toy, 8192, small, 1 << 16),
+            gpu_bytes(toy, 4096, wide, 1 << 16),
+            gpu_bytes(toy, 4096, small, 1 << 17),
+        ]
+    )
+    text = (Path(__file__).parents[2] / "docs/performance.md").read_text(encoding="utf-8")
+    rows = [re.search(rf"^\| a {name}\D*\| ([\d,]+) \| ([\d,]+) \|", text, re.M) for name in ("splat", "pixel", "pair")]
+    documented = np.array([[float(figure.replace(",", "")) for figure in row.groups()] for row in rows if row])
+    np.testing.assert_allclose(np.stack([on_cpu, on_gpu], 1), documented, rtol=0.02, atol=0.6)
+    assert (np.abs(on_gpu / on_cpu - 1) < 0.2).all()
