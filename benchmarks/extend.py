@@ -3,11 +3,10 @@
     python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2] [--refine mouth]
 
 The training timesteps are split into two takes, alternating by how much of the face moves. An avatar is trained on the
-first; each arm then continues it for the same time. PSNR of held-out views in dB: whole image and moving region of the
-old and the new take; with --refine, of the region. Arms with numbers: share of the learning rates' schedule at the
-start, share of replayed views, local iterations between two global ones. --clock cpu counts processor time, for a
-machine that others use: set NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first
-take is not repeated.
+first; each arm then continues it for the same time, but training anew on both takes has three times as long. PSNR of
+held-out views in dB: whole image and moving region of the old and the new take; with --refine, of the region. Ends with
+a table of all seeds. --clock cpu counts processor time, for a machine that others use: set NUMBA_NUM_THREADS=1 with it.
+Runs and figures stay in --folder; the training on the first take is not repeated.
 """
 
 import argparse
@@ -17,10 +16,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
@@ -35,19 +37,24 @@ from stga_addon.training.run.continuation import (
     DENSITY_INTERVAL,
     Prepared,
     continued_evaluation_views,
-    late_rates,
     prepare_extension,
     prepare_refinement,
     starting_state,
 )
-from stga_addon.training.run.folder import Run
+from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.replay import continued_order
 from stga_addon.training.run.request import Extension, Refinement
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings, make_settings
 
-EVALUATIONS = 4
+EVALUATIONS = 6
+"""Evaluations of an arm after the first."""
+ANEW_BUDGET = 3
+"""Time of training anew on both takes, as a multiple of the other arms'."""
+Line = dict[str, Any]
+"""A line of quality: arm, seconds, iterations and what `Quality.as_json` gives."""
+FIGURES = ("take_1", "moving_take_1", "take_2", "moving_take_2", "region")
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
@@ -75,6 +82,7 @@ def main() -> None:
     options = parser.parse_args()
     precompile_kernels()
     old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
+    runs: dict[str, list[list[Line]]] = {}
     for seed in options.seeds:
         parent = trained(old, options, seed)
         print(f"seed {seed}, {parent}", flush=True)
@@ -87,7 +95,8 @@ def main() -> None:
             prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
         for name, arm in arms(prepared, seed).items():
             if not options.arms or name in options.arms:
-                compare(name, prepared, arm, options)
+                runs.setdefault(name, []).append(compare(name, prepared, arm, options))
+    print("\n".join(table(runs)))
 
 
 def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Path]:
@@ -134,31 +143,21 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
-    original = replace(settings, rates=type(settings.rates)(), sh_steps=(0.3, 0.5, 0.7)[: settings.sh_degree])
+    original = replace(read_run(continuation.parent).settings, strain_color=settings.strain_color)
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
-    union = np.any(list(prepared.selection.values()), axis=0)
-
-    def replay(share: float) -> Iterator[View]:
-        return continued_order(continuation, capture, None, seed, replay_share=share)
-
-    def local(start: float, share: float, interval: int) -> Arm:
-        late = replace(settings, rates=late_rates(original.rates, start))
-        return Arm(late, replay(share), ExtendStrategy(union, interval))
-
-    grown = replace(settings, growth=0.5 * float(union.mean()), density_interval=DENSITY_INTERVAL)
-    return {
+    union, every = np.any(list(prepared.selection.values()), axis=0), GlobalStrategy()
+    arms = {
         "extend": Arm(settings, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
-        "extend-0.6-0.25-4": local(0.6, 0.25, 4),
-        "extend-0.5-0.5-4": local(0.5, 0.5, 4),
-        "extend-0.8-0.33-4": local(0.8, 0.33, 4),
-        "extend-grown": Arm(grown, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
-        "all-in-turn": Arm(settings, alternating(old, new, seed), GlobalStrategy()),
-        "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), GlobalStrategy()),
-        "all-new-only": Arm(settings, view_order(new, 1, seed), GlobalStrategy()),
-        "anew": Arm(original, view_order(views, 1, seed), GlobalStrategy(), anew=True),
+        "all-in-turn": Arm(settings, alternating(old, new, seed), every),
+        "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), every),
+        "all-new-only": Arm(settings, view_order(new, 1, seed), every),
+        "anew": Arm(original, view_order(views, 1, seed), every, anew=True),
     }
+    if settings.strain_color and not read_avatar(continuation.parent / "avatar.npz").splats.strain_color.shape[1]:
+        arms["all-in-turn-plain"] = Arm(replace(settings, strain_color=False), alternating(old, new, seed), every)
+    return arms
 
 
 def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
@@ -168,24 +167,12 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
     region = np.any(list(prepared.selection.values()), axis=0)
     base = Trainer(capture, settings, prepared.selection, starting_state(continuation, settings.strain_color))
-    count = int(region[base.state.face.numpy()].sum())
-
-    def refined(start: float, growth: float) -> Arm:
-        share = growth * count / len(base)
-        late = replace(
-            settings,
-            rates=late_rates(type(settings.rates)(), start),
-            growth=share,
-            density_interval=DENSITY_INTERVAL if growth else 0,
-        )
-        return Arm(late, continued_order(continuation, capture, region, seed), base.strategy)
-
+    share = float(region[base.state.face.numpy()].mean())
+    grown = replace(settings, growth=share, density_interval=DENSITY_INTERVAL)
     every = view_order(capture.views["train"], 1, seed)
     return {
         "refine": Arm(settings, continued_order(continuation, capture, region, seed), base.strategy),
-        "refine-0.3": refined(0.3, 0.0),
-        "refine-0.8": refined(0.8, 0.0),
-        "refine-0.6-grown": refined(0.6, 1.0),
+        "refine-grown": Arm(grown, continued_order(continuation, capture, region, seed), base.strategy),
         "all": Arm(settings, every, GlobalStrategy()),
     }
 
@@ -198,8 +185,8 @@ def alternating(old: list[View], new: list[View], seed: int) -> Iterator[View]:
         yield next(second)
 
 
-def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace) -> None:
-    """Train one arm and print its quality before, during and after."""
+def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace) -> list[Line]:
+    """Train one arm; returns and prints its quality before, during and after."""
     assert prepared.run.continuation is not None
     capture, clock = prepared.capture, CLOCKS[options.clock]
     state = None if arm.anew else starting_state(prepared.run.continuation, arm.settings.strain_color)
@@ -207,26 +194,28 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     trainer.strategy = arm.strategy
     region = arm_region(prepared)
     evaluation_views = continued_evaluation_views(prepared.run, capture, region)
-    spent, due, lines = 0.0, 0.0, []
+    spent, due, budget = 0.0, 0.0, options.seconds * (ANEW_BUDGET if arm.anew else 1)
+    lines: list[Line] = []
     background = tuple(round(255 * level) for level in arm.settings.background)
     with ViewLoader(
         arm.views, background=background, correct=exposure_correction(arm.settings), mesh=capture.mesh
     ) as loader:
         while True:
             if spent >= due:
-                share = min(1.0, spent / options.seconds) if arm.anew else 1.0
+                share = min(1.0, spent / budget) if arm.anew else 1.0
                 quality = evaluate(partial(trainer.render, progress=share), evaluation_views)
                 lines.append({"arm": name, "seconds": spent, "iterations": trainer.iteration, **quality.as_json()})
                 print(describe(lines[-1]), flush=True)
-                if spent >= options.seconds:
+                if spent >= budget:
                     break
                 due += options.seconds / EVALUATIONS
             begin = clock()
             view, image, mask, mesh = next(loader)
-            trainer.step(view, image, min(1.0, spent / options.seconds), mask, mesh)
+            trainer.step(view, image, min(1.0, spent / budget), mask, mesh)
             spent += clock() - begin
     with (options.folder / f"{options.capture.name}.jsonl").open("a", encoding="utf-8") as out:
         out.writelines(json.dumps({**line, "seed": arm.settings.seed, "clock": options.clock}) + "\n" for line in lines)
+    return lines
 
 
 def arm_region(prepared: Prepared) -> np.ndarray | None:
@@ -238,9 +227,53 @@ def arm_region(prepared: Prepared) -> np.ndarray | None:
 
 def describe(line: dict[str, float]) -> str:
     """One row of the table."""
-    names = ("take_1", "moving_take_1", "take_2", "moving_take_2", "region")
-    figures = "  ".join(f"{name} {line[f'psnr_{name}']:.2f}" for name in names if f"psnr_{name}" in line)
+    figures = "  ".join(f"{name} {line[f'psnr_{name}']:.2f}" for name in FIGURES if f"psnr_{name}" in line)
     return f"{line['arm']:20} {line['seconds']:6.1f} s {line['iterations']:5d} it  all {line['psnr']:.2f}  {figures}"
+
+
+def table(runs: dict[str, list[list[Line]]]) -> list[str]:
+    """Markdown: PSNR at the end of each arm, mean ± standard deviation over seeds, and the seconds to two levels.
+
+    *same*: until the moving region of the new take (or the region) is as good as all-in-turn (or all) leaves it.
+    *98 %*: until both takes together reach 98 % of the PSNR that training anew ends with.
+    """
+    figures = [name for name in FIGURES if f"psnr_{name}" in next(iter(runs.values()))[0][-1]]
+    measured, rival = ("psnr_region", "all") if "region" in figures else ("psnr_moving_take_2", "all-in-turn")
+    goals = {"same": (measured, runs.get(rival), 1.0), "98 %": ("psnr", runs.get("anew"), 0.98)}
+    rows = [["arm", "iterations", "ms", *figures, *(f"s to {goal}" for goal in goals)]]
+    first = [lines[0] for lines in runs[next(name for name in runs if name != "anew")]]
+    rows.append(["before", "", "", *(spread([line[f"psnr_{name}"] for line in first]) for name in figures), "", ""])
+    for arm, of_seeds in runs.items():
+        ends = [lines[-1] for lines in of_seeds]
+        count, seconds = (np.mean([end[name] for end in ends]) for name in ("iterations", "seconds"))
+        row = [arm, f"{count:.0f}", f"{1000 * seconds / count:.0f}"]
+        row += [spread([end[f"psnr_{name}"] for end in ends]) for name in figures]
+        for quality, others, share in goals.values():
+            pairs = zip(of_seeds, others or [], strict=False)
+            row.append(spread([time_to(lines, quality, share * other[-1][quality]) for lines, other in pairs], 1))
+        rows.append(row)
+    rows.insert(1, ["---"] * len(rows[0]))
+    return ["| " + " | ".join(row) + " |" for row in rows]
+
+
+def spread(values: list[float], digits: int = 2) -> str:
+    """Mean ± standard deviation; empty without values, a dash where one of them is infinite."""
+    if not values:
+        return ""
+    if not np.isfinite(values).all():
+        return "–"
+    deviation = f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.{digits}f}{deviation}"
+
+
+def time_to(lines: list[Line], quality: str, level: float) -> float:
+    """Seconds until the quality is first reached, between two evaluations by interpolation; infinite if never."""
+    for before, after in pairwise(lines):
+        low, high = before[quality], after[quality]
+        if high >= level:
+            part = 0.0 if low >= level else (level - low) / (high - low)
+            return float(before["seconds"] + part * (after["seconds"] - before["seconds"]))
+    return float("inf")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,9 @@ STRAIN_COMPONENTS = 3
 """Stretch along two directions of the triangle's plane, and the shear between them."""
 STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
 """Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
+COLOR_RANGE = np.array([[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [0, 0, MAX_STRAIN]], np.float32)
+"""Lowest and highest strain that colors are trained to follow. Folds and their shadows come with compression and shear;
+a color fitted to little compression is not to be continued into stretch."""
 RANGE_MARGIN = 1.2
 """A triangle's range of strain, as a multiple of what was seen: training may have seen a few timesteps more than were
 measured, and refined tracking moves them."""
@@ -62,6 +65,11 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
     )
 
 
+def color_range(count: int) -> np.ndarray:
+    """COLOR_RANGE for each of `count` triangles: (count, 2, 3) float32."""
+    return np.broadcast_to(COLOR_RANGE, (count, *COLOR_RANGE.shape)).copy()
+
+
 def _full_range(count: int) -> np.ndarray:
     """(count, 2, 3) float32: −MAX_STRAIN and MAX_STRAIN, for every triangle and component."""
     ends = np.array([-MAX_STRAIN, MAX_STRAIN], np.float32)[:, None]
@@ -71,13 +79,14 @@ def _full_range(count: int) -> np.ndarray:
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
     """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), times RANGE_MARGIN.
 
-    It includes 0, the neutral mesh. Colors fitted to a few expressions are not extrapolated to stronger ones.
+    It includes 0, the neutral mesh, and stays within that of the basis. Colors fitted to a few expressions are not
+    extrapolated to stronger ones.
     """
     seen = np.zeros((len(basis.faces), 2, STRAIN_COMPONENTS), np.float32)
     for mesh in meshes:
         strain = np.float32(RANGE_MARGIN) * face_strain(basis, mesh)
         seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], strain), np.maximum(seen[:, 1], strain)
-    return np.clip(seen, -MAX_STRAIN, MAX_STRAIN)
+    return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
 
 
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:

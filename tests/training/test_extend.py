@@ -3,7 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_INTERVAL, ExtendStrategy
+from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_SHARE, ExtendStrategy
+from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
@@ -59,8 +60,8 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
-def extend(parent: Path, take: Path, out: Path, stop: int | None = None) -> Path:
-    prepared = prepare_extension(Extension(parent, (take,), iterations=ITERATIONS), "cpu")
+def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0) -> Path:
+    prepared = prepare_extension(Extension(parent, (take,), growth, iterations=ITERATIONS), "cpu")
 
     def report(progress: Progress) -> bool:
         return progress.iteration == stop
@@ -123,12 +124,16 @@ def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tm
     assert last["psnr_take_1"] != last["psnr_take_2"]
 
 
+@pytest.mark.parametrize("growth", [0.0, 0.5])
 def test_a_stopped_extension_is_continued_to_the_same_bits(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path, growth: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches an order, a selection or a take that a resumed extension does not find again."""
-    whole = extend(parent, takes[1], tmp_path / "whole")
-    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7)
+    """Catches an order, a selection, a take or a count of splats that a resumed extension does not find again."""
+    monkeypatch.setattr(continuation, "DENSITY_INTERVAL", 3)
+    whole = extend(parent, takes[1], tmp_path / "whole", growth=growth)
+    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7, growth=growth)
+    before, after = (len(read_avatar(run / "avatar.npz").splats) for run in (parent, whole))
+    assert (after > before) == bool(growth)
     opened = open_run(stopped)
     train(opened.capture, stopped, opened.run, resume=True)
     assert_same_state(stopped, whole)
@@ -151,20 +156,25 @@ def test_strain_color_can_begin_with_a_further_take(takes: tuple[Path, Path], tm
     assert avatar.strain_range is not None
 
 
-def test_old_and_new_views_take_turns(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that forgets because it sees the new take only."""
+def test_global_iterations_replay_old_views(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches an extension that forgets because it sees the new take only, or trains all splats on it."""
     prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
-    assert sum(view.timestep < 4 for view in views) == 13
+    strategy = ExtendStrategy(np.ones(1, bool))
+    is_global = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(40)]
+    assert [view.timestep < 4 for view in views] == is_global
+    assert 0 < sum(is_global) < 40
 
 
-def test_every_so_often_all_splats_are_trained() -> None:
+def test_local_and_global_iterations_take_turns() -> None:
     """Catches an extension whose global iterations are lost, or are all there is."""
     region = np.array([True, False])
     strategy = ExtendStrategy(region)
-    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(2 * (EXTEND_GLOBAL_INTERVAL + 1))]
-    assert kinds == 2 * [*EXTEND_GLOBAL_INTERVAL * [False], True]
+    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(100)]
+    assert sum(kinds) == round(100 * EXTEND_GLOBAL_SHARE)
+    assert not any(first and second for first, second in pairwise(kinds))
+    assert strategy.triangles(0, 0, 0, 0.0) is region
     assert ExtendStrategy(~region & region).triangles(0, 0, 0, 0.0) is None
 
 
@@ -173,7 +183,6 @@ def test_takes_that_do_not_fit(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches another head, or a take without images, that is found out after minutes of training."""
-    from stga_addon.training.run import continuation
 
     def changed(path: Path, *rest: Any) -> Capture:
         capture = open_capture(path, *rest)

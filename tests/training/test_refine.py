@@ -174,9 +174,10 @@ def test_late_rates_are_the_rest_of_the_schedule() -> None:
 def test_order_of_views_continues_and_replays(toy: Capture) -> None:
     """Catches a resumed order that starts anew, and other frames that are forgotten or trained too often."""
     continuation = Continuation(Path(), "", 1, 1)
-    whole = list(islice(continued_order(continuation, toy, None, 5), 40))
-    assert list(islice(continued_order(continuation, toy, None, 5, start=13), 27)) == whole[13:]
-    assert sum(view.timestep == 1 for view in whole) == 27
+    for region, count in ((np.ones(len(toy.faces), bool), 27), (None, 24)):  # to refine, to extend
+        whole = list(islice(continued_order(continuation, toy, region, 5), 40))
+        assert list(islice(continued_order(continuation, toy, region, 5, start=13), 27)) == whole[13:]
+        assert sum(view.timestep == 1 for view in whole) == count
     assert {view.timestep for view in whole} == {0, 1, 3}
     alone = islice(continued_order(Continuation(Path(), "", 0, 9), toy, None, 5), 20)
     assert {view.timestep for view in alone} == {0, 1, 3}

@@ -6,12 +6,13 @@ from typing import Protocol
 
 import numpy as np
 
+from ..schedule import is_turn
 from ..settings import CONTINUATIONS, TrainingSettings
 from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .state import TrainState
 
-EXTEND_GLOBAL_INTERVAL = 2
-"""Local iterations of an extension between two that train all splats."""
+EXTEND_GLOBAL_SHARE = 0.4
+"""Share of an extension's iterations that train all splats, in old views (`run.replay`); the others train new views."""
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
 
@@ -74,17 +75,15 @@ class RefineStrategy:
 
 @dataclass
 class ExtendStrategy:
-    """Trains what new takes need, in all frames; every so often all splats.
+    """Trains what new takes need, and in turn with that all splats.
 
-    region    (F,) bool: what moves in the new takes, or looks different there
-    interval  local iterations between two that train all splats
+    region  (F,) bool: what moves in the new takes, or looks different there
     """
 
     region: np.ndarray
-    interval: int = EXTEND_GLOBAL_INTERVAL
 
     def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
-        is_global = iteration % (self.interval + 1) == self.interval
+        is_global = is_turn(iteration, EXTEND_GLOBAL_SHARE)
         return None if is_global or not self.region.any() else self.region
 
 

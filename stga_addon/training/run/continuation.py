@@ -33,7 +33,7 @@ from .open_run import OpenedRun, open_run
 from .replay import replayed_views
 from .request import Extension, Refinement, Request
 
-START_SHARE = 0.5
+START_SHARE = {"refine": 0.5, "extend": 0.3}
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
@@ -193,7 +193,7 @@ def continued_settings(
         seconds=seconds,
         iterations=iterations,
         seed=seed,
-        rates=late_rates(settings.rates, START_SHARE),
+        rates=late_rates(settings.rates, START_SHARE[strategy]),
         views_per_visit=1,
         warm_up_share=0.0,
         sh_steps=(0.0,) * settings.sh_degree,

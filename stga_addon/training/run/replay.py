@@ -5,11 +5,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ...capture.model import Capture, View, evenly_spread
-from ..schedule import view_order
+from ..optimize.strategies import EXTEND_GLOBAL_SHARE
+from ..schedule import is_turn, view_order
 from .folder import Continuation
 
 REPLAY_SHARE = 1 / 3
-"""Share of the iterations that train views outside the continuation's frames, where there are any."""
+"""Share of a refinement's iterations that train views outside the continuation's frames, where there are any."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
@@ -26,24 +27,24 @@ def continued_order(
     region: np.ndarray | None,
     seed: int,
     start: int = 0,
-    replay_share: float = REPLAY_SHARE,
 ) -> Iterator[View]:
     """Endless order of views from position `start` on: of the continuation's frames and, now and then, of others.
 
-    region (F,) bool: train only views that see much of it; None trains all views of the frames.
+    region (F,) bool: what is refined, by views that see much of it. None for an extension, whose global iterations
+    replay old views and whose local ones train new views.
     """
     views = capture.views["train"]
     asked = [view for view in views if continuation.includes(view.timestep)]
     others = replayed_views(capture, [view for view in views if not continuation.includes(view.timestep)])
     if region is not None:
         asked, others = (views_of_region(capture, members, region) for members in (asked, others))
-    share = replay_share if others else 0.0
+    share = (EXTEND_GLOBAL_SHARE if region is None else REPLAY_SHARE) if others else 0.0
     replayed = [int(position * share) for position in (start, start + 1)]
     new = view_order(asked, 1, seed, start - replayed[0])
     old = view_order(others, 1, seed + 1, replayed[0]) if others else new
     position = start
     while True:
-        yield next(old) if int((position + 1) * share) > int(position * share) else next(new)
+        yield next(old) if is_turn(position, share) else next(new)
         position += 1
 
 
