@@ -33,6 +33,9 @@ from stga_addon.scene.gpu import viewport_display  # noqa: E402
 from stga_addon.scene.gpu.renderer import SplatRenderer  # noqa: E402
 from stga_addon.scene.gpu.viewport_display import display, region_view  # noqa: E402
 from stga_addon.scene.render import engine  # noqa: E402
+from stga_addon.scene.render.view_transform import inverse_view  # noqa: E402
+
+RENDER_PATIENCE_S = 60.0
 
 bpy.context.preferences.view.show_splash = False
 seen: dict[str, Any] = {"version": bpy.app.version_string, "pictures": {}}
@@ -151,10 +154,10 @@ def bones_in_front(shown: Any) -> None:
     bpy.data.objects.remove(rig)
 
 
-def in_viewport(operator: Any, **settings: Any) -> None:
+def in_viewport(operator: Any, *how: str, **settings: Any) -> None:
     window, area, region = viewport()
     with bpy.context.temp_override(window=window, area=area, region=region):
-        operator(**settings)
+        operator(*how, **settings)
 
 
 def parts_of_the_view(area: Any) -> None:
@@ -264,6 +267,18 @@ def after_load() -> None:
     seen["drawn"].append(pictures_per_redraw())
 
 
+def start_render() -> None:
+    """F12 in AgX, in its own thread, as an artist starts it: the view transform is measured by the main thread."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.view_settings.view_transform = engine.ENGINE, "AgX"
+    scene.render.resolution_x = scene.render.resolution_y = 64
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(scene.camera)
+    bpy.context.preferences.view.render_display_type = "NONE"
+    bpy.app.handlers.render_complete.append(lambda *_: seen.update(rendered=inverse_view(scene) is not None))
+    in_viewport(bpy.ops.render.render, "INVOKE_DEFAULT")
+
+
 def finish() -> None:
     np.savez(FOLDER / "views.npz", **views)
     seen["device"] = gpu.platform.backend_type_get()
@@ -299,6 +314,11 @@ def steps() -> Any:
     after_failure()
     yield
     after_load()
+    yield
+    start_render()
+    end = perf_counter() + RENDER_PATIENCE_S
+    while "rendered" not in seen and perf_counter() < end:
+        yield
 
 
 def play() -> float | None:

@@ -107,6 +107,11 @@ def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: 
     assert np.median(np.abs(found - plain)[:, colored]) < 3 / 255
 
 
+def test_rendering_in_a_window(shown: tuple[Path, dict[str, Any]]) -> None:
+    """Catches a render thread and a main thread that wait for each other, and a view transform not measured there."""
+    assert shown[1].get("rendered"), "not in a minute" if "rendered" not in shown[1] else "without the view transform"
+
+
 def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
     """Catches splats that cover bones which are to be drawn in front, and holes in the splats around such bones."""
     folder, result = shown
