@@ -60,7 +60,7 @@ MAX_OUTLINE_DISTANCE_M = 0.0005
 """Median distance of the masks' outlines from the surface in the images, beyond which they are not those of the skin:
 mattes are often a pixel or two too wide, and hair hangs over faces."""
 MIN_OUTLINE_POINTS = 100
-MAX_OUTLINE_CAMERAS = 6
+MAX_OUTLINE_CAMERAS = 8
 """Cameras whose masks are compared at every timestep."""
 OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
@@ -362,7 +362,7 @@ def _whole_take(
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
-    together, near = [], near_landmarks(fit.head, points[-1], take)
+    together, near = [], [near_landmarks(fit.head, on, take) for on in points]
     sights: list[Sights] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)
@@ -370,8 +370,7 @@ def _whole_take(
         for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
             rough = replace(fit, parameters={t: start[number]})
             seen = seen_surface(rough, t, on, images, sweep, sights[stage])
-            if stage == len(TAKE_SWEEPS) - 1:
-                seen = with_outlines(seen, rough, t, on, masks, near, sweep.reach)
+            seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
             joined = _joined(own, LANDMARK_SHARE, seen)
             start[number] = solve_take(fit.head, _both(take.places, on), [joined], start[number : number + 1])[0]
         together.append(joined)
