@@ -10,7 +10,7 @@ from .photo_consistency import facing
 
 MAX_COSINE = 0.25
 """Of the angle between normal and camera: points within 15° of the outline move it."""
-RIM_COSINE = 0.4
+RIM_COSINE = 0.5
 PICTURE_SIDE, MAX_ENLARGEMENT = 600, 2
 """The mesh's own mask is drawn with about so many pixels, since it has no soft edge."""
 SAMPLES_PER_PIXEL = 4
