@@ -13,8 +13,8 @@ from .environment import training_python
 def render_device_property() -> Any:
     """Rendering device: of the preferences."""
     return bpy.props.EnumProperty(
-        name="Splats Without Blender's GPU",
-        description="Device that renders splats for videos, and in the background where Blender has no GPU context",
+        name="Rendering Device",
+        description="Device that renders splats for videos, and for images where Blender has no GPU context",
         items=(
             ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
             ("cpu", "CPU", "The processor"),

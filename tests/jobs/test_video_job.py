@@ -96,6 +96,7 @@ def test_backgrounds() -> None:
         {"format": "stga-video", "version": 1},
         {"format": "stga-video", "version": 1, "output": "v.mp4", "images": "x", "fps": 1, "background": None},
         {"format": "stga-video", "version": 1, "output": "v.mp4", "images": 1, "fps": 1, "background": [1, 2]},
+        {"format": "stga-video", "version": 1, "output": "v", "images": 1, "fps": 1, "background": None, "device": "x"},
     ],
 )
 def test_damaged_jobs(tmp_path: Path, values: object) -> None:
