@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, uniform_filter
 
-from ..avatar.strain import face_strain, strain_basis
+from ..avatar.strain import color_range, face_strain, strain_basis
 from ..capture.camera import Camera
 from ..capture.images import read_view
 from ..capture.model import Capture, View, evenly_spread
@@ -37,7 +37,7 @@ class Samples:
     camera, timestep  (S,) of the views
     color      (S, K, 3) float32 from 0 to 255, mean around the triangle's center; NaN where it is not visible
     direction  (S, K, 3) unit vectors from the camera to the triangle, world axes
-    strain     (S, K, 3) of the triangles (`avatar.strain`)
+    strain     (S, K, 3) of the triangles, as far as colors follow it (`avatar.strain`)
     pixels     (S, K) area of the triangle in pixels; NaN where it is not visible
     pixel_width  (S,) meters that a pixel spans at the head; NaN for a head behind the camera
     foreground (S,) pixels inside the mask; NaN without one, like the following
@@ -94,7 +94,7 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
     rng = np.random.default_rng(seed)
     count = len(capture.faces)
     faces = np.sort(rng.permutation(count)[:MAX_FACES])
-    basis = strain_basis(capture.neutral, capture.faces)
+    basis = strain_basis(capture.neutral, capture.faces, color_range(count))
     strain = {t: face_strain(basis, capture.mesh(t))[faces] for t in {view.timestep for view in views}}
     rows = [_sample_view(capture, view, faces) for view in views]
     return Samples(

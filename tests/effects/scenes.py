@@ -25,8 +25,8 @@ def nothing(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.
 
 
 def wrinkles(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Darker where the first edge shrinks."""
-    return 30 * strain[:, 0]
+    """Darker where the first edge shrinks, but no lighter where it grows."""
+    return 60 * np.minimum(strain[:, 0], 0)
 
 
 def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -1,10 +1,14 @@
 """Colors that splats start with, on a ball whose triangles' colors are known."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from stga_addon.avatar.splats import SH_C0
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.model import Capture, View
 from stga_addon.training.optimize.initial_colors import triangle_colors
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.settings import make_settings
@@ -44,3 +48,60 @@ def test_masks_that_show_nothing_give_gray(painted, tmp_path):
     capture = painted()
     views = [replace(view, camera=replace(view.camera, cx=-1000.0)) for view in capture.views["train"][:2]]
     np.testing.assert_array_equal(triangle_colors(capture, views), 0.5)
+
+
+PLATES = {
+    "lip": (0, 0, 60, 0.00, (200, 80, 80)),
+    "tooth": (0, -10, 8, 0.02, (250, 240, 220)),
+    "molar": (0, 12, 8, 0.004, (0, 0, 255)),
+}
+"""Center x, y and half the width in millimeters, depth behind the lip in meters, color."""
+
+
+def test_teeth_behind_closed_lips_have_their_own_color(tmp_path):
+    """Catches teeth that start with the color of the lips, and stay so where no image shows them."""
+    capture = _mouth(tmp_path)
+    lip, tooth, molar = (colors.mean(0) for colors in np.split(triangle_colors(capture, capture.views["train"]), 3))
+    np.testing.assert_allclose(255 * lip, PLATES["lip"][-1], atol=2)
+    np.testing.assert_allclose(255 * tooth, PLATES["tooth"][-1], atol=2)
+    np.testing.assert_allclose(255 * molar, PLATES["tooth"][-1], atol=2)
+
+
+def test_without_later_timesteps_what_is_hidden_has_the_nearest_color(tmp_path):
+    """Catches a single frame whose hidden parts are gray or black."""
+    capture = _mouth(tmp_path)
+    colors = triangle_colors(capture, capture.views["train"][:1])
+    np.testing.assert_allclose(255 * colors, np.tile(PLATES["lip"][-1], (len(colors), 1)), atol=2)
+
+
+def _mouth(folder: Path) -> Capture:
+    """Plates of two triangles each: a lip in front of a tooth, which is lifted in the second timestep far enough to
+    show the tooth but not the molar, which is nearer to the lip than to the tooth."""
+    camera = Camera(200, 200, 400.0, 400.0, 100.0, 100.0, np.eye(4))
+    corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    plates = [
+        np.column_stack([0.001 * (half * corner + (x, y)), np.full(4, 0.5 + behind)])
+        for x, y, half, behind, _ in PLATES.values()
+    ]
+    neutral, faces = np.concatenate(plates), np.array([[0, 1, 2], [0, 2, 3]])
+    lifted = neutral + np.array([[0, 0.06, 0]]) * (np.arange(12) < 4)[:, None]
+    meshes, views = (neutral, lifted), []
+    for timestep, mesh in enumerate(meshes):
+        picture = Image.new("RGB", (200, 200), "white")
+        for plate, (*_, color) in sorted(
+            zip(np.split(mesh, 3), PLATES.values(), strict=True), key=lambda p: -p[0][0, 2]
+        ):
+            ImageDraw.Draw(picture).polygon((camera.project(plate)[0] - 0.5).ravel().tolist(), fill=color)
+        picture.save(folder / f"{timestep}.png")
+        views.append(View(timestep, 0, camera, f"{timestep}.png", folder / f"{timestep}.png"))
+    return Capture(
+        root=folder,
+        layout="mesh",
+        faces=np.concatenate([faces + 4 * n for n in range(3)]).astype(np.int32),
+        neutral=neutral,
+        views={"train": tuple(views)},
+        timesteps=(0, 1),
+        regions={},
+        mesh=meshes.__getitem__,
+        expression_mesh=lambda timestep, zero_pose: meshes[timestep],
+    )

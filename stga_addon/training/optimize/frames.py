@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, face_frames
-from ...avatar.strain import strain_basis
+from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
 from .tracking import Tracking
 
@@ -30,7 +30,8 @@ class FrameStore:
         self, capture: Capture, convention: str, strain: bool = False, tracking: Tracking | None = None
     ) -> None:
         self.capture, self.convention, self.tracking = capture, convention, tracking
-        self.strain = strain_basis(capture.neutral, capture.faces) if strain else None
+        limits = color_range(len(capture.faces))
+        self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self._cached: dict[int, _Timestep] = {}
 
     def of(self, timestep: int) -> FaceFrames:

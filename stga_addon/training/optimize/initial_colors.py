@@ -1,33 +1,62 @@
-"""Colors that the splats of a mesh start with: those of the first training timestep's images."""
+"""Colors that the splats of a mesh start with: those of the training images."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import binary_erosion
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ...capture.images import read_view
 from ...capture.mesh_raster import rasterize
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
 MASK_EDGE_PIXELS = 3
 """Along the mask's edge, colors are mixed with the background."""
+MAX_LATER_TIMESTEPS, MAX_LATER_VIEWS = 6, 2
+"""Further timesteps that are read, and views of each."""
 MIDDLE_GRAY = 0.5
 
 
 def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
-    """Mean color (F, 3) from 0 to 1 of each triangle in views of one timestep.
+    """Mean color (F, 3) from 0 to 1 of each triangle in the first view's timestep or, if hidden there, in later ones.
 
-    A triangle that no view shows has the color of the nearest one of the neutral mesh that is shown: the back of a head
-    that is seen from the front has the color of its sides. Gray if no view shows any.
+    Teeth that the lips hide at first have their own color, not that of the lips. A triangle that no view shows has the
+    color of the nearest one of the neutral mesh that is connected with it: the back of a head that is seen from the
+    front has the color of its sides. Where all connected ones are hidden too, as a back tooth, it is the nearest of
+    those that only later timesteps show or, without any, of all. Gray if no view shows any.
     """
+    first = views[0].timestep
+    color, seen = _mean_colors(capture, [view for view in views if view.timestep == first])
+    late_color, late = _mean_colors(capture, _later_views([view for view in views if view.timestep != first]))
+    late &= ~seen
+    color[late] = late_color[late]
+    shown = seen | late
+    if not shown.any():
+        return np.full(color.shape, MIDDLE_GRAY)
+    return np.asarray(color[_nearest_shown(capture, shown, late if late.any() else shown)])
+
+
+def _later_views(views: Sequence[View]) -> list[View]:
+    """A few views of timesteps that are evenly spread, by other cameras in each."""
+    timesteps = sorted({view.timestep for view in views})
+    chosen: list[View] = []
+    for n, timestep in enumerate(evenly_spread(timesteps, MAX_LATER_TIMESTEPS)):
+        at_once = [view for view in views if view.timestep == timestep]
+        step = -(-len(at_once) // MAX_LATER_VIEWS)
+        chosen += at_once[n % step :: step]
+    return chosen
+
+
+def _mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean color (F, 3) from 0 to 1 of each triangle in the views, and (F,) bool whether any shows it."""
     total, count = np.zeros((len(capture.faces), 3)), np.zeros(len(capture.faces))
-    mesh = capture.mesh(views[0].timestep)
     for view in views:
         small, image, mask = read_view(view, min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height))
-        triangle, _ = rasterize(mesh, capture.faces, small.camera)
+        triangle, _ = rasterize(capture.mesh(view.timestep), capture.faces, small.camera)
         shown = triangle >= 0
         if mask is not None:
             shown &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
@@ -35,9 +64,25 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
         count += np.bincount(found, minlength=len(count))
         for channel in range(3):
             total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
-    seen = count > 0
-    if not seen.any():
-        return np.full(total.shape, MIDDLE_GRAY)
+    return total / np.maximum(count, 1)[:, None] / 255, count > 0
+
+
+def _nearest_shown(capture: Capture, shown: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(F,) the nearest triangle that is `shown` of those connected with each or, if none is, the nearest of `others`.
+
+    shown, others (F,) bool.
+    """
     centers = capture.neutral[capture.faces].mean(1)
-    nearest = np.flatnonzero(seen)[cKDTree(centers[seen]).query(centers)[1]]
-    return np.asarray(total[nearest] / count[nearest, None] / 255)
+    nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
+    part = _connected_parts(capture.faces, len(capture.neutral))
+    for number in np.unique(part[shown]):
+        members, known = np.flatnonzero(part == number), np.flatnonzero((part == number) & shown)
+        nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
+    return np.asarray(nearest)
+
+
+def _connected_parts(faces: np.ndarray, vertices: int) -> np.ndarray:
+    """(F,) number of the connected part of the mesh that a triangle belongs to."""
+    ends = np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    part = connected_components(coo_matrix((np.ones(ends.shape[1]), ends), (vertices, vertices)), directed=False)[1]
+    return np.asarray(part[faces[:, 0]])

@@ -24,7 +24,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
         lattice = lattice.rows(~teeth_triangles(capture)[lattice.face])
     first = capture.views["train"][0].timestep
     views = [view for view in capture.views["train"] if view.timestep == first]
-    lattice.sh[:, 0] = (triangle_colors(capture, views)[lattice.face] - 0.5) / SH_C0
+    lattice.sh[:, 0] = (triangle_colors(capture, capture.views["train"])[lattice.face] - 0.5) / SH_C0
     parts = [lattice]
     if settings.hull_points:
         if len(views) == 1:

@@ -149,7 +149,7 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
-        self.measured_strain: list[np.ndarray | None] = []
+        self.measured_strain: list[np.ndarray] = []
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...avatar.file import read_avatar
-from ...avatar.strain import seen_range, strain_basis
+from ...avatar.strain import color_range, seen_range, strain_basis
 from ...capture.model import Capture, evenly_spread
 from .folder import Continuation
 
@@ -15,12 +15,13 @@ MAX_TIMESTEPS = 64
 
 def trained_strain_range(
     capture: Capture, mesh: Callable[[int], np.ndarray], continuation: Continuation | None
-) -> np.ndarray | None:
+) -> np.ndarray:
     """`Avatar.strain_range` (F, 2, 3) of a run: what its training timesteps show, and what its parent's did.
 
-    mesh: timestep -> (V, 3) that is trained on. None where the parent's avatar has no limits.
+    mesh: timestep -> (V, 3) that is trained on. Within COLOR_RANGE, which a parent of an earlier version may exceed.
     """
-    basis = strain_basis(capture.neutral, capture.faces)
+    limits = color_range(len(capture.faces))
+    basis = strain_basis(capture.neutral, capture.faces, limits)
     timesteps = evenly_spread(sorted({view.timestep for view in capture.views["train"]}), MAX_TIMESTEPS)
     seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     if continuation is None:
@@ -30,6 +31,6 @@ def trained_strain_range(
     if not parent.splats.strain_color.shape[1]:
         return seen  # its colors follow strain only from here on
     if earlier is None:
-        return None
-    widest: np.ndarray = np.stack([np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])], 1)
-    return widest
+        return limits
+    lowest, highest = np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])
+    return np.stack([np.maximum(lowest, limits[:, 0]), np.minimum(highest, limits[:, 1])], axis=1)
