@@ -25,14 +25,9 @@ from .posed_points import RIGID_SIZE, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 from .write_capture import posed_mesh
 
-IDENTITY_SWEEPS = (
-    Sweep(0.010, 0.001, 0.0015),
-    Sweep(0.004, 0.0005, 0.001),
-    Sweep(0.003, 0.0005, 0.001),
-    Sweep(0.003, 0.0005, 0.001),
-)
-FIRST_OFFSET_SWEEP = 2
-"""Before it, what is left between head and surface is mostly a pose and identity that have not converged."""
+IDENTITY_SWEEPS = Sweep(0.010, 0.001, 0.0015), Sweep(0.004, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
+OUTLINE_SWEEPS = Sweep(0.003, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
+"""After the others, where the masks' outlines are those of the skin."""
 TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
 """At every timestep, and how many of the points that are usually found are looked for. The first starts at the pose of
 the landmarks, from which patches do not lie on the skin that they are of yet."""
@@ -61,6 +56,10 @@ OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
 
+MAX_OUTLINE_DISTANCE_M = 0.0005
+"""Median distance of the masks' outlines from the surface in the images, beyond which they are not those of the skin:
+mattes are often a pixel or two too wide, and hair hangs over faces."""
+MIN_OUTLINE_POINTS = 100
 MAX_OUTLINE_CAMERAS = 8
 """Cameras whose masks are compared at every timestep."""
 OUTLINE_RADIUS_M = 0.01
@@ -71,6 +70,11 @@ Images = Callable[[int], Sequence[tuple[Camera, np.ndarray]]]
 
 Sights = dict[tuple[int, ...], np.ndarray]
 """Direction from the head, rounded -> (N,) bool: points that are not hidden from there."""
+
+
+def no_masks(timestep: int) -> Sequence[tuple[Camera, np.ndarray]]:
+    """The masks of footage without any."""
+    return ()
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,7 @@ class Take:
     reliable: np.ndarray
     landmarks: Mapping[int, TimestepLandmarks]
     images: Images
-    masks: Images = lambda timestep: ()
+    masks: Images = no_masks
 
 
 def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lambda stage, done, total: None) -> HeadFit:
@@ -111,24 +115,52 @@ def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lamb
         for t, own in take.landmarks.items()
     }
     take = replace(take, landmarks=visible)
-    steps = len(IDENTITY_SWEEPS) * len(chosen) + len(timesteps)
-    points, offset = surface_points(head, SURFACE_POINTS), np.zeros_like(head.model.v_template)
-    near = _near_landmarks(head, points, take)
-    found = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
-    for number, sweep in enumerate(IDENTITY_SWEEPS):
-        seen: dict[int, SeenSurface] = {}
-        for t in chosen:
-            report("Surface", number * len(chosen) + len(seen), steps)
-            seen[t] = seen_surface(found, t, points, take.images(t), sweep, {})
-            seen[t] = with_outlines(seen[t], found, t, points, take.masks(t), near, sweep.reach)
+    early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
+    steps = early + len(timesteps)
+    points = surface_points(head, SURFACE_POINTS)
+    near = near_landmarks(head, points, take)
+    start, without = replace(fit, parameters={t: fit.parameters[t] for t in chosen}), replace(take, masks=no_masks)
+    solved = _identity(head, start, without, points, near, IDENTITY_SWEEPS, lambda n: report("Surface", n, steps))
+    if solved is None:
+        return fit
+    if outlines_agree(solved[0], take, points, near):
+        start, begin = replace(solved[0], static_offset=None), len(IDENTITY_SWEEPS) * len(chosen)
+        again = _identity(
+            head, start, take, points, near, OUTLINE_SWEEPS, lambda n: report("Surface", begin + n, steps)
+        )
+        solved = again or solved
+    else:
+        take = without
+    often = [_often_seen(points, solved[1], count) for _, count in TAKE_SWEEPS]
+    return _whole_take(solved[0], fit, take, often, lambda left: report("Surface", steps - left, steps))
+
+
+def _identity(
+    head: HeadModel,
+    found: HeadFit,
+    take: Take,
+    points: SurfacePoints,
+    near: np.ndarray,
+    sweeps: Sequence[Sweep],
+    report: Callable[[int], None],
+) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
+    """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they were solved from.
+
+    near: as of `with_outlines`. None where the images do not show enough of the surface.
+    """
+    offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
+    for number, sweep in enumerate(sweeps):
+        for row, t in enumerate(found.parameters):
+            report(number * len(found.parameters) + row)
+            surface = seen_surface(found, t, points, take.images(t), sweep, {})
+            seen[t] = with_outlines(surface, found, t, points, take.masks(t), near, sweep.reach)
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
-            return fit
+            return None
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
-        if number >= FIRST_OFFSET_SWEEP:
+        if number:
             offset = offset + _offsets(found, points, seen)
             found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
-    often = [_often_seen(points, seen, count) for _, count in TAKE_SWEEPS]
-    return _whole_take(found, fit, take, often, lambda left: report("Surface", steps - left, steps))
+    return found, seen
 
 
 def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
@@ -193,7 +225,7 @@ def with_outlines(
     near: np.ndarray,
     reach: float,
 ) -> SeenSurface:
-    """The surface with what masks say about points at the head's outline; near (N,) bool: those that count."""
+    """The surface with what masks say about points at the head's outline; near (N,) bool: points that this is for."""
     vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
     at = points.on(vertices, faces)
     total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
@@ -206,7 +238,24 @@ def with_outlines(
     return replace(seen, position=at + mean[:, None] * seen.normal, weight=total)
 
 
-def _near_landmarks(head: HeadModel, points: SurfacePoints, take: Take) -> np.ndarray:
+def outlines_agree(fit: HeadFit, take: Take, points: SurfacePoints, near: np.ndarray) -> bool:
+    """Whether the masks end where the surface in the images does; False without masks."""
+    model, distances = fit.head.model, [np.zeros(0)]
+    for timestep, parameters in fit.parameters.items():
+        vertices = posed_mesh(fit, parameters)
+        at, normals = (
+            points.on(values, model.faces)[near] for values in (vertices, vertex_normals(vertices, model.faces))
+        )
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        for camera, mask in take.masks(timestep):
+            posed = fit.to_capture.camera(camera)
+            offset, known = outline_offsets(posed, mask, vertices, model.faces, at, normals, OUTLINE_SWEEPS[0].reach)
+            distances.append(np.abs(offset[known]))
+    every = np.concatenate(distances)
+    return len(every) >= MIN_OUTLINE_POINTS and float(np.median(every)) < MAX_OUTLINE_DISTANCE_M
+
+
+def near_landmarks(head: HeadModel, points: SurfacePoints, take: Take) -> np.ndarray:
     """(N,) bool: points within OUTLINE_RADIUS_M of a reliable landmark."""
     from scipy.spatial import cKDTree
 
@@ -313,7 +362,7 @@ def _whole_take(
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start)
-    together, near = [], [_near_landmarks(fit.head, on, take) for on in points]
+    together, near = [], [near_landmarks(fit.head, on, take) for on in points]
     sights: list[Sights] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
         report(len(timesteps) - number)

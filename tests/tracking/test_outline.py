@@ -1,11 +1,25 @@
 """Outlines in masks, against a ball whose outline is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
+from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.flame.forward import flame_forward
+from stga_addon.tracking.fit import HeadFit, Similarity
+from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.outline import outline_offsets
+from stga_addon.tracking.posed_points import parameters_of
+from stga_addon.tracking.solve import person
+from stga_addon.tracking.surface import Take, near_landmarks, no_masks, outlines_agree, surface_points
+
+from .test_fit import frame_at, places_on
+from .test_surface import rig
 
 RADIUS_M = 0.09
 CAMERA = look_at((0.3, 0.1, 1.0), (0.01, 0, 0), 120, 160, 500)
@@ -53,3 +67,20 @@ def test_what_the_mask_does_not_show_is_left_open():
     assert not known[pixels[:, 1] > 84].any()
     assert not measured(RADIUS_M, np.full_like(mask, 255))[1].any()
     assert not measured(RADIUS_M - 0.02, ball_mask(CAMERA))[1].any()
+
+
+def test_mattes_that_are_too_wide_are_not_followed():
+    """Catches a face that grows by a matte's margin, or by hair: those of real captures are a pixel or two too wide."""
+    head, cameras = HeadModel(synthetic_flame(0), "flame"), rig(5)
+    places, used = places_on(head, 150), np.ones(150, bool)
+    shape, frame = np.zeros(head.model.n_identity), frame_at(head, 0)
+    mesh, world = flame_forward(head.model, shape, frame), Similarity(1.0, np.eye(3), np.zeros(3))
+    fit = HeadFit(person(head, shape), shape, {0: parameters_of(frame)}, world)
+    masks = [255 * (rasterize(mesh, head.model.faces, camera)[0] >= 0).astype(np.uint8) for camera in cameras]
+    points = surface_points(head, 2000)
+    for wide, agree in ((0, True), (2, False)):
+        grown = [binary_dilation(mask > 0, iterations=wide) if wide else mask > 0 for mask in masks]
+        shown = [(camera, 255 * mask.astype(np.uint8)) for camera, mask in zip(cameras, grown, strict=True)]
+        take = Take(places, used, {}, lambda t: pytest.fail("no image is needed"), lambda t, own=shown: own)
+        assert outlines_agree(fit, take, points, near_landmarks(head, points, take)) is agree
+    assert not outlines_agree(fit, replace(take, masks=no_masks), points, np.ones(len(points), bool))
