@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +26,11 @@ class StrainBasis:
 
     faces (F, 3); gram (F, 3) squared lengths and product of the neutral edges: d1·d1, d1·d2, d2·d2.
     to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
-    to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear.
-    touching (V,): how many triangles touch a vertex, at least one.
+    to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear; both float32.
+    corners (3, F): `faces` by corner.
+    rank (3, F): the same, with vertices counted by how many triangles touch them, most first.
+    touching: of each of the first vertices in that order its first triangle, of those with two their second, …
+    share (T, 1): a third of one over how many triangles touch each vertex in that order.
     range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
     """
 
@@ -34,7 +38,10 @@ class StrainBasis:
     gram: np.ndarray
     to_tensor: np.ndarray
     to_plane: np.ndarray
-    touching: np.ndarray
+    corners: np.ndarray
+    rank: np.ndarray
+    touching: list[np.ndarray]
+    share: np.ndarray
     range: np.ndarray
 
 
@@ -52,17 +59,35 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
     a1, a2 = np.cross(d2, normal) * inverse, np.cross(normal, d1) * inverse
     along = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, _dot(d1, d1))))[:, None] * d1
     across = np.cross(normal, along) * np.sqrt(inverse)
+    corners = np.ascontiguousarray(faces.T, np.intp)
+    order, count, touching = _touching(corners, len(neutral))
     twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
     return StrainBasis(
         faces=faces,
         gram=_by_component(np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1)),
-        to_tensor=_by_component(np.stack([_product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2], 1)),
-        to_plane=_by_component(
-            twice * np.stack([_product(along, along), _product(across, across), _product(along, across)], 1)
+        to_tensor=_by_component(
+            np.stack([_product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2], 1), np.float32
         ),
-        touching=np.maximum(np.bincount(faces.ravel(), minlength=len(neutral)), 1),
+        to_plane=_by_component(
+            twice * np.stack([_product(along, along), _product(across, across), _product(along, across)], 1),
+            np.float32,
+        ),
+        corners=corners,
+        rank=np.argsort(order)[corners],
+        touching=touching,
+        share=(1 / (3 * count[:, None])).astype(np.float32),
         range=_by_component(_full_range(len(faces)) if strain_range is None else strain_range),
     )
+
+
+def _touching(corners: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Vertices by how many triangles touch them, most first; how many, where any do; `StrainBasis.touching`."""
+    count = np.bincount(corners.ravel(), minlength=n_vertices)
+    order = np.argsort(-count, kind="stable")
+    triangles = np.argsort(corners.ravel(), kind="stable") % corners.shape[1]
+    first, sorted_count = (np.cumsum(count) - count)[order], count[order]
+    touching = [triangles[first[sorted_count > nth] + nth] for nth in range(max(sorted_count[0], 1))]
+    return order, sorted_count[sorted_count > 0], touching
 
 
 def color_range(count: int) -> np.ndarray:
@@ -97,21 +122,27 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     vertices), so that colors do not jump at edges. Columns: along the neutral triangle's first edge, across it, shear.
     """
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
-    p0, p1, p2 = np.take(rows, np.ascontiguousarray(basis.faces.T), axis=1).transpose(1, 0, 2)
+    p0, p1, p2 = np.take(rows, basis.corners, axis=1).transpose(1, 0, 2)
     return edge_strain(basis, p1 - p0, p2 - p0)
 
 
 def edge_strain(basis: StrainBasis, e1: np.ndarray, e2: np.ndarray) -> np.ndarray:
     """`face_strain` from the posed triangles' edges (3, F), p1 − p0 and p2 − p0, in meters."""
     # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time of short columns.
-    corners = np.ascontiguousarray(basis.faces.T)
-    change = np.stack([_row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2)]) - basis.gram.T
+    change = np.asarray(np.stack([_row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2)]) - basis.gram.T, np.float32)
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
-    at_vertex = [np.bincount(corners.ravel(), np.tile(row, 3), len(basis.touching)) for row in tensor]
-    averaged = np.take(np.stack(at_vertex) / basis.touching, corners, axis=1).sum(1) / 3
-    strain = np.einsum("df,kdf->kf", averaged, basis.to_plane.transpose(1, 2, 0))
+    tensors = np.ascontiguousarray(tensor.T)  # as rows again: what is gathered lies side by side
+    at_vertex = np.take(tensors, basis.touching[0], axis=0)
+    for triangles in basis.touching[1:]:
+        at_vertex[: len(triangles)] += np.take(tensors, triangles, axis=0)
+    at_vertex *= basis.share
+    averaged = np.take(at_vertex, basis.rank[0], axis=0)
+    for corner in basis.rank[1:]:
+        averaged += np.take(at_vertex, corner, axis=0)
+    strain = np.einsum("df,kdf->kf", np.ascontiguousarray(averaged.T), basis.to_plane.transpose(1, 2, 0))
     lowest, highest = basis.range.transpose(1, 2, 0)
-    return np.ascontiguousarray(np.clip(STRAIN_GAIN * strain, lowest, highest).T, np.float32)
+    within = np.minimum(np.maximum(np.float32(STRAIN_GAIN) * strain, lowest), highest)
+    return np.ascontiguousarray(within.T)
 
 
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -128,9 +159,9 @@ def _row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _by_component(per_face: np.ndarray) -> np.ndarray:
+def _by_component(per_face: np.ndarray, dtype: Any = None) -> np.ndarray:
     """The same array (F, …), with the values of one component side by side in memory."""
-    return np.moveaxis(np.ascontiguousarray(np.moveaxis(per_face, 0, -1)), -1, 0)
+    return np.moveaxis(np.ascontiguousarray(np.moveaxis(per_face, 0, -1), dtype), -1, 0)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

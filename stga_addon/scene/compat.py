@@ -146,14 +146,6 @@ def allow_depth_write(shader: Any) -> None:
         shader.depth_write("ANY")
 
 
-def has_scene_depth(space: Any) -> bool:
-    """Whether a 3D viewport's depth buffer holds the scene when draw handlers run.
-
-    Before 5.2, render engines leave it zero where overlays are off (seen in 4.3).
-    """
-    return bpy.app.version >= (5, 2) or space.overlay.show_overlays or space.shading.type in ("SOLID", "WIREFRAME")
-
-
 def working_space() -> str:
     """The name of the color space that is "scene-linear" in the open file; always the same before Blender 5.0."""
     spaces = getattr(bpy.data, "colorspace", None)

@@ -109,6 +109,9 @@ def pictures(shown: Any) -> None:
     space.region_3d.view_perspective = "PERSP"
     scene.view_settings.view_transform = "Filmic"
     picture("filmic")
+    scene.view_settings.view_transform, space.shading.type = "AgX", "MATERIAL"
+    picture("material agx")
+    scene.view_settings.view_transform = "Filmic"
     scene.render.engine, space.shading.type = engine.ENGINE, "RENDERED"
     picture("engine filmic")
     scene.view_settings.view_transform = "Standard"
@@ -124,6 +127,28 @@ def pictures(shown: Any) -> None:
     picture("quad")
     parts_of_the_view(area)
     bpy.data.objects.remove(bpy.data.objects["quad"])
+
+
+def bones_in_front(shown: Any) -> None:
+    """A bone behind the splats, drawn In Front, with the splats and without."""
+    data = bpy.data.armatures.new("rig")
+    rig = bpy.data.objects.new("rig", data)
+    bpy.context.scene.collection.objects.link(rig)
+    rig.show_in_front = True
+    bpy.context.view_layer.objects.active = rig
+    in_viewport(bpy.ops.object.mode_set, mode="EDIT")
+    bone = data.edit_bones.new("bone")
+    bone.head, bone.tail = (0.0, 0.0, -0.04), (0.0, 0.0, 0.08)
+    in_viewport(bpy.ops.object.mode_set, mode="OBJECT")
+    overlay = viewport()[1].spaces.active.overlay
+    overlay.show_overlays = True
+    overlay.show_floor = overlay.show_axis_x = overlay.show_axis_y = overlay.show_cursor = overlay.show_text = False
+    picture("bone and splats")
+    shown.hide_set(True)
+    picture("bone")
+    shown.hide_set(False)
+    overlay.show_overlays = False
+    bpy.data.objects.remove(rig)
 
 
 def in_viewport(operator: Any, **settings: Any) -> None:
@@ -210,7 +235,7 @@ def failure() -> None:
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         redraw(4)
     seen["reports"] = output.getvalue().count("out of memory; points") + output.getvalue().count("MemoryError: out")
-    seen["failed"] = display.failed, display._handler is None, display.problem
+    seen["failed"] = display.failed, not display._handlers, display.problem
 
 
 def after_failure() -> Any:
@@ -224,7 +249,7 @@ def after_failure() -> Any:
     held = textures()
     viewport_display.unregister()
     seen["freed"]["disabled"] = freed(held)
-    seen["unregistered"] = display._handler is None, display._renderer is None
+    seen["unregistered"] = not display._handlers, display._renderer is None
     seen["drawn without"] = pictures_per_redraw()
     viewport_display.register()
     redraw()
@@ -234,7 +259,7 @@ def after_failure() -> Any:
 
 
 def after_load() -> None:
-    seen["after load"] = display._handler is not None, display._renderer is None, display.problem
+    seen["after load"] = bool(display._handlers), display._renderer is None, display.problem
     set_up()
     seen["drawn"].append(pictures_per_redraw())
 
@@ -261,6 +286,7 @@ def steps() -> Any:
     shown = set_up()
     yield
     pictures(shown)
+    bones_in_front(shown)
     memory(shown)
     in_viewport(bpy.ops.screen.region_quadview)
     yield  # regions get their places between two steps

@@ -22,7 +22,7 @@ from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
-from stga_addon.scene.display.colors import linear_to_srgb
+from stga_addon.scene.display.colors import linear_to_srgb, srgb_to_linear
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
@@ -93,6 +93,33 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
     print(f"{name}: {psnr_db(found, picture):.1f} dB")
     assert image.alpha.mean() > 0.02, "nothing to compare"
     assert psnr_db(found, picture) >= MIN_PSNR_DB
+
+
+@pytest.mark.parametrize("name", ["material agx", "engine filmic"])
+def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: str) -> None:
+    """Catches splats that AgX or Filmic changes, in a mode that goes through the scene's view transform."""
+    folder, result = shown
+    found, plain = (on_screen(folder, result, which)[0] for which in (name, "solid"))
+    same_view = {which: on_screen(folder, result, which)[1] for which in (name, "solid")}
+    assert np.allclose(same_view[name].world_to_camera, same_view["solid"].world_to_camera)
+    colored = np.ptp(plain, axis=0) > 0.4  # little of the background is seen there
+    assert colored.sum() > 1000
+    assert np.median(np.abs(found - plain)[:, colored]) < 3 / 255
+
+
+def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
+    """Catches splats that cover bones which are to be drawn in front, and holes in the splats around such bones."""
+    folder, result = shown
+    names = ("bone and splats", "bone", "hidden", "solid")
+    both, bone, nothing, splats = (on_screen(folder, result, name)[0] for name in names)
+    is_bone = np.abs(bone - nothing).max(0) > 0.1
+    is_covered = is_bone & (np.ptp(splats, axis=0) > 0.25)
+    assert is_covered.sum() > 300
+    darker = linear_to_srgb(np.maximum(srgb_to_linear(bone) - srgb_to_linear(nothing), 0))  # by the background's light
+    assert np.median(np.abs(both - darker).max(0)[is_covered]) < 0.05
+    away = ~is_bone
+    assert np.median(np.abs(both - splats).max(0)[away & (np.ptp(splats, axis=0) > 0.25)]) < 2 / 255
+    assert psnr_db(np.where(away, both, 0), np.where(away, splats, 0)) > 30
 
 
 def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:

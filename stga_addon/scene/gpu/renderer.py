@@ -4,6 +4,7 @@ Needs a GPU context: a viewport's drawing, or a render engine with `bl_use_gpu_c
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gpu
@@ -14,10 +15,13 @@ from ...avatar.embedding import FaceFrames
 from ...raster.posed_splats import ComposedImage
 from ..layers import SceneLayer
 from . import packing
+from .front_bones import NO_BONES
 from .packing import StaticSplats, View
 from .shaders import SPLAT_TEXTURES, TEXTURE_WIDTH, composite_shader, splat_shader
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
+OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
+"""Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
 EXACT, COMPACT = "RGBA32F", "RGBA16F"
 """Formats of the color target. The depth target is always exact."""
 
@@ -56,20 +60,46 @@ class SplatRenderer:
         to_depth: tuple[float, ...],
         behind: tuple[float, ...] | None = None,
         test_depth: bool = True,
+        bones: np.ndarray | None = None,
+        scene: Any = None,
+        has_background: bool = False,
     ) -> None:
         """Put what was drawn last into the active framebuffer, which blends linearly and has the scene's depth.
 
         corner: pixel of the framebuffer for the image's bottom left. to_depth (a, b, c, d): depth in −1…1 is
         (a + b·z) / (c + d·z) at z meters along the view axis. behind: sRGB expected behind the splats, if known.
         test_depth: whether objects in front hide splats; not where the framebuffer lacks the scene's depth.
+        bones: as of `front_bones`. Near them, splats are put into `scene`, the framebuffer that a viewport shows below
+        the active one. Of that, if it has drawn its background there (`has_background`), what they cover is taken out.
         """
-        gpu.state.blend_set("ALPHA_PREMULT")
+        draw = partial(self._composite_part, corner, to_depth, test_depth)
+        if scene is None or bones is None or not len(bones):
+            draw(OUTSIDE, behind, NO_BONES)
+            return
+        draw(OUTSIDE, behind, bones)
+        if behind is not None and has_background:
+            draw(BEHIND, behind, bones)
+        with scene.bind():
+            draw(NEAR_BONES, None, bones)
+
+    def _composite_part(
+        self,
+        corner: tuple[int, int],
+        to_depth: tuple[float, ...],
+        test_depth: bool,
+        part: int,
+        behind: tuple[float, ...] | None,
+        bones: np.ndarray,
+    ) -> None:
+        gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
         gpu.state.depth_mask_set(False)
         gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
-        shader = self._composite
+        shader, bone_image = self._composite, _image(bones)  # a texture lives as long as its name
         shader.bind()
         shader.uniform_sampler("color_image", self._color)
         shader.uniform_sampler("depth_image", self._depth)
+        shader.uniform_sampler("bones", bone_image)
+        shader.uniform_float("part", (part, len(bones), 0.0, 0.0))
         shader.uniform_float("corner_px", (*corner, 0.0, 0.0))
         shader.uniform_float("to_depth", to_depth)
         shader.uniform_float("behind", CLEAR if behind is None else (*behind, 1.0))
@@ -137,6 +167,13 @@ def _texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
     padded[: len(texels)] = texels
     pixels = Buffer("FLOAT", padded.size, padded.reshape(-1))
     return GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
+
+
+def _image(texels: np.ndarray) -> Any:
+    """(H, W, 4) float32 as a texture of that size, or of one texel where there are none."""
+    texels = np.ascontiguousarray(texels if texels.size else np.zeros((1, 1, 4)), np.float32)
+    pixels = Buffer("FLOAT", texels.size, texels.reshape(-1))
+    return GPUTexture((texels.shape[1], texels.shape[0]), format=EXACT, data=pixels)
 
 
 def _pixels(texture: Any) -> np.ndarray:

@@ -167,16 +167,33 @@ vec3 to_linear(vec3 srgb)
   return mix(curve, srgb / 12.92, vec3(lessThanEqual(srgb, vec3(0.04045))));
 }
 
+bool is_near_bone(vec2 pixel)
+{
+  for (int bone = 0; bone < int(part.y); bone++) {
+    vec4 ends = texelFetch(bones, ivec2(0, bone), 0);
+    vec2 along = ends.zw - ends.xy, to = pixel - ends.xy;
+    float share = clamp(dot(to, along) / max(dot(along, along), 1e-6), 0.0, 1.0);
+    if (distance(to, share * along) < texelFetch(bones, ivec2(1, bone), 0).r) {
+      return true;
+    }
+  }
+  return false;
+}
+
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy) - ivec2(corner_px.xy);
   vec4 splats = texelFetch(color_image, texel, 0), distances = texelFetch(depth_image, texel, 0);
-  if (splats.a < 1.0 / 255.0) {
+  if (splats.a < 1.0 / 255.0 || is_near_bone(vec2(texel) + 0.5) != (part.x > 0.5)) {
     discard;
   }
   /* From z along the view axis to the depth of the projection: (x + y·z) / (z + w·z), by its matrix. */
   float z = distances.r / max(distances.a, 1e-9);
   gl_FragDepth = clamp(0.5 + 0.5 * (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z), 0.0, 1.0);
+  if (part.x > 1.5) {
+    color_final = vec4(splats.a * to_linear(behind.rgb), 0.0);
+    return;
+  }
   if (behind.a < 0.5) {
     color_final = vec4(to_linear(splats.rgb / splats.a) * splats.a, splats.a);
     return;
@@ -211,14 +228,18 @@ def splat_shader() -> Any:
 
 
 def composite_shader() -> Any:
-    """Puts the two targets of `splat_shader` into a viewport, with depth; outputs display-linear, premultiplied."""
+    """Puts the two targets of `splat_shader` into a viewport, with depth; outputs display-linear, premultiplied.
+
+    part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of `behind` that it covers. part.y: how
+    many bones; bones: for each, two texels as `front_bones` returns them.
+    """
     info = GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "corner")
     info.fragment_out(0, "VEC4", "color_final")
     allow_depth_write(info)
-    for slot, name in enumerate(("color_image", "depth_image")):
+    for slot, name in enumerate(("color_image", "depth_image", "bones")):
         info.sampler(slot, "FLOAT_2D", name)
-    for name in ("corner_px", "to_depth", "behind"):
+    for name in ("corner_px", "to_depth", "behind", "part"):
         info.push_constant("VEC4", name)
     info.vertex_source(_COMPOSITE_VERTEX)
     info.fragment_source(_COMPOSITE_FRAGMENT)

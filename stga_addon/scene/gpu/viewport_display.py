@@ -15,7 +15,7 @@ from bpy.app.handlers import persistent
 
 from ...errors import StgaError
 from .. import tags
-from ..compat import has_scene_depth, world_nodes
+from ..compat import world_nodes
 from ..display import splat_nodes
 from ..display.colors import linear_to_srgb
 from ..display.display_modes import AS_TRAINED, POINTS
@@ -23,6 +23,7 @@ from ..display.splat_object import display_mode, set_input
 from ..render.camera import viewport_camera
 from ..render.scene_splats import SplatCache, visible_layers
 from ..render.view_transform import keeps_colors
+from .front_bones import NO_BONES, front_bones
 from .packing import NEAR_M, View
 from .renderer import COMPACT, SplatRenderer
 
@@ -39,27 +40,36 @@ class GpuDisplay:
     """
 
     def __init__(self) -> None:
-        self._handler: Any = None
+        self._handlers: list[Any] = []
+        self._scene_target: Any = None
         self._renderer: SplatRenderer | None = None
         self._cache = SplatCache()
         self.problem, self.failed = "", False
 
     def start(self) -> None:
         """Draw from now on; without a window there is nothing to draw in."""
-        if self._handler is None and not bpy.app.background:
-            self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_VIEW")
+        if not self._handlers and not bpy.app.background:
+            add = bpy.types.SpaceView3D.draw_handler_add
+            self._handlers = [
+                add(call, (), "WINDOW", moment)
+                for call, moment in ((self._before, "PRE_VIEW"), (self._draw, "POST_VIEW"))
+            ]
 
     def stop(self) -> None:
-        """Remove the handler, and free textures and shaders."""
-        if self._handler is not None:
-            bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
-            self._handler = None
+        """Remove the handlers, and free textures and shaders."""
+        for handler in self._handlers:
+            bpy.types.SpaceView3D.draw_handler_remove(handler, "WINDOW")
+        self._handlers = []
         self.forget()
 
     def forget(self) -> None:
         """Free what belongs to the open file."""
-        self._renderer, self._cache = None, SplatCache()
+        self._renderer, self._scene_target, self._cache = None, None, SplatCache()
         self.problem = self.problem if self.failed else ""
+
+    def _before(self) -> None:
+        """Keep the framebuffer of the scene's colors: after it, Blender binds that of the overlays, which lie above."""
+        self._scene_target = gpu.state.active_framebuffer_get()
 
     def _draw(self) -> None:
         try:
@@ -70,6 +80,8 @@ class GpuDisplay:
         except Exception as error:  # raised again at each redraw otherwise: reported once, then off
             traceback.print_exc()
             self._fail(f"Splats cannot be drawn as trained here ({type(error).__name__}: {error}); points are shown")
+        finally:
+            self._scene_target = None
 
     def _draw_region(self, context: Any) -> None:
         space, depsgraph = context.space_data, context.evaluated_depsgraph_get()
@@ -88,7 +100,12 @@ class GpuDisplay:
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
-        self._renderer.composite((x, y), to_depth, expected_background(context), has_scene_depth(space))
+        is_plain = space.shading.type in ("SOLID", "WIREFRAME") or keeps_colors(context.scene)
+        bones = front_bones(space, context.region_data, width, height) if is_plain else NO_BONES
+        self._renderer.composite(
+            (x, y), to_depth, expected_background(context), has_scene_depth(space),
+            bones, self._scene_target, background_source(context) != "SCENE",
+        )  # fmt: skip
 
     def _fail(self, problem: str) -> None:
         self.stop()
@@ -150,11 +167,7 @@ def expected_background(context: Any) -> tuple[float, ...] | None:
     known to be behind them.
     """
     shading, theme = context.space_data.shading, context.preferences.themes[0].view_3d.space.gradients
-    if shading.type in ("SOLID", "WIREFRAME"):
-        source = shading.background_type
-    else:
-        uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
-        source = "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
+    source = background_source(context)
     if source == "THEME":
         return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient)
     if source == "VIEWPORT":
@@ -165,6 +178,23 @@ def expected_background(context: Any) -> tuple[float, ...] | None:
         color = world_color(context.scene)
         return None if color is None else _srgb(color)
     return None
+
+
+def has_scene_depth(space: Any) -> bool:
+    """Whether a 3D viewport's depth buffer holds the scene when draw handlers run.
+
+    Render engines leave it zero where overlays are off: always in 4.3, at times in 5.2.
+    """
+    return bool(space.overlay.show_overlays) or space.shading.type in ("SOLID", "WIREFRAME")
+
+
+def background_source(context: Any) -> str:
+    """What gives a viewport its background: THEME, VIEWPORT, WORLD (its color for viewports), SCENE or STUDIO."""
+    shading = context.space_data.shading
+    if shading.type in ("SOLID", "WIREFRAME"):
+        return str(shading.background_type)
+    uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
+    return "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
 
 
 def world_color(scene: Any) -> tuple[float, ...] | None:
