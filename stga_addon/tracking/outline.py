@@ -40,7 +40,7 @@ def outline_offsets(
     steps = np.linspace(-pixels, pixels, 2 * math.ceil(SAMPLES_PER_PIXEL * pixels) + 1)
     at = begin[:, None] + steps[:, None] * (along / length[:, None])[:, None]
     factor = int(np.clip(PICTURE_SIDE / max(camera.width, camera.height), 1, MAX_ENLARGEMENT))
-    rim = _rim(camera, vertices, faces)
+    rim = _rim(camera, vertices, faces, begin, pixels)
     drawn = (rasterize(vertices, rim, camera.scaled(factor))[0] >= 0).astype(np.float32)
     wanted, own = _edge(mask / np.float32(255), at, steps), _last_edge(drawn, factor * at, steps)
     move = (wanted - own) / length
@@ -49,12 +49,19 @@ def outline_offsets(
     return found, known
 
 
-def _rim(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The triangles (R, 3) around the outline: the others, most of the mesh, need not be drawn."""
+def _rim(camera: Camera, vertices: np.ndarray, faces: np.ndarray, around: np.ndarray, pixels: float) -> np.ndarray:
+    """The triangles (R, 3) of the outline near the pixels `around` (N, 2): most of the mesh need not be drawn."""
+    from scipy.spatial import cKDTree
+
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    return np.asarray(faces[np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE])
+    rows = np.flatnonzero(np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE)
+    corners = camera.project(vertices)[0][faces[rows]]
+    center = corners.mean(1)
+    radius = np.linalg.norm(corners - center[:, None], axis=2).max(1)
+    distance, _ = cKDTree(around).query(np.nan_to_num(center, nan=1e9))
+    return np.asarray(faces[rows[distance < pixels + radius]])
 
 
 def _edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:

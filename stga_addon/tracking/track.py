@@ -1,6 +1,7 @@
 """Tracking of a head: footage and a head model to a capture."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from os.path import realpath
@@ -203,7 +204,10 @@ def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, c
 
 
 def _images(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:
-    return [(camera.camera, camera.image(timestep)) for camera in footage.cameras if timestep in camera.timesteps]
+    seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
+    with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
+        images = list(pool.map(lambda camera: camera.image(timestep), seen))
+    return [(camera.camera, image) for camera, image in zip(seen, images, strict=True)]
 
 
 def _masks(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:

@@ -42,7 +42,7 @@ class Rates:
     sh_rest: float = setting(2e-3, 0, MAX_RATE)
     strain_color: float = setting(1e-2, 0, MAX_RATE)
     position_end: float = setting(0.025, 0, 1)
-    end: float = setting(0.1, 0, 1)
+    end: float = setting(0.3, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class TrainingSettings:
     distance_weight: float = setting(0.0, 0, MAX_WEIGHT)
     distance_limit: float = setting(1.0, 0, MAX_WEIGHT)
     adam_epsilon: float = setting(0.003, maximum=1.0, above=0)
-    ema_share: float = setting(0.05, 0, 1)
+    ema_share: float = setting(0.015, 0, 1)
     stray_reset_interval: int = setting(200, 0, MAX_COUNT)
     stray_limit: float = setting(6.0, 0, MAX_WEIGHT)
     stray_reset_share: float = setting(1.0, 0, 1)
