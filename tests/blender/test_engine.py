@@ -83,12 +83,16 @@ def show(avatar: Avatar):
     return shown, head
 
 
-def render(folder: Path) -> dict[str, np.ndarray]:
-    """Passes of one image in float: R, G, B, A and Depth, top row first."""
-    settings = bpy.context.scene.render.image_settings
+def multilayer(settings: object) -> None:
+    """Choose files that hold all passes in float."""
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format, settings.color_depth, settings.exr_codec = "OPEN_EXR_MULTILAYER", "32", "NONE"
+
+
+def render(folder: Path) -> dict[str, np.ndarray]:
+    """Passes of one image in float: R, G, B, A and Depth, top row first."""
+    multilayer(bpy.context.scene.render.image_settings)
     bpy.context.scene.render.filepath = str(folder / "image.exr")
     bpy.ops.render.render(write_still=True)
     passes = read_exr(folder / "image.exr")
@@ -482,6 +486,36 @@ def test_changed_topology_is_refused():
     set_input(shown, splat_nodes.HEAD, None)
     with pytest.raises(RuntimeError, match="has no head to follow"):
         bpy.ops.render.render()
+
+
+@pytest.mark.parametrize(
+    ("stage", "raised", "message"),
+    [
+        ("visible_layers", StgaError("head: is broken"), "^Error: head: is broken$"),
+        ("visible_layers", ValueError("of bones"), r"Unexpected error \(ValueError: of bones\); see the console"),
+        ("combined", MemoryError("of pixels"), r"Unexpected error \(MemoryError: of pixels\); see the console"),
+    ],
+)
+def test_failed_render_is_an_error_and_an_empty_image(stage, raised, message, tmp_path, monkeypatch):
+    """Catches an image without passes, which Blender cannot save or crashes over, and a failure saved as an image."""
+
+    def fail(*_: object) -> None:
+        raise raised
+
+    scene = bpy.context.scene
+    scene.render.filepath = str(tmp_path / "failed.png")
+    camera_at()
+    monkeypatch.setattr(engine, stage, fail)
+    with pytest.raises(RuntimeError, match=message) as reported:
+        bpy.ops.render.render(write_still=True)
+    assert str(reported.value).count(str(raised)) == 1
+    assert not any(tmp_path.iterdir())
+    multilayer(scene.render.image_settings)
+    bpy.data.images["Render Result"].save_render(str(tmp_path / "empty.exr"))
+    passes = read_exr(tmp_path / "empty.exr")
+    combined = [values for name, values in passes.items() if "Combined" in name]
+    assert len(combined) == 4
+    assert all(values.shape == (HEIGHT, WIDTH) and not values.any() for values in combined)
 
 
 def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):

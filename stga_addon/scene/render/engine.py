@@ -87,14 +87,22 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.register_pass(scene, renderlayer, "Depth", 1, "Z", "VALUE")
 
     def render(self, depsgraph: Any) -> None:
+        message = ""
         try:
-            self._render(depsgraph)
+            passes = self._render(depsgraph)
         except StgaError as error:
-            self.report({"ERROR"}, str(error))  # raised in scripts
+            passes, message = {}, str(error)
+        except Exception as error:  # raised here, it would not stop Blender from saving an image without passes
+            traceback.print_exc()
+            passes, message = {}, f"Unexpected error ({type(error).__name__}: {error}); see the console"
+        self._write_result(depsgraph, passes)
+        if message:
+            self.report({"ERROR"}, message)  # raised in scripts; nothing is saved
             if not bpy.app.background:
-                self.error_set(str(error))  # shown in place of the image
+                self.error_set(message)  # shown in place of the image
 
-    def _render(self, depsgraph: Any) -> None:
+    def _render(self, depsgraph: Any) -> dict[str, np.ndarray]:
+        """Values (H, W, channels) of each pass, top row first."""
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
         border = _border(scene.render, *size)
         camera_object = scene.camera.evaluated_get(depsgraph) if scene.camera else None
@@ -110,13 +118,20 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         view = inverse_view(scene)
         if view is None and needs_inverse(scene):
             self.report({"WARNING"}, VIEW_TRANSFORM_UNKNOWN)
-        result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
-        passes = result.layers[0].passes
-        _write_pass(passes["Combined"], combined(image.rgb, image.alpha, _background(scene), view))
-        if "Depth" in passes:
-            assert image.depth is not None
-            covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
-            _write_pass(passes["Depth"], np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None])
+        assert image.depth is not None
+        covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
+        return {
+            "Combined": combined(image.rgb, image.alpha, _background(scene), view),
+            "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],
+        }
+
+    def _write_result(self, depsgraph: Any, passes: dict[str, np.ndarray]) -> None:
+        """Hand the passes that the view layer has to Blender; those not given stay empty."""
+        size = _border(depsgraph.scene.render, self.resolution_x, self.resolution_y)[2:]
+        result = self.begin_result(0, 0, *size, layer=depsgraph.view_layer.name)
+        for render_pass in result.layers[0].passes:
+            if render_pass.name in passes:
+                _write_pass(render_pass, passes[render_pass.name])
         self.end_result(result)
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
