@@ -107,6 +107,8 @@ def stop() -> None:
 
 def tick() -> float | None:
     """Show what has finished; seconds until the next call, as bpy.app.timers expects."""
+    if bpy.app.is_job_running("RENDER"):  # its thread reads what would be changed
+        return CHECK_INTERVAL_S
     scenes = {scene.session_uid: scene for scene in bpy.data.scenes}
     for uid in [uid for uid, (_, process) in _running.items() if not process.is_running]:
         command, process = _running.pop(uid)
