@@ -25,7 +25,7 @@ class SelectExtension(bpy.types.Operator):
 
     bl_idname = ids.SELECT_EXTENSION
     bl_label = "Select What Extend Trains"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+    bl_options: ClassVar[set[str]] = {"REGISTER"}  # the selection, which comes later, is the step to undo
 
     directory: bpy.props.StringProperty(
         name="Run Folder", description="Folder of the run to extend", subtype="DIR_PATH", options=PATH_OPTIONS
