@@ -21,7 +21,7 @@ class AnalyzeCapture(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_idle(cls, context) and needs_head(cls, context)
+        return background.needs_idle(cls, context) and needs_head(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -47,14 +47,6 @@ class CancelAnalysis(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         background.cancel(context.scene)
         return {"FINISHED"}
-
-
-def needs_idle(operator: Any, context: Any) -> bool:
-    """Poll: whether no analysis runs for the scene; says so where one does."""
-    if background.running(context.scene) is None:
-        return True
-    operator.poll_message_set("An analysis is running")
-    return False
 
 
 def chosen_effects(settings: Any) -> list[str]:

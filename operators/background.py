@@ -91,6 +91,14 @@ def running(scene: Any) -> Command | None:
     return command
 
 
+def needs_idle(operator: Any, context: Any) -> bool:
+    """Poll: whether no analysis runs for the scene; says so where one does."""
+    if running(context.scene) is None:
+        return True
+    operator.poll_message_set("An analysis is running")
+    return False
+
+
 def cancel(scene: Any) -> None:
     """End the scene's command; what is shown stays."""
     _running.pop(scene.session_uid)[1].cancel()

@@ -13,7 +13,6 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import write_selection
 from . import background, ids, monitor
-from .analyze import needs_idle
 from .background import Command
 from .common import file_path, head_of, is_head, needs_own_head, reporting
 from .select import count_selected
@@ -33,7 +32,7 @@ class SelectExtension(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_idle(cls, context) and needs_own_head(cls, context)
+        return background.needs_idle(cls, context) and needs_own_head(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
