@@ -8,6 +8,8 @@ import numpy as np
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
+REC709 = "Linear Rec.709"
+"""The scene-linear color space of new files, and of all before Blender 5.0."""
 # Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
 PATH_OPTIONS = (
     {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -147,9 +149,9 @@ def allow_depth_write(shader: Any) -> None:
 
 
 def working_space() -> str:
-    """The name of the color space that is "scene-linear" in the open file; always the same before Blender 5.0."""
+    """The name of the color space that is "scene-linear" in the open file; always `REC709` before Blender 5.0."""
     spaces = getattr(bpy.data, "colorspace", None)
-    return str(spaces.working_space) if spaces else "Linear Rec.709"
+    return str(spaces.working_space) if spaces else REC709
 
 
 def choose_image_file(settings: Any, file_format: str, color_mode: str, color_depth: str) -> None:

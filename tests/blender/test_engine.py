@@ -20,7 +20,7 @@ from stga_addon.raster.cpu.project import _basis  # noqa: E402
 from stga_addon.raster.render import render as render_splats  # noqa: E402
 from stga_addon.raster.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.compat import enable_nodes  # noqa: E402
+from stga_addon.scene.compat import choose_image_file, enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
 from stga_addon.scene.render import engine, view_transform  # noqa: E402
@@ -250,10 +250,7 @@ def saved_picture(folder: Path, **view: object) -> np.ndarray:
     scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
     for name, value in {"exposure": 0, "gamma": 1, **view}.items():
         setattr(scene.view_settings, name, value)
-    file = scene.render.image_settings
-    if hasattr(file, "media_type"):
-        file.media_type = "IMAGE"
-    file.file_format, file.color_mode, file.color_depth = "PNG", "RGBA", "16"
+    choose_image_file(scene.render.image_settings, "PNG", "RGBA", "16")
     scene.render.dither_intensity = 0
     scene.render.filepath = str(folder / "picture.png")
     bpy.ops.render.render(write_still=True)

@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..compat import choose_image_file, working_space
+from ..compat import REC709, choose_image_file, working_space
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
@@ -22,8 +22,6 @@ GRID, INVERSE_GRID = 41, 25
 DARKEST, BRIGHTEST = -14.0, 6.0
 """Range of the scene-linear samples, in log2; the first sample is 0."""
 INVERSE_STEPS = 15
-REC709 = "Linear Rec.709"
-"""The scene-linear color space of new files, and of all before Blender 5.0."""
 CHUNK = 1 << 16
 """Pixels converted at a time, which bounds the memory."""
 MAIN_THREAD_TIMEOUT_S = 10.0
