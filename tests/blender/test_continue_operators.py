@@ -1,6 +1,7 @@
 """Refine and Extend from Blender: what is painted or selected reaches the worker, and the preview stays in place."""
 
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.files import read_npz, write_npz  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 
-from .test_analyze_operator import write_interpreter  # noqa: E402
+from .test_analyze_operator import tick_until_done, write_interpreter  # noqa: E402
 from .test_operators import write_ball_avatar  # noqa: E402
 
 
@@ -137,6 +138,34 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, monkeyp
     with pytest.raises(RuntimeError, match="no such run"):
         bpy.ops.stga.select_extension(directory=str(run))
     assert settings.extension_error == "no such run"
+
+
+def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, extension, monkeypatch, tmp_path):
+    """Catches a selection written to the head imported meanwhile, and files that a cancelled command leaves."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    write_npz(tmp_path / "given.npz", {"00000": np.ones(len(head.data.polygons), bool)})
+    wait = f"import pathlib, shutil\nwhile not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
+    program = write_interpreter(
+        tmp_path / "python", wait + f"shutil.copy({str(tmp_path / 'given.npz')!r}, sys.argv[-1])"
+    )
+    background, settings = extension.operators.background, bpy.context.scene.stga
+    monkeypatch.setattr(background, "training_python", lambda context: program)
+    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
+    assert any(temporary.iterdir())
+    assert not bpy.ops.stga.select_extension.poll()
+    assert bpy.ops.stga.cancel_analysis() == {"FINISHED"}
+    assert not any(temporary.iterdir())
+    assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "other")))
+    (tmp_path / "go").touch()
+    tick_until_done(extension)
+    assert settings.extension_error.endswith("its head is no longer that of the scene")
+    assert "stga_0" not in head.vertex_groups
+    assert "stga_0" not in settings.head.vertex_groups
+    assert not any(temporary.iterdir())
 
 
 @pytest.mark.slow
