@@ -80,8 +80,9 @@ def train(
         if not falls_back:
             raise
         logging.getLogger(__name__).warning("%s; continuing on the CPU from the last checkpoint", error.cause)
-        report(Progress(message="Continuing on the CPU"))
-        return _train(capture, out, replace(run, device="cpu"), selection, True, report)
+    # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
+    report(Progress(message="Continuing on the CPU"))
+    return _train(capture, out, replace(run, device="cpu"), selection, True, report)
 
 
 def _train(
