@@ -25,23 +25,23 @@ def wait(device: Device) -> None:
     device.read(counts_buffer(device), (1,), np.uint32)
 
 
-def queued_ms(step: GpuBackend, repeats: int, batch: Batch) -> float:
+def queued_ms(backend: GpuBackend, repeats: int, batch: Batch) -> float:
     """Mean wall time in milliseconds of iterations that follow each other without waiting, after five of them."""
     for count in (5, repeats):
-        wait(step.device)
+        wait(backend.device)
         begin = perf_counter()
         for _ in range(count):
-            step.step(batch)
-        wait(step.device)
+            backend.step(batch)
+        wait(backend.device)
     return 1e3 * (perf_counter() - begin) / repeats
 
 
-def host_ms(step: GpuBackend, batch: Batch, repeats: int) -> tuple[float, float]:
+def host_ms(backend: GpuBackend, batch: Batch, repeats: int) -> tuple[float, float]:
     """Median CPU time in milliseconds that the host's thread takes for an iteration: without the submit, and in it.
 
     Of an idle device. Software Vulkan computes in the submit, so that only a tiny image shows what the latter costs.
     """
-    queue, inside = step.device.gpu.queue, 0.0
+    queue, inside = backend.device.gpu.queue, 0.0
     submit = queue.submit
 
     def timed(commands: object) -> None:
@@ -53,9 +53,9 @@ def host_ms(step: GpuBackend, batch: Batch, repeats: int) -> tuple[float, float]
     queue.submit = timed
     times = []
     for _ in range(repeats):
-        wait(step.device)
+        wait(backend.device)
         begin = thread_time()
-        step.step(batch)
+        backend.step(batch)
         times.append((thread_time() - begin - inside, inside))
     del queue.submit
     recording, submitting = (1e3 * statistics.median(column) for column in zip(*times, strict=True))
@@ -104,26 +104,26 @@ def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, i
     }
 
 
-def kernel_table(step: GpuBackend, batch: Batch, repeats: int) -> dict[str, float]:
+def kernel_table(backend: GpuBackend, batch: Batch, repeats: int) -> dict[str, float]:
     """Print each kernel's time beside its floor, and what an iteration asks of the host; returns milliseconds."""
-    device, camera = step.device, batch.view.camera
+    device, camera = backend.device, batch.view.camera
     if device.is_software:
         print("This adapter is a CPU: its times say nothing of a GPU's")
-    step.step(batch)
+    backend.step(batch)
     before = device.dispatches, device.submits, device.waits
     for _ in range(repeats):
-        step.step(batch)
+        backend.step(batch)
     after = device.dispatches, device.submits, device.waits
     counts = [(b - a) / repeats for a, b in zip(before, after, strict=True)]
     print("{:g} dispatches, {:g} submits, {:g} waits an iteration".format(*counts))
-    recording, submitting = host_ms(step, batch, repeats)
+    recording, submitting = host_ms(backend, batch, repeats)
     print(
         f"host thread: {recording:.2f} ms of CPU time to upload and record an iteration; {submitting:.2f} in the submit"
     )
-    _, submitting = host_ms(step, tiny(batch), repeats)
+    _, submitting = host_ms(backend, tiny(batch), repeats)
     print(f"of an image of 16 × 16 pixels, which leaves next to nothing to compute: {submitting:.2f} ms in the submit")
     print(f"buffers: {device.bytes / 2**20:.0f} MiB")
-    step.step(batch)
+    backend.step(batch)
     wait(device)
     pairs = int(device.read(counts_buffer(device), (COUNTS,), np.uint32)[NEEDED])
     bandwidth = copy_bandwidth(device)
@@ -133,11 +133,11 @@ def kernel_table(step: GpuBackend, batch: Batch, repeats: int) -> dict[str, floa
         return {}
     device.kernel_times = KernelTimes(device)
     for _ in range(repeats):
-        step.step(batch)
+        backend.step(batch)
     found = {name: ms / repeats for name, ms in device.kernel_times.read().items()}
     device.kernel_times = None
     tiles_x, tiles_y = tile_grid(camera.width, camera.height)
-    moved = least_bytes(len(step), camera.width * camera.height, tiles_x * tiles_y, pairs)
+    moved = least_bytes(len(backend), camera.width * camera.height, tiles_x * tiles_y, pairs)
     print(f"{'kernel':<26}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, ms in found.items():
         floor = 1e3 * moved.get(name, 0) / bandwidth

@@ -170,9 +170,9 @@ def device_step(
     lengths = np.sqrt(2 * face_areas(mesh, faces)).astype(np.float32)
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
     given = make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats)
-    step = make_backend(device, *given)
+    backend = make_backend(device, *given)
     view = View(0, 0, camera, "benchmark", Path())
-    return step, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
+    return backend, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
 
 
 def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "demo") -> np.ndarray:
@@ -199,16 +199,16 @@ def main() -> None:
     target = rng.integers(0, 256, (options.height, options.width, 3)).astype(np.uint8)
     chosen, why = choose_device(options.device)
     print(why)
-    step, batch = device_step(chosen, splats, mesh, faces, camera, target)
+    backend, batch = device_step(chosen, splats, mesh, faces, camera, target)
     if chosen == "cpu":
-        measure = partial(cpu_ms, step, options.repeats)
+        measure = partial(cpu_ms, backend, options.repeats)
         frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
         found = cpu_table(splats, frames, target, options.repeats)
     else:
         import gpu_kernels  # needs wgpu
 
-        measure = partial(gpu_kernels.queued_ms, step, options.repeats)
-        found = gpu_kernels.kernel_table(step, batch, options.repeats)
+        measure = partial(gpu_kernels.queued_ms, backend, options.repeats)
+        found = gpu_kernels.kernel_table(backend, batch, options.repeats)
     whole = measure(batch)
     print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
     print(f"{'whole iteration':<22}{whole:8.2f}")
@@ -221,8 +221,9 @@ def main() -> None:
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def cpu_ms(step: Backend, repeats: int, batch: Batch) -> float:
-    return median_ms(lambda: step.step(batch), repeats)
+def cpu_ms(backend: Backend, repeats: int, batch: Batch) -> float:
+    """Median wall time in milliseconds of an iteration on the CPU."""
+    return median_ms(lambda: backend.step(batch), repeats)
 
 
 def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, float]:

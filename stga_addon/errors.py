@@ -25,7 +25,7 @@ class StgaError(Exception):
 class DeviceError(StgaError):
     """A GPU that failed while it was in use: lost, or out of memory.
 
-    cause  the part of the sentence before the advice what to do
+    cause  the sentence without --device and the advice
     """
 
     def __init__(self, cause: str, advice: str) -> None:

@@ -53,8 +53,8 @@ def add_device(command: argparse.ArgumentParser) -> None:
         type=device_name,
         default="auto",
         metavar="{auto,cpu,gpu,gpu:NAME}",
-        help="gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto: a GPU if it is right "
-        "and faster than the CPU in a trial of a second, else the CPU (default)",
+        help="gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto (default): a GPU if it "
+        "is right and faster than the CPU in a trial of a second, else the CPU",
     )
 
 

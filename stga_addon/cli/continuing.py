@@ -60,4 +60,4 @@ def resume_continuation(options: Namespace) -> None:
     device, why = device_of(opened.run, options.device)
     print(why)
     run = replace(opened.run, device=device)
-    train_run(options.run_folder, run, opened.capture, None, True, options.device == "auto")
+    train_run(options.run_folder, run, opened.capture, None, resume=True, falls_back=options.device == "auto")

@@ -60,7 +60,7 @@ def run(options: Namespace) -> None:
     run = with_effects_of_takes(prepared.run, prepared.capture)
     if run.settings.strain_color != prepared.run.settings.strain_color:
         print(next(f"strain-color  {decision}" for decision in run.effect_plan if decision.effect == "strain-color"))
-    train_run(folder, run, prepared.capture, prepared.selection, False, options.device == "auto")
+    train_run(folder, run, prepared.capture, prepared.selection, resume=False, falls_back=options.device == "auto")
 
 
 def _write_selection(path: Path, wanted: "Extension", flame: Path | None) -> None:

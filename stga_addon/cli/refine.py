@@ -38,5 +38,5 @@ def run(options: Namespace) -> None:
     wanted = Refinement(
         options.run_folder, options.region, options.frames, options.growth, **budget_of(options, DEFAULT_SECONDS)
     )
-    prepared = prepare_refinement(wanted, device, options.flame)
-    train_run(folder, prepared.run, prepared.capture, prepared.selection, False, options.device == "auto")
+    prepared, falls_back = prepare_refinement(wanted, device, options.flame), options.device == "auto"
+    train_run(folder, prepared.run, prepared.capture, prepared.selection, resume=False, falls_back=falls_back)

@@ -17,7 +17,7 @@ def choose_device(wanted: str, task: str = "Training") -> tuple[str, str]:
     """The device, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
 
     wanted: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with this
-    part in its name). "auto" takes the first adapter that is no software, right and faster than the CPU. task: what is
+    part in its name). "auto" takes the first adapter that is not software, right and faster than the CPU. task: what is
     done there. Raises StgaError if a GPU is wanted and none works.
     """
     if wanted == "cpu":
@@ -60,7 +60,7 @@ def _fastest(task: str) -> tuple[str, str]:
     """The first real GPU that is right and faster than the CPU, or the CPU and why."""
     try:
         names = adapter_names(software=False)
-    except Exception as error:  # whatever a driver raises, the CPU can still train
+    except Exception as error:  # whatever a driver raises, the CPU still works
         return "cpu", f"{task} on the CPU: {first_line(error)}"
     reasons = []
     for adapter in names:
@@ -89,7 +89,7 @@ def _trial(adapter: str) -> "Trial":
 
 
 def _comparison(trial: "Trial") -> str:
-    """How fast a device is beside the CPU, of which an image took the other time."""
+    """How fast a device is compared with the CPU, and the time of an image on each."""
     times = f"{1e3 * trial.device_s:.1f} and {1e3 * trial.cpu_s:.1f} ms an image"
     faster, slower = trial.cpu_s / trial.device_s, trial.device_s / trial.cpu_s
     share = f"{faster:.1f} times as fast as" if faster > 1 else f"{slower:.1f} times slower than"

@@ -11,10 +11,12 @@ from .photo_consistency import facing
 MAX_COSINE = 0.25
 """Of the angle between normal and camera: points within 15° of the outline move it."""
 RIM_COSINE = 0.5
+"""The same of a triangle: those farther from the outline are not drawn."""
 PICTURE_SIDE, MAX_ENLARGEMENT = 600, 2
 """The mesh's own mask is drawn with about so many pixels, since it has no soft edge."""
 SAMPLES_PER_PIXEL = 4
 MAX_REACH_PX = 40.0
+"""Pixels on either side of a point in which an edge is looked for; a close camera's are many."""
 
 
 def outline_offsets(

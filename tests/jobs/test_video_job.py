@@ -88,15 +88,26 @@ def test_backgrounds() -> None:
     assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
 
 
+VALID = {
+    "format": "stga-video", "version": 1, "output": "v.mp4", "images": 1, "fps": 1, "background": None, "device": "cpu"
+}  # fmt: skip
+
+
+def test_a_whole_job_is_read(tmp_path: Path) -> None:
+    """Catches a damaged job below that is refused for something else than its one damaged field."""
+    write_json(tmp_path / VIDEO, VALID)
+    assert read_video_job(tmp_path) == VideoJob(Path("v.mp4"), 1, 1.0, None, "cpu")
+
+
 @pytest.mark.parametrize(
     "values",
     [
         [],
         {"format": "stga-job", "version": 1},
         {"format": "stga-video", "version": 1},
-        {"format": "stga-video", "version": 1, "output": "v.mp4", "images": "x", "fps": 1, "background": None},
-        {"format": "stga-video", "version": 1, "output": "v.mp4", "images": 1, "fps": 1, "background": [1, 2]},
-        {"format": "stga-video", "version": 1, "output": "v", "images": 1, "fps": 1, "background": None, "device": "x"},
+        VALID | {"images": "x"},
+        VALID | {"background": [1, 2]},
+        VALID | {"device": "x"},
     ],
 )
 def test_damaged_jobs(tmp_path: Path, values: object) -> None:

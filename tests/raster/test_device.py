@@ -1,4 +1,4 @@
-"""Choice of the training device, and the message if the wanted one cannot be used."""
+"""Choice of the device that trains or renders, and the message if the wanted one cannot be used."""
 
 import subprocess
 import sys

@@ -13,6 +13,7 @@ from capture import factory
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.strain import COLOR_RANGE
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
@@ -154,6 +155,7 @@ def test_strain_color_can_begin_with_a_further_take(takes: tuple[Path, Path], tm
     assert avatar.splats.strain_color.shape[1:] == (3, 3)
     assert avatar.splats.strain_color.any()
     assert avatar.strain_range is not None
+    assert (avatar.strain_range[:, 0] > COLOR_RANGE[0]).all()  # what the takes show, not any strain
 
 
 def test_global_iterations_replay_old_views(takes: tuple[Path, Path], parent: Path) -> None:

@@ -131,9 +131,9 @@ class Device:
         """A buffer of so many bytes; usage: flags of WebGPU."""
         if size > self.max_bytes:
             raise DeviceError(
-                f"{self.name} allows buffers of {self.max_bytes >> 20} MiB and training needs one of {size >> 20} MiB "
+                f"{self.name} allows buffers of {self.max_bytes >> 20} MiB and one of {size >> 20} MiB is needed "
                 f"for {name}",
-                "train smaller images or fewer splats, or continue on the CPU (--device cpu)",
+                "use smaller images or fewer splats, or continue on the CPU (--device cpu)",
             )
         with self.errors():
             return self.gpu.create_buffer(label=name, size=size, usage=usage)
@@ -403,5 +403,5 @@ def _source(name: str) -> str:
 def _full_memory(name: str) -> DeviceError:
     return DeviceError(
         f"the memory of {name} is full",
-        "close other programs that use it, train smaller images or fewer splats, or continue on the CPU (--device cpu)",
+        "close other programs that use it, use smaller images or fewer splats, or continue on the CPU (--device cpu)",
     )

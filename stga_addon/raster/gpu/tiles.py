@@ -1,7 +1,7 @@
 """Projected splats to tiles: the tiles to be rendered, and every tile's list of pairs, near to far.
 
 The splats are sorted by depth, write their (tile, splat) pairs in that order, and a stable sort by tile alone keeps it.
-A splat has a pair with each rendered tile that its outline reaches; its bounding box alone counts a third more.
+A splat has a pair with each rendered tile that its outline reaches; its bounding box would count more.
 How many pairs there are is known on the device only, so everything that follows is dispatched indirectly.
 """
 

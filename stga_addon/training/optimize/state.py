@@ -86,7 +86,7 @@ def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
     return _map(lambda tensors: tensors[0][keep], state)
 
 
-def with_strain_color(state: TrainState) -> TrainState:
+def with_strain_coefficients(state: TrainState) -> TrainState:
     """The state with strain coefficients; they and their moments are zero where there were none."""
     if state.parameters.strain_color.shape[1]:
         return state

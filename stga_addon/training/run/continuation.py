@@ -23,7 +23,7 @@ from ..evaluate.evaluation_views import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
-from ..optimize.state import TrainState, new_state, with_strain_color
+from ..optimize.state import TrainState, new_state, with_strain_coefficients
 from ..optimize.tracking import with_refined_tracking
 from ..settings import Rates, TrainingSettings, validate
 from .checkpoint import read_checkpoint
@@ -157,16 +157,15 @@ def starting_state(continuation: Continuation, strain_color: bool) -> TrainState
     if file_digest(folder / "avatar.npz") != continuation.avatar:
         raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
     splats = read_avatar(folder / "avatar.npz").splats
-    if (folder / CHECKPOINT).exists():
-        state = read_checkpoint(folder).state
-        kept = state.averaged()
-        if all(np.array_equal(array, getattr(kept, name)) for name, array in vars(splats).items()):
-            parameters = Parameters(*(tensor.clone() for tensor in state.average))
-            zero = torch.zeros(len(state))
-            state = replace(state, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
-            return with_strain_color(state) if strain_color else state
     state = new_state(splats)
-    return with_strain_color(state) if strain_color else state
+    if (folder / CHECKPOINT).exists():
+        kept = read_checkpoint(folder).state
+        averaged = kept.averaged()
+        if all(np.array_equal(array, getattr(averaged, name)) for name, array in vars(splats).items()):
+            parameters = Parameters(*(tensor.clone() for tensor in kept.average))
+            zero = torch.zeros(len(kept))
+            state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
+    return with_strain_coefficients(state) if strain_color else state
 
 
 def late_rates(rates: Rates, share: float) -> Rates:

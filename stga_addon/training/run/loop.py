@@ -80,8 +80,9 @@ def train(
         if not falls_back:
             raise
         logging.getLogger(__name__).warning("%s; continuing on the CPU from the last checkpoint", error.cause)
-        report(Progress(message="Continuing on the CPU"))
-        return _train(capture, out, replace(run, device="cpu"), selection, True, report)
+    # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
+    report(Progress(message="Continuing on the CPU"))
+    return _train(capture, out, replace(run, device="cpu"), selection, True, report)
 
 
 def _train(
@@ -149,7 +150,7 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
-        self.measured_strain: list[np.ndarray] = []
+        self.measured_strain: np.ndarray | None = None
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""
@@ -390,10 +391,10 @@ class _Loop:
         """Measured once, or whenever refined tracking may have moved the meshes."""
         if not self.settings.strain_color:
             return None
-        if not self.measured_strain or self.trainer.tracking is not None:
+        if self.measured_strain is None or self.trainer.tracking is not None:
             mesh = self.trainer.frames.mesh if self.trainer.tracking is not None else self.capture.mesh
-            self.measured_strain = [trained_strain_range(self.capture, mesh, self.run.continuation)]
-        return self.measured_strain[0]
+            self.measured_strain = trained_strain_range(self.capture, mesh, self.run.continuation)
+        return self.measured_strain
 
     def _save(self) -> None:
         trainer = self.trainer
