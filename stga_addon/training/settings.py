@@ -150,6 +150,7 @@ PAPER_SETTINGS = {
     "views_per_visit": 0,
     "global_interval": 20,
     "warm_up_share": 0.0,
+    "rates": Rates(end=0.1),
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_reset_share": 0.0,

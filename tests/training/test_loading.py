@@ -10,9 +10,11 @@ import pytest
 from capture import factory
 
 from stga_addon.capture.loader import ViewLoader
+from stga_addon.capture.model import evenly_spread
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.residuals import Residuals
 from stga_addon.training.optimize.frames import CACHED_TIMESTEPS
+from stga_addon.training.optimize.initial_colors import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import loop
 from stga_addon.training.run.loop import train
 
@@ -38,8 +40,9 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(loop, "triangle_residuals", no_residuals)  # which read meshes after training
     train(capture, tmp_path / "loaded", run)
     assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view
-    # Splats are placed, and given colors, on the first mesh before training.
-    assert [timestep for timestep, on_training_thread in read if on_training_thread] == [timesteps[0]]
+    # Before training, splats are placed on the first mesh, and given colors there and on a few later ones.
+    before = [timesteps[0], *evenly_spread(timesteps[1:-1], MAX_LATER_TIMESTEPS)]
+    assert [timestep for timestep, on_training_thread in read if on_training_thread] == before
 
     def without_meshes(*arguments: Any, **options: Any) -> ViewLoader:
         return ViewLoader(*arguments, **{**options, "mesh": None})
