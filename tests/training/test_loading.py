@@ -50,6 +50,6 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
     read.clear()
     monkeypatch.setattr(loop, "ViewLoader", without_meshes)
     train(capture, tmp_path / "unloaded", run)
-    assert len(read) == len(timesteps)  # the first one twice
+    assert len(read) == len(timesteps) - 1 + len(before)
     assert all(on_training_thread for _, on_training_thread in read)
     assert_same_state(tmp_path / "loaded", tmp_path / "unloaded")
