@@ -37,11 +37,6 @@ def _epoch(views: Sequence[View], per_visit: int, seed: int, epoch: int) -> list
     return [view for n in rng.permutation(len(visits)) for view in visits[n]]
 
 
-def is_turn(position: int, share: float) -> bool:
-    """Whether the event that happens at this share of all positions, as evenly as possible, happens at this one."""
-    return int((position + 1) * share) > int(position * share)
-
-
 def sh_degree(settings: TrainingSettings, progress: float) -> int:
     """Degree of spherical harmonics in use at a share of the budget."""
     return min(settings.sh_degree, sum(progress >= step for step in settings.sh_steps))

@@ -19,7 +19,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.training.optimize.strategies import EXTEND_GLOBAL_SHARE, ExtendStrategy
+from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, ExtendStrategy
 from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import prepare_extension
 from stga_addon.training.run.folder import Run, read_run
@@ -27,7 +27,7 @@ from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.open_run import open_run
 from stga_addon.training.run.progress import Progress
-from stga_addon.training.run.replay import continued_order
+from stga_addon.training.run.replay import EXTEND_REPLAY_SHARE, continued_order
 from stga_addon.training.run.request import Extension
 
 from .test_run import assert_same_state
@@ -158,25 +158,23 @@ def test_strain_color_can_begin_with_a_further_take(takes: tuple[Path, Path], tm
     assert (avatar.strain_range[:, 0] > COLOR_RANGE[0]).all()  # what the takes show, not any strain
 
 
-def test_global_iterations_replay_old_views(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that forgets because it sees the new take only, or trains all splats on it."""
+def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches an extension that forgets because it sees the new take only, or that sees old views at one end only."""
     prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
-    strategy = ExtendStrategy(np.ones(1, bool))
-    is_global = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(40)]
-    assert [view.timestep < 4 for view in views] == is_global
-    assert 0 < sum(is_global) < 40
+    is_old = [view.timestep < 4 for view in views]
+    assert sum(is_old) == round(40 * EXTEND_REPLAY_SHARE)
+    assert not any(first and second for first, second in pairwise(is_old))
 
 
-def test_local_and_global_iterations_take_turns() -> None:
-    """Catches an extension whose global iterations are lost, or are all there is."""
+def test_what_new_takes_need_is_trained_first() -> None:
+    """Catches an extension that trains all splats from the start, or never."""
     region = np.array([True, False])
     strategy = ExtendStrategy(region)
-    kinds = [strategy.triangles(n, 0, 0, 0.0) is None for n in range(100)]
-    assert sum(kinds) == round(100 * EXTEND_GLOBAL_SHARE)
-    assert not any(first and second for first, second in pairwise(kinds))
     assert strategy.triangles(0, 0, 0, 0.0) is region
+    assert strategy.triangles(1, 0, 0, EXTEND_LOCAL_SHARE - 0.01) is region
+    assert strategy.triangles(2, 0, 0, EXTEND_LOCAL_SHARE) is None
     assert ExtendStrategy(~region & region).triangles(0, 0, 0, 0.0) is None
 
 

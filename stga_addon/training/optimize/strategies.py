@@ -6,13 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from ..schedule import is_turn
 from ..settings import CONTINUATIONS, TrainingSettings
 from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .state import TrainState
 
-EXTEND_GLOBAL_SHARE = 0.4
-"""Share of an extension's iterations that train all splats, in old views (`run.replay`); the others train new views."""
+EXTEND_LOCAL_SHARE = 0.5
+"""Share of an extension's budget that trains what the new takes need, before all splats are trained."""
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
 
@@ -75,7 +74,9 @@ class RefineStrategy:
 
 @dataclass
 class ExtendStrategy:
-    """Trains what new takes need, and in turn with that all splats.
+    """Trains what new takes need, in views of all takes, and then all splats.
+
+    Not in turn: where some splats are frozen in the new views only, the others make up for them there, and drift.
 
     region  (F,) bool: what moves in the new takes, or looks different there
     """
@@ -83,8 +84,7 @@ class ExtendStrategy:
     region: np.ndarray
 
     def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
-        is_global = is_turn(iteration, EXTEND_GLOBAL_SHARE)
-        return None if is_global or not self.region.any() else self.region
+        return self.region if progress < EXTEND_LOCAL_SHARE and self.region.any() else None
 
 
 def make_strategy(settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> Strategy:

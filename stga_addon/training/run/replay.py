@@ -5,12 +5,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ...capture.model import Capture, View, evenly_spread
-from ..optimize.strategies import EXTEND_GLOBAL_SHARE
-from ..schedule import is_turn, view_order
+from ..schedule import view_order
 from .folder import Continuation
 
 REPLAY_SHARE = 1 / 3
 """Share of a refinement's iterations that train views outside the continuation's frames, where there are any."""
+EXTEND_REPLAY_SHARE = 0.4
+"""Share of an extension's iterations that train views of the old takes."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
@@ -30,21 +31,20 @@ def continued_order(
 ) -> Iterator[View]:
     """Endless order of views from position `start` on: of the continuation's frames and, now and then, of others.
 
-    region (F,) bool: what is refined, by views that see much of it. None for an extension, whose global iterations
-    replay old views and whose local ones train new views.
+    region (F,) bool: what is refined, by views that see much of it. None for an extension.
     """
     views = capture.views["train"]
     asked = [view for view in views if continuation.includes(view.timestep)]
     others = replayed_views(capture, [view for view in views if not continuation.includes(view.timestep)])
     if region is not None:
         asked, others = (views_of_region(capture, members, region) for members in (asked, others))
-    share = (EXTEND_GLOBAL_SHARE if region is None else REPLAY_SHARE) if others else 0.0
+    share = (EXTEND_REPLAY_SHARE if region is None else REPLAY_SHARE) if others else 0.0
     replayed = [int(position * share) for position in (start, start + 1)]
     new = view_order(asked, 1, seed, start - replayed[0])
     old = view_order(others, 1, seed + 1, replayed[0]) if others else new
     position = start
     while True:
-        yield next(old) if is_turn(position, share) else next(new)
+        yield next(old) if int((position + 1) * share) > int(position * share) else next(new)
         position += 1
 
 
