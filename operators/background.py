@@ -26,7 +26,7 @@ class _Process:
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", errors="replace",
         )  # fmt: skip
         self._output = ("", "")
-        self._thread = Thread(target=self._read, name="stga analysis", daemon=True)
+        self._thread = Thread(target=self._read, name="stga command", daemon=True)
         self._thread.start()
 
     def _read(self) -> None:
@@ -42,7 +42,7 @@ class _Process:
         output, errors = self._output
         code = self._process.returncode
         if code:
-            lines = errors.strip().splitlines() or [f"Analysis exited unexpectedly (exit code {code})"]
+            lines = errors.strip().splitlines() or [f"The command exited unexpectedly (exit code {code})"]
             raise StgaError(lines[-1].removeprefix("stga: ").removeprefix("--effect "))
         return output
 
@@ -92,10 +92,10 @@ def running(scene: Any) -> Command | None:
 
 
 def needs_idle(operator: Any, context: Any) -> bool:
-    """Poll: whether no analysis runs for the scene; says so where one does."""
+    """Poll: whether no such command runs for the scene; says so where one does."""
     if running(context.scene) is None:
         return True
-    operator.poll_message_set("An analysis is running")
+    operator.poll_message_set("Another command is running")
     return False
 
 

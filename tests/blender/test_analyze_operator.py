@@ -112,7 +112,7 @@ def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
 @pytest.mark.parametrize(
     ("body", "sentence"),
     [
-        ("sys.exit(3)", r"Analysis exited unexpectedly \(exit code 3\)"),
+        ("sys.exit(3)", r"The command exited unexpectedly \(exit code 3\)"),
         ("sys.exit('stga: no memory')", "no memory"),
         ("print('no JSON')", "Analysis printed something other than JSON"),
         ("print('{}')", r"Unexpected error \(KeyError"),

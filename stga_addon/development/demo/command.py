@@ -13,7 +13,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--out", type=usable_path, default=Path("out/demo"))
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget", type=duration, default=40.0, metavar="TIME")
-    budget.add_argument("--iterations", type=whole_number(1), help="number of iterations instead")
+    budget.add_argument(
+        "--iterations", type=whole_number(1), help="number of iterations instead, of the first training"
+    )
     add_device(parser)
     parser.add_argument("--footage", action="store_true", help="make an avatar from the capture's images alone as well")
 

@@ -18,7 +18,7 @@ def trained_strain_range(
 ) -> np.ndarray:
     """`Avatar.strain_range` (F, 2, 3) of a run: what its training timesteps show, and what its parent's did.
 
-    mesh: timestep -> (V, 3) that is trained on. Within COLOR_RANGE, which a parent of an earlier version may exceed.
+    mesh: timestep -> (V, 3) that is trained on. Within COLOR_RANGE.
     """
     limits = color_range(len(capture.faces))
     basis = strain_basis(capture.neutral, capture.faces, limits)
