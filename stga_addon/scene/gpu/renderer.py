@@ -9,7 +9,7 @@ from typing import Any
 
 import gpu
 import numpy as np
-from gpu.types import Buffer, GPUBatch, GPUFrameBuffer, GPUTexture, GPUVertBuf, GPUVertFormat
+from gpu.types import Buffer, GPUBatch, GPUFrameBuffer, GPUIndexBuf, GPUTexture, GPUVertBuf, GPUVertFormat
 
 from ...avatar.embedding import FaceFrames
 from ...raster.posed_splats import ComposedImage
@@ -17,20 +17,30 @@ from ..layers import SceneLayer
 from . import packing
 from .front_bones import NO_BONES
 from .packing import StaticSplats, View
-from .shaders import SPLAT_TEXTURES, TEXTURE_WIDTH, composite_shader, splat_shader
+from .shaders import (
+    BLOCK_SPLATS,
+    PROJECTED_TEXTURES,
+    SPLAT_TEXTURES,
+    TEXTURE_WIDTH,
+    composite_shader,
+    projection_shader,
+    splat_shader,
+)  # fmt: skip
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
 OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
 """Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
 EXACT, COMPACT = "RGBA32F", "RGBA16F"
-"""Formats of the color target. The depth target is always exact."""
+"""Formats of the color target."""
+DEPTH_FORMAT = "RG32F"
 
 
 class SplatRenderer:
     """Shaders, the textures of the layers drawn last, and the targets they were drawn to."""
 
     def __init__(self, color_format: str = EXACT) -> None:
-        self._shader, self._composite, self._corners = splat_shader(), composite_shader(), _corners()
+        self._projection, self._shader, self._composite = projection_shader(), splat_shader(), composite_shader()
+        self._screen, self._block = _rectangles(1), _rectangles(BLOCK_SPLATS)
         self._color_format = color_format
         self._static: StaticSplats | None = None
         self._static_textures: dict[str, Any] = {}
@@ -38,18 +48,23 @@ class SplatRenderer:
         self._blocks: dict[int, tuple[FaceFrames, np.ndarray]] = {}
         self._size = (0, 0)
         self._color = self._depth = self._target = None
+        self._projected: dict[str, Any] = {}
+        self._projected_target: Any = None
 
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
         """Draw layers, sorted together, to this renderer's own targets."""
         self._resize(view.camera.width, view.camera.height)
+        gpu.state.depth_test_set("NONE")
+        gpu.state.depth_mask_set(False)
+        count = self._project(layers, view) if layers else 0
         with self._target.bind():  # type: ignore[attr-defined]
             gpu.state.active_framebuffer_get().clear(color=CLEAR)
-            if layers:
-                self._draw_splats(layers, view)
+            if count:
+                self._draw_splats(count)
 
     def read(self, with_depth: bool = False) -> ComposedImage:
         """What was drawn last, in memory."""
-        color, depth = (_pixels(texture)[::-1] for texture in (self._color, self._depth))
+        color, depth = _pixels(self._color, 4)[::-1], _pixels(self._depth, 2)[::-1]
         alpha = np.ascontiguousarray(color[..., 3])
         rgb = np.ascontiguousarray(color[..., :3].transpose(2, 0, 1))
         return ComposedImage(rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None)
@@ -103,7 +118,7 @@ class SplatRenderer:
         shader.uniform_float("corner_px", (*corner, 0.0, 0.0))
         shader.uniform_float("to_depth", to_depth)
         shader.uniform_float("behind", CLEAR if behind is None else (*behind, 1.0))
-        self._corners.draw(shader)
+        self._screen.draw(shader)
         gpu.state.depth_test_set("NONE")
         gpu.state.blend_set("NONE")
 
@@ -111,6 +126,9 @@ class SplatRenderer:
         if self._static is None or self._static.key != packing.static_key(layers):
             self._static = StaticSplats(layers)
             self._static_textures = {name: _texture(texels) for name, texels in self._static.texels.items()}
+            size = TEXTURE_WIDTH, _rows(len(self._static))
+            self._projected = {name: GPUTexture(size, format=EXACT) for name in PROJECTED_TEXTURES}
+            self._projected_target = GPUFrameBuffer(color_slots=tuple(self._projected.values()))
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
         return self._static
 
@@ -127,42 +145,61 @@ class SplatRenderer:
         if self._size != (width, height):
             self._size = width, height
             self._color = GPUTexture((width, height), format=self._color_format)
-            self._depth = GPUTexture((width, height), format=EXACT)
+            self._depth = GPUTexture((width, height), format=DEPTH_FORMAT)
             self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
 
-    def _draw_splats(self, layers: Sequence[SceneLayer], view: View) -> None:
+    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
+        """Compute what is drawn of each splat, once for its four corners; returns how many are to be drawn."""
         static = self._update_static(layers)
         frames = packing.posed_frames(layers, self._frame_blocks(layers), view)
         order = packing.drawing_order(static, frames, view)
         if not len(order):
-            return
+            return 0
         textures = self._static_textures | {
             "orders": _texture(order[:, None], "R32F"), "frames": _texture(frames.texels.reshape(-1, 4)),
             "table": _texture(packing.table(static, layers, view)),
         }  # fmt: skip
-        gpu.state.depth_test_set("NONE")
-        gpu.state.depth_mask_set(False)
+        shader = self._projection
+        with self._projected_target.bind():
+            gpu.state.blend_set("NONE")
+            shader.bind()
+            for name in SPLAT_TEXTURES:
+                shader.uniform_sampler(name, textures[name])
+            shader.uniform_int("faces", frames.texels.shape[1])
+            shader.uniform_int("count", len(order))
+            self._screen.draw(shader)
+        return len(order)
+
+    def _draw_splats(self, count: int) -> None:
         gpu.state.blend_set("ALPHA_PREMULT")
         shader = self._shader
         shader.bind()
-        for name in SPLAT_TEXTURES:
-            shader.uniform_sampler(name, textures[name])
-        shader.uniform_int("faces", frames.texels.shape[1])
-        self._corners.draw_instanced(shader, instance_start=0, instance_count=len(order))
+        for name in PROJECTED_TEXTURES:
+            shader.uniform_sampler(name, self._projected[name])
+        self._block.draw_instanced(shader, instance_start=0, instance_count=-(-count // BLOCK_SPLATS))
         gpu.state.blend_set("NONE")
 
 
-def _corners() -> Any:
+def _rectangles(count: int) -> Any:
+    """Rectangles of four vertices with corners at ±1."""
     layout = GPUVertFormat()
     layout.attr_add(id="corner", comp_type="F32", len=2, fetch_mode="FLOAT")
-    vertices = GPUVertBuf(len=4, format=layout)
-    vertices.attr_fill(id="corner", data=np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32))
-    return GPUBatch(type="TRI_STRIP", buf=vertices)
+    vertices = GPUVertBuf(len=4 * count, format=layout)
+    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32)
+    vertices.attr_fill(id="corner", data=np.tile(corners, (count, 1)))
+    triangles = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [2, 1, 3]])
+    indices = GPUIndexBuf(type="TRIS", seq=triangles.reshape(-1, 3).astype(np.uint32))
+    return GPUBatch(type="TRIS", buf=vertices, elem=indices)
+
+
+def _rows(count: int) -> int:
+    """Rows of a texture TEXTURE_WIDTH wide for `count` texels."""
+    return max(1, -(-count // TEXTURE_WIDTH))
 
 
 def _texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
     """Texels (M, C) as a texture TEXTURE_WIDTH wide, its last row filled with zeros."""
-    rows = max(1, -(-len(texels) // TEXTURE_WIDTH))
+    rows = _rows(len(texels))
     padded = np.zeros((rows * TEXTURE_WIDTH, texels.shape[1]), np.float32)
     padded[: len(texels)] = texels
     pixels = Buffer("FLOAT", padded.size, padded.reshape(-1))
@@ -176,9 +213,9 @@ def _image(texels: np.ndarray) -> Any:
     return GPUTexture((texels.shape[1], texels.shape[0]), format=EXACT, data=pixels)
 
 
-def _pixels(texture: Any) -> np.ndarray:
-    """(H, W, 4) float32, bottom row first."""
+def _pixels(texture: Any, channels: int) -> np.ndarray:
+    """(H, W, channels) float32, bottom row first."""
     buffer = texture.read()
     # Of several axes, a buffer tells numpy the wrong strides in some versions. The copy is made while it lives.
-    buffer.dimensions = (texture.height * texture.width * 4,)
-    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+    buffer.dimensions = (texture.height * texture.width * channels,)
+    return np.array(buffer, np.float32).reshape(texture.height, texture.width, channels)

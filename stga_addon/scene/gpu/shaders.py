@@ -1,7 +1,7 @@
 """GLSL of the splats, of their composition with a viewport, and the shaders made of it.
 
 Textures of `packing.py`, each 2048 texels wide and read by texel index:
-    orders   per instance: index of the splat (one channel)
+    orders   per splat drawn, farthest first: index of the splat (one channel)
     centers  per splat: xyz in its triangle's frame, index of the triangle
     axes     per splat: three axes times standard deviations; beside them opacity, random percentage, layer
     colors   per splat: spherical harmonics, then strain colors
@@ -9,6 +9,12 @@ Textures of `packing.py`, each 2048 texels wide and read by texel index:
     table    the view: focal lengths and principal point; width, height, number of clip planes; 6 clip planes;
              per layer: first color, first splat, colors per splat, degree; antialiased, strained, size, opacity
              threshold; three rows of the matrix to directions, with percentage, show selection, selected only
+
+Of these, the projection shader makes once per splat, in the order of drawing, what the corners of its rectangle read:
+    places   center in normalized device coordinates, depth in meters, standard deviations up to the rectangle's sides
+             (0: the splat is not drawn)
+    sides    the rectangle's two half axes in normalized device coordinates
+    shades   color in sRGB, opacity
 """
 
 from typing import Any
@@ -22,16 +28,20 @@ from .packing import CLIP_PLANES, LAYER_TEXELS, VIEW_TEXELS
 
 TEXTURE_WIDTH = 2048
 SPLAT_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
+PROJECTED_TEXTURES = ("places", "sides", "shades")
+BLOCK_SPLATS = 128
+"""Splats in an instance, a divisor of TEXTURE_WIDTH: GPUs, and software even more, are slow at tiny instances."""
 
 _DEFINES = f"""
 #define WIDTH {TEXTURE_WIDTH}
+#define BLOCK_SPLATS {BLOCK_SPLATS}
 #define VIEW_TEXELS {VIEW_TEXELS}
 #define LAYER_TEXELS {LAYER_TEXELS}
 #define CLIP_PLANES {CLIP_PLANES}
 #define FROZEN_COLOR vec3({", ".join(f"{channel:.6f}" for channel in FROZEN_COLOR_SRGB)})
 """
 
-_SPLAT_VERTEX = """
+_PROJECTION_FRAGMENT = """
 const float LOW_PASS_PX2 = 0.3;
 const float MIN_ALPHA = 1.0 / 255.0;
 
@@ -69,11 +79,12 @@ vec3 spherical_harmonics(int first, int degree, vec3 d)
 
 void main()
 {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* outside: all four corners in one point */
-  offset = vec2(0.0);
-  shade = vec4(0.0);
-  depth = 0.0;
-  int splat = int(texelFetch(orders, at(gl_InstanceID), 0).r);
+  place_out = sides_out = shade_out = vec4(0.0);
+  ivec2 texel = ivec2(gl_FragCoord.xy);
+  if (texel.y * WIDTH + texel.x >= count) {
+    return;
+  }
+  int splat = int(texelFetch(orders, texel, 0).r);
   vec4 center = texelFetch(centers, at(splat), 0);
   vec4 axis0 = texelFetch(axes, at(3 * splat), 0);
   vec4 axis1 = texelFetch(axes, at(3 * splat + 1), 0);
@@ -132,12 +143,23 @@ void main()
   float large = mean + spread, small = max(determinant / large, 1e-9);
   vec2 major = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
   float reach = sqrt(2.0 * log(opacity / MIN_ALPHA)) * 1.001;
-  offset = reach * corner;
-  vec2 pixel = focal * p.xy / p.z + principal
-             + offset.x * sqrt(large) * major + offset.y * sqrt(small) * vec2(-major.y, major.x);
-  shade = vec4(max(color, vec3(0.0)), opacity);
-  depth = p.z;
-  gl_Position = vec4(2.0 * pixel.x / image.x - 1.0, 1.0 - 2.0 * pixel.y / image.y, 0.0, 1.0);
+  vec2 pixel = focal * p.xy / p.z + principal, to_device = vec2(2.0, -2.0) / image.xy;
+  place_out = vec4(to_device * pixel + vec2(-1.0, 1.0), p.z, reach);
+  sides_out = reach * vec4(sqrt(large) * to_device * major, sqrt(small) * to_device * vec2(-major.y, major.x));
+  shade_out = vec4(max(color, vec3(0.0)), opacity);
+}
+"""
+
+_SPLAT_VERTEX = """
+void main()
+{
+  int index = gl_InstanceID * BLOCK_SPLATS + gl_VertexID / 4;
+  ivec2 texel = ivec2(index % WIDTH, index / WIDTH);
+  vec4 place = texelFetch(places, texel, 0), axes = texelFetch(sides, texel, 0);
+  offset = place.w * corner;
+  depth = place.z;
+  shade = texelFetch(shades, texel, 0);
+  gl_Position = vec4(place.xy + corner.x * axes.xy + corner.y * axes.zw, place.w > 0.0 ? 0.0 : 2.0, 1.0);
 }
 """
 
@@ -149,11 +171,11 @@ void main()
     discard;
   }
   color_out = vec4(shade.rgb * alpha, alpha);
-  depth_out = vec4(depth * alpha, 0.0, 0.0, alpha);
+  depth_out = vec4(depth * alpha, alpha, 0.0, alpha); /* the fourth is what blending reads */
 }
 """
 
-_COMPOSITE_VERTEX = """
+_SCREEN_VERTEX = """
 void main()
 {
   gl_Position = vec4(corner, 0.0, 1.0);
@@ -188,7 +210,7 @@ void main()
     discard;
   }
   /* From z along the view axis to the depth of the projection: (x + y·z) / (z + w·z), by its matrix. */
-  float z = distances.r / max(distances.a, 1e-9);
+  float z = distances.r / max(distances.g, 1e-9);
   gl_FragDepth = clamp(0.5 + 0.5 * (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z), 0.0, 1.0);
   if (part.x > 1.5) {
     color_final = vec4(splats.a * to_linear(behind.rgb), 0.0);
@@ -207,8 +229,24 @@ void main()
 """
 
 
+def projection_shader() -> Any:
+    """Fills PROJECTED_TEXTURES, as large as `orders`, for the first `count` splats; the rest is not drawn."""
+    info = GPUShaderCreateInfo()
+    info.typedef_source(_DEFINES)
+    info.vertex_in(0, "VEC2", "corner")
+    for slot, name in enumerate(("place_out", "sides_out", "shade_out")):
+        info.fragment_out(slot, "VEC4", name)
+    for slot, name in enumerate(SPLAT_TEXTURES):
+        info.sampler(slot, "FLOAT_2D", name)
+    for name in ("faces", "count"):
+        info.push_constant("INT", name)
+    info.vertex_source(_SCREEN_VERTEX)
+    info.fragment_source(_PROJECTION_FRAGMENT)
+    return gpu.shader.create_from_info(info)
+
+
 def splat_shader() -> Any:
-    """Draws instances of a strip of four corners; two color targets: sRGB premultiplied, and (depth · alpha, alpha)."""
+    """Draws instances of BLOCK_SPLATS rectangles; two color targets: sRGB premultiplied, and (depth · alpha, alpha)."""
     info = GPUShaderCreateInfo()
     info.typedef_source(_DEFINES)
     info.vertex_in(0, "VEC2", "corner")
@@ -219,9 +257,8 @@ def splat_shader() -> Any:
     info.vertex_out(passed)
     info.fragment_out(0, "VEC4", "color_out")
     info.fragment_out(1, "VEC4", "depth_out")
-    for slot, name in enumerate(SPLAT_TEXTURES):
+    for slot, name in enumerate(PROJECTED_TEXTURES):
         info.sampler(slot, "FLOAT_2D", name)
-    info.push_constant("INT", "faces")
     info.vertex_source(_SPLAT_VERTEX)
     info.fragment_source(_SPLAT_FRAGMENT)
     return gpu.shader.create_from_info(info)
@@ -241,6 +278,6 @@ def composite_shader() -> Any:
         info.sampler(slot, "FLOAT_2D", name)
     for name in ("corner_px", "to_depth", "behind", "part"):
         info.push_constant("VEC4", name)
-    info.vertex_source(_COMPOSITE_VERTEX)
+    info.vertex_source(_SCREEN_VERTEX)
     info.fragment_source(_COMPOSITE_FRAGMENT)
     return gpu.shader.create_from_info(info)
