@@ -25,7 +25,7 @@ from ..render.scene_splats import SplatCache, visible_layers
 from ..render.view_transform import keeps_colors
 from .front_bones import NO_BONES, front_bones
 from .packing import NEAR_M, View
-from .renderer import COMPACT, SplatRenderer
+from .renderer import SplatRenderer, fastest_format
 
 ENGINE = "STGA_SPLATS"
 """The render engine, which draws all splats in *Rendered* mode."""
@@ -96,7 +96,7 @@ class GpuDisplay:
                 self._renderer = None  # frees its textures
             return
         if self._renderer is None:
-            self._renderer = SplatRenderer(COMPACT)
+            self._renderer = SplatRenderer(fastest_format())
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
