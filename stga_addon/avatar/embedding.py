@@ -138,14 +138,14 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
         xyz=xyz.astype(np.float32),
         rotation=rotation.astype(np.float32),
         log_scale=log_scale.astype(np.float32),
-        sh=_strained(splats, frames),
+        sh=strained_sh(splats, frames),
         face=np.zeros_like(face),
         strain_color=no_strain_color(len(xyz)),
     )
 
 
-def _strained(splats: Splats, frames: FaceFrames) -> np.ndarray:
-    """The splats' `sh` including the color change by strain."""
+def strained_sh(splats: Splats, frames: FaceFrames) -> np.ndarray:
+    """The splats' `sh` (N, K, 3) including the color change by strain."""
     if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
         return splats.sh
     sh = splats.sh.copy()

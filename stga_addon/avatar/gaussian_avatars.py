@@ -8,10 +8,10 @@ import numpy as np
 from ..errors import StgaError
 from ..files import write_npz
 from ..flame.sequence import FlameSequence
-from .embedding import face_frames, to_local, to_world
+from .embedding import face_frames, strained_sh, to_local, to_world
 from .file import Avatar
 from .ply import PROPERTIES, splat_columns, write_columns
-from .splats import Splats
+from .splats import Splats, no_strain_color
 
 PLY_NAME = "point_cloud.ply"
 MOTION_NAME = "flame_param.npz"
@@ -40,17 +40,21 @@ def in_convention(avatar: Avatar, convention: str) -> Splats:
     """The avatar's splats in the frames of another convention, at the same places on the neutral mesh.
 
     Both conventions have their origin at the centroid, which is left out for precision. On deformed triangles the
-    conventions scale differently, and so do the splats.
+    conventions scale differently, and so do the splats. Colors are those of the neutral mesh.
     """
+    splats = avatar.splats
+    if splats.strain_color.shape[1]:
+        sh = strained_sh(splats, avatar.frames(avatar.neutral))
+        splats = replace(splats, sh=sh, strain_color=no_strain_color(len(sh)))
     if convention == avatar.convention:
-        return avatar.splats
+        return splats
     here, there = (
         replace(frames, origin=np.zeros_like(frames.origin))
         for frames in (
             face_frames(avatar.neutral, avatar.faces, avatar.neutral, name) for name in (avatar.convention, convention)
         )
     )
-    return to_local(to_world(avatar.splats, here), there, avatar.splats.face)
+    return to_local(to_world(splats, here), there, splats.face)
 
 
 def motion_arrays(sequence: FlameSequence) -> dict[str, np.ndarray]:

@@ -10,9 +10,14 @@ STRAIN_COMPONENTS = 3
 """Stretch along two directions of the triangle's plane, and the shear between them."""
 STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
 """Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
-COLOR_RANGE = np.array([[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [0, 0, MAX_STRAIN]], np.float32)
+MIN_COMPRESSION = 0.2
+"""Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly noise."""
+COLOR_RANGE = np.array(
+    [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN]], np.float32
+)
 """Lowest and highest strain that colors are trained to follow. Folds and their shadows come with compression and shear;
-a color fitted to little compression is not to be continued into stretch."""
+a color fitted to compression is not to be continued into stretch. Within this range, a mesh at rest has
+−MIN_COMPRESSION, not 0: a constant share of the colors, which the splats' `sh` are trained beside."""
 RANGE_MARGIN = 1.2
 """A triangle's range of strain, as a multiple of what was seen: training may have seen a few timesteps more than were
 measured, and refined tracking moves them."""
@@ -102,20 +107,22 @@ def _full_range(count: int) -> np.ndarray:
 
 
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
-    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), times RANGE_MARGIN.
+    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), RANGE_MARGIN times as far
+    from that of the neutral mesh.
 
-    It includes 0, the neutral mesh, and stays within that of the basis. Colors fitted to a few expressions are not
+    It includes the neutral mesh, and stays within that of the basis. Colors fitted to a few expressions are not
     extrapolated to stronger ones.
     """
-    seen = np.zeros((len(basis.faces), 2, STRAIN_COMPONENTS), np.float32)
+    rest = np.clip(np.float32(0), basis.range[:, 0], basis.range[:, 1])
+    seen = np.stack([rest, rest], axis=1)
     for mesh in meshes:
-        strain = np.float32(RANGE_MARGIN) * face_strain(basis, mesh)
+        strain = rest + np.float32(RANGE_MARGIN) * (face_strain(basis, mesh) - rest)
         seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], strain), np.maximum(seen[:, 1], strain)
     return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
 
 
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
-    """Strain (F, 3) float32 of every triangle of a posed mesh: 5·E within its range; 0 for a mesh moved rigidly.
+    """Strain (F, 3) float32 of every triangle of a posed mesh: 5·E within its range; E = 0 for a mesh moved rigidly.
 
     vertices (V, 3) meters. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the posed mesh, averaged
     over the triangles that touch a triangle (each vertex's mean over its triangles, then the mean of its three

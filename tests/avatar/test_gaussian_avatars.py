@@ -137,6 +137,20 @@ def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.nd
     return turn @ row["xyz"] * size + (p + q + r) / 3, axes @ axes.T
 
 
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
+    """Catches a pair that leaves out what strain color adds at rest: the least compression that it follows is not 0."""
+    avatar = avatar_on(sequence, convention)
+    strain_color = np.random.default_rng(1).normal(0, 0.2, (50, 3, 3)).astype(np.float32)
+    limits = np.broadcast_to(np.array([[-1, -1, -1], [-0.2, -0.2, 1]], np.float32), (len(avatar.faces), 2, 3)).copy()
+    avatar = replace(avatar, splats=replace(avatar.splats, strain_color=strain_color), strain_range=limits)
+    write_gaussian_avatars(tmp_path, avatar, sequence)
+    written = bound_splats(tmp_path / "point_cloud.ply").sh
+    added = -0.2 * (strain_color[:, 0] + strain_color[:, 1]) / 0.28209479177387814
+    np.testing.assert_allclose(written[:, 0], avatar.splats.sh[:, 0] + added, atol=1e-5)
+    np.testing.assert_array_equal(written[:, 1:], avatar.splats.sh[:, 1:])
+
+
 def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence):
     """Catches a conversion that is only approximately right, checked by the viewer's own arithmetic."""
     avatar = avatar_on(sequence, "stga")

@@ -165,6 +165,22 @@ def test_a_camera_that_does_not_fit_is_named(recorded, capsys):
     assert not (folder / "out/transforms_train.json").exists()
 
 
+def test_a_mirrored_rig_is_named(recorded, capsys, head):
+    """Catches images that are all mirrored, where no camera stands out from the others."""
+    folder, meshes = recorded
+    template, faces = head.model.v_template, head.model.faces
+    twins, _ = nearest_points(template, faces, places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1])
+    for number, camera in enumerate(rig()):
+        path = folder / f"points/cam{number}.npz"
+        points = np.stack([camera.project(twins.on(mesh, faces))[0] for mesh in meshes])
+        points[..., 0] = SIZE - points[..., 0]  # a detector calls the left eye of a mirrored face its right one
+        write_npz(path, dict(np.load(path)) | {"points": points})
+    assert command(folder) == 2
+    message = capsys.readouterr().err
+    assert re.search(r"camera cam\d: .* pixels at timestep \d, and those of the other cameras are too; check", message)
+    assert not (folder / "out/transforms_train.json").exists()
+
+
 def test_a_camera_out_of_step_is_named(recorded, capsys):
     """Catches a camera that was started later, whose head is averaged into everyone's."""
     folder, _ = recorded

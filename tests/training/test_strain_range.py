@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.strain import COLOR_RANGE, color_range, face_strain, strain_basis
+from stga_addon.avatar.strain import COLOR_RANGE, MIN_COMPRESSION, color_range, face_strain, strain_basis
 from stga_addon.capture.model import Capture
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.run import strain_range as module
@@ -55,7 +55,7 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
     assert alone is not None
     assert both is not None
     np.testing.assert_array_equal(both[:, 0], np.minimum(alone[:, 0], -0.5))
-    np.testing.assert_array_equal(both[:, 1, :2], 0)  # a parent whose colors followed stretch
+    np.testing.assert_array_equal(both[:, 1, :2], np.float32(-MIN_COMPRESSION))  # its parent followed stretch
     np.testing.assert_array_equal(both[:, 1, 2], np.maximum(alone[:, 1, 2], np.float32(0.01)))
     write_avatar(tmp_path / "avatar.npz", replace(parent, strain_range=None))
     unlimited = trained_strain_range(toy, lambda t: deformed(toy, t), continuation)
@@ -63,15 +63,16 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
 
 
 def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> None:
-    """Catches wrinkles of compressed skin that show with the opposite sign where it is stretched, in the frames that
-    training renders or in the avatar's range."""
+    """Catches wrinkles of compressed skin that show with the opposite sign where it is stretched, or that begin with
+    the least compression, in the frames that training renders or in the avatar's range."""
     basis = FrameStore(toy, "stga", strain=True).strain
     assert basis is not None
-    larger, smaller = (face_strain(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.95))
-    np.testing.assert_array_equal(larger[:, :2], 0)
-    assert (smaller[:, :2] < -0.2).all()
+    larger, little, smaller = (face_strain(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9))
+    np.testing.assert_array_equal(larger[:, :2], np.float32(-MIN_COMPRESSION))
+    np.testing.assert_array_equal(little[:, :2], np.float32(-MIN_COMPRESSION))
+    assert (smaller[:, :2] < -0.4).all()
     limits = trained_strain_range(toy, lambda t: 1.05 * np.asarray(toy.neutral), None)
-    np.testing.assert_array_equal(limits[:, 1, :2], 0)
+    np.testing.assert_array_equal(limits[:, :, :2], np.float32(-MIN_COMPRESSION))
     sheared = np.asarray(toy.neutral) @ np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]])
     shear = face_strain(basis, sheared)[:, 2]
     assert shear.min() < -0.05
