@@ -569,7 +569,7 @@ def test_interpreter_is_looked_up_by_the_main_thread(monkeypatch):
             raise answer
         return answer
 
-    interpreter = engine.Interpreter(find, lambda: "cpu")
+    interpreter = engine.RenderEnvironment(find, lambda: "cpu")
     interpreter.update()
     with pytest.raises(StgaError, match="no environment"):
         interpreter.path()
