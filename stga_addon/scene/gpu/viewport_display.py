@@ -87,7 +87,7 @@ class GpuDisplay:
         space, depsgraph = context.space_data, context.evaluated_depsgraph_get()
         if is_drawn_by_engine(context):
             return
-        everything = is_engine_view(context)
+        everything = is_engine_view(context)  # and nothing else, although its depth buffer has other displays of splats
         layers = visible_layers(
             depsgraph, self._cache, space, lambda shown: everything or display_mode(shown) == AS_TRAINED
         )
@@ -103,7 +103,7 @@ class GpuDisplay:
         is_plain = space.shading.type in ("SOLID", "WIREFRAME") or keeps_colors(context.scene)
         bones = front_bones(space, context.region_data, width, height) if is_plain else NO_BONES
         self._renderer.composite(
-            (x, y), to_depth, expected_background(context), has_scene_depth(space),
+            (x, y), to_depth, expected_background(context), has_scene_depth(space) and not everything,
             bones, self._scene_target, background_source(context) != "SCENE",
         )  # fmt: skip
 
