@@ -1,12 +1,14 @@
 """Compares ways to extend an avatar by a take, and to refine a region of it, at equal training time.
 
     python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2] [--refine mouth]
+                                [--arms extend all-in-turn anew refine] [--parent RUN]
 
 The training timesteps are split into two takes, alternating by how much of the face moves. An avatar is trained on the
-first; each arm then continues it for the same time, but training anew on both takes has three times as long. PSNR of
-held-out views in dB: whole image and moving region of the old and the new take; with --refine, of the region. Ends with
-a table of all seeds. --clock cpu counts processor time, for a machine that others use: set NUMBA_NUM_THREADS=1 with it.
-Runs and figures stay in --folder; the training on the first take is not repeated.
+first; each arm then continues it for the same time, but training anew on both takes has three times as long. With
+--refine, arms that train this region of the same avatar follow; --parent refines a finished run instead. PSNR of
+held-out views in dB: whole image and moving region of the old and the new take, and the region. Ends with a table of
+all seeds and the differences that matter. --clock cpu counts processor time, for a machine that others use: set
+NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first take is not repeated.
 """
 
 import argparse
@@ -75,28 +77,38 @@ def main() -> None:
     parser.add_argument("--base", type=int, default=1500, help="iterations on the first take")
     parser.add_argument("--seconds", type=float, default=60.0, help="time of each arm")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--refine", metavar="REGION", help="compare refinements of this region instead")
+    parser.add_argument("--refine", metavar="REGION", help="compare refinements of this region, too")
+    parser.add_argument("--parent", type=Path, metavar="RUN", help="a finished run to refine, instead of extending one")
     parser.add_argument("--arms", nargs="+", help="only these (names as in the table)")
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     parser.add_argument("--folder", type=Path, default=Path("out/extend"))
     options = parser.parse_args()
     precompile_kernels()
-    old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
-    runs: dict[str, list[list[Line]]] = {}
+    options.folder.mkdir(parents=True, exist_ok=True)
+    runs: dict[str, dict[str, list[list[Line]]]] = {}
     for seed in options.seeds:
+        for kind, prepared, arms in comparisons(options, seed):
+            for name, arm in arms.items():
+                if not options.arms or name in options.arms:
+                    runs.setdefault(kind, {}).setdefault(name, []).append(compare(name, prepared, arm, options))
+    for of_kind in runs.values():
+        print("\n".join(["", *table(of_kind), "", *differences(of_kind)]))
+
+
+def comparisons(options: argparse.Namespace, seed: int) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
+    """What is compared with one seed: "extend" and, where a region is given, "refine"; the arms of each."""
+    parent = options.parent
+    if parent is None:
+        old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
         parent = trained(old, options, seed)
-        print(f"seed {seed}, {parent}", flush=True)
-        if options.refine:
-            wanted = Refinement(parent, options.refine, seconds=options.seconds, seed=seed)
-            prepared, arms = prepare_refinement(wanted, "cpu"), refine_arms
-        else:
-            wanted = Extension(parent, (new,), seconds=options.seconds, seed=seed)
-            prepared, arms = prepare_extension(wanted, "cpu"), extend_arms
-            prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
-        for name, arm in arms(prepared, seed).items():
-            if not options.arms or name in options.arms:
-                runs.setdefault(name, []).append(compare(name, prepared, arm, options))
-    print("\n".join(table(runs)))
+        wanted = Extension(parent, (new,), seconds=options.seconds, seed=seed)
+        prepared = prepare_extension(wanted, "cpu")
+        prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
+        yield "extend", prepared, extend_arms(prepared, seed)
+    if options.refine:
+        refinement = Refinement(parent, options.refine, seconds=options.seconds, seed=seed)
+        prepared = prepare_refinement(refinement, "cpu", options.flame)
+        yield "refine", prepared, refine_arms(prepared, seed)
 
 
 def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Path]:
@@ -254,6 +266,29 @@ def table(runs: dict[str, list[list[Line]]]) -> list[str]:
         rows.append(row)
     rows.insert(1, ["---"] * len(rows[0]))
     return ["| " + " | ".join(row) + " |" for row in rows]
+
+
+def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
+    """One line each, over seeds: what the continuation gains over all splats, forgets, and needs of the time anew."""
+
+    def gain(name: str, figure: str, over: str | None) -> str:
+        ends = [lines[-1][f"psnr_{figure}"] for lines in runs[name]]
+        others = [lines[0] for lines in runs[name]] if over is None else [lines[-1] for lines in runs[over]]
+        return spread([end - other[f"psnr_{figure}"] for end, other in zip(ends, others, strict=True)])
+
+    found = []
+    if {"extend", "all-in-turn"} <= set(runs):
+        found += [
+            f"{figure}: extend over all-in-turn {gain('extend', figure, 'all-in-turn')} dB, "
+            f"over before {gain('extend', figure, None)}, all-in-turn over before {gain('all-in-turn', figure, None)}"
+            for figure in FIGURES[:4]
+        ]
+    if {"extend", "anew"} <= set(runs):
+        pairs = list(zip(runs["extend"], runs["anew"], strict=True))
+        shares = [time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"] for lines, anew in pairs]
+        found.append(f"98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time")
+    found += [f"region: {name} over before {gain(name, 'region', None)} dB" for name in runs if "refine" in name]
+    return found
 
 
 def spread(values: list[float], digits: int = 2) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 FRAMES = range(1, 9)
-CASES = (("As Trained", "SOLID"), ("Points", "SOLID"), ("As Trained", "MATERIAL"), ("Points", "MATERIAL"))
+SHADINGS = "SOLID", "MATERIAL"
 
 
 def arguments() -> argparse.Namespace:
@@ -70,16 +70,19 @@ def measure(splats: int, rounds: int) -> Iterator[None]:
     area = next(area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D")
     space = area.spaces.active
     space.region_3d.view_location, space.region_3d.view_distance = (0.0, 0.0, 0.0), 0.5
-    displays = import_module("stga_addon.scene.display.splat_object")
-    times: dict[tuple[str, str], list[float]] = {case: [] for case in CASES}
+    set_input = import_module("stga_addon.scene.display.splat_object").set_input
+    display = import_module("stga_addon.scene.display.splat_nodes").DISPLAY
+    modes = import_module("stga_addon.scene.display.display_modes")
+    cases = [(mode, shading) for shading in SHADINGS for mode in (modes.AS_TRAINED, modes.POINTS)]
+    times: dict[tuple[str, str], list[float]] = {case: [] for case in cases}
     for _ in range(rounds):
-        for mode, shading in CASES:
-            displays.set_input(shown, "Display", mode)
+        for mode, shading in cases:
+            set_input(shown, display, mode)
             space.shading.type = shading
             yield
             times[mode, shading] += frame_times()
-    for shading in ("SOLID", "MATERIAL"):
-        trained, points = (statistics.median(times[mode, shading]) for mode in ("As Trained", "Points"))
+    for shading in SHADINGS:
+        trained, points = (statistics.median(times[mode, shading]) for mode in (modes.AS_TRAINED, modes.POINTS))
         print(
             f"{splats} splats, {shading}: as trained {trained:.0f} ms, points {points:.0f} ms, "
             f"ratio {trained / points:.2f}",

@@ -58,11 +58,13 @@ class Command:
     arguments  of the command
     show       puts what it printed into the scene; may raise StgaError
     error      property of the scene's settings that says why it failed, empty where it did not
+    changes_head  whether `show` changes the head's mesh, which has to wait until that leaves Edit Mode
     """
 
     arguments: list[str]
     show: Callable[[Any, str], None]
     error: str
+    changes_head: bool = False
 
 
 _running: dict[int, tuple[Command, _Process]] = {}
@@ -75,6 +77,7 @@ def start(context: Any, command: Command) -> None:
     Raises StgaError where it was waited for and failed.
     """
     process = _Process(training_python(context), ["stga_addon", *command.arguments])
+    setattr(getattr(context.scene, ids.SETTINGS), command.error, "")
     if not monitor.has_timer():
         _show(context.scene, command, process)
         if message := getattr(getattr(context.scene, ids.SETTINGS), command.error):
@@ -89,6 +92,15 @@ def running(scene: Any) -> Command | None:
     """The scene's command that has not finished yet."""
     command, _ = _running.get(scene.session_uid, (None, None))
     return command
+
+
+def is_waiting(scene: Any) -> bool:
+    """Whether the scene's command has finished and is shown once the head leaves Edit Mode."""
+    command, process = _running.get(scene.session_uid, (None, None))
+    if command is None or process is None or process.is_running:
+        return False
+    head = getattr(scene, ids.SETTINGS).head
+    return command.changes_head and head is not None and head.mode == "EDIT"
 
 
 def needs_idle(operator: Any, context: Any) -> bool:
@@ -119,6 +131,8 @@ def tick() -> float | None:
         return CHECK_INTERVAL_S
     scenes = {scene.session_uid: scene for scene in bpy.data.scenes}
     for uid in [uid for uid, (_, process) in _running.items() if not process.is_running]:
+        if uid in scenes and is_waiting(scenes[uid]):
+            continue
         command, process = _running.pop(uid)
         if uid in scenes:
             _show(scenes[uid], command, process)

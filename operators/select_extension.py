@@ -50,7 +50,7 @@ class SelectExtension(bpy.types.Operator):
         arguments = ["extend", str(run), take, "--select-only", str(found)]
         if head.get(tags.FLAME_MODEL):
             arguments += ["--flame", head[tags.FLAME_MODEL]]
-        background.start(context, Command(arguments, show, "extension_error"))
+        background.start(context, Command(arguments, show, "extension_error", changes_head=True))
         return {"FINISHED"}
 
 

@@ -4,9 +4,10 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..operators import background, ids
+from ..operators import ids
 from ..operators.common import is_head, scene_settings
 from ..stga_addon.scene.display.heat_map import shows_residuals
+from .effects import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
 from .train_panel import TrainPanel
@@ -64,11 +65,7 @@ def _draw_extend(layout: Any, context: Any, settings: Any) -> None:
     extend = column.operator(ids.EXTEND, icon="ADD")
     extend.directory, extend.device, extend.take = settings.run_folder, settings.device, settings.take
     extend.adapter, extend.seconds = settings.adapter, settings.extend_seconds
-    if background.running(context.scene):
-        row = column.row(align=True)
-        row.label(text="Analyzing…", icon="VIEWZOOM")
-        row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
-    else:
+    if not draw_running(column, context):
         column.operator(ids.SELECT_EXTENSION, icon="GROUP_VERTEX").directory = settings.run_folder
     if settings.extension_error:
         draw_text(column, context, settings.extension_error, "ERROR")

@@ -10,6 +10,17 @@ from .sidebar import SidebarPanel
 from .text import draw_text
 
 
+def draw_running(layout: Any, context: Any) -> bool:
+    """Draw the command that runs for the scene, with its cancel button; returns False where none runs."""
+    if not background.running(context.scene):
+        return False
+    row = layout.row(align=True)
+    waits = background.is_waiting(context.scene)
+    row.label(text="Done: leave Edit Mode to see it" if waits else "Analyzing…", icon="INFO" if waits else "VIEWZOOM")
+    row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
+    return True
+
+
 class EffectsPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "STGA_PT_effects"
     bl_label = "Effects"
@@ -18,11 +29,7 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
-        if background.running(context.scene):
-            row = layout.row(align=True)
-            row.label(text="Analyzing…", icon="VIEWZOOM")
-            row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
-        else:
+        if not draw_running(layout, context):
             layout.operator(ids.ANALYZE_CAPTURE, icon="VIEWZOOM")
         if settings.analysis_error:
             draw_text(layout, context, settings.analysis_error, "ERROR")

@@ -98,6 +98,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         if mode == AS_TRAINED:
             layout.operator(ids.PREVIEW_IMAGES, icon="SHADING_RENDERED")
             return
+        if viewport_display.is_engine_view(context):  # shows every display as trained
+            return
         draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
         if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
             layout.label(text="Solid mode shows no splat colors", icon="INFO")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .splats import SH_C0, Splats, no_strain_color, unit_quaternions
-from .strain import StrainBasis, edge_strain
+from .strain import StrainBasis, gram_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 MIN_DIVISOR = 1e-30
@@ -75,7 +75,9 @@ def face_frames(
         scale = (edge + np.where(no_edge, side, triangles.twice_area / np.where(no_edge, 1.0, edge))) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
-    deformed = np.zeros((len(faces), 0), np.float32) if strain is None else edge_strain(strain, to_p1, to_p2)
+    deformed = np.zeros((len(faces), 0), np.float32)
+    if strain is not None:
+        deformed = gram_strain(strain, triangles.squared[0], _dot(to_p1, to_p2), triangles.squared[1])
     p0, p1, p2 = triangles.corners
     origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
     for column, axis in enumerate(axes):
@@ -101,7 +103,7 @@ def frame_backward(
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _longest_squared(_edges(corners.transpose(1, 2, 0))), MIN_DIVISOR)
+    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _largest(_squared(_edges(corners.transpose(1, 2, 0)))), MIN_DIVISOR)
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
     # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left, over twice the area.
     slope_x, slope_y = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area, (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
@@ -211,31 +213,36 @@ def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
 
 
 class _Triangles(NamedTuple):
-    """corners (3 corners, 3, F); edges p1 − p0, p2 − p0 and p2 − p1, each (3, F); normal (3, F), as long as twice the
-    area; twice_area (F,); longest_squared (F,), of the edges."""
+    """corners (3 corners, 3, F); edges p1 − p0, p2 − p0 and p2 − p1, each (3, F), their squared lengths (F,) and the
+    largest of these; normal (3, F), as long as twice the area; twice_area (F,)."""
 
     corners: np.ndarray
     edges: tuple[np.ndarray, np.ndarray, np.ndarray]
+    squared: tuple[np.ndarray, np.ndarray, np.ndarray]
+    longest_squared: np.ndarray
     normal: np.ndarray
     twice_area: np.ndarray
-    longest_squared: np.ndarray
 
 
 def _triangles(vertices: np.ndarray, faces: np.ndarray) -> _Triangles:
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     corners = np.take(rows, np.ascontiguousarray(faces.T), axis=1).transpose(1, 0, 2)
     edges = _edges(corners)
-    normal = _cross(edges[0], edges[1])
-    return _Triangles(corners, edges, normal, _length(normal), _longest_squared(edges))
+    squared, normal = _squared(edges), _cross(edges[0], edges[1])
+    return _Triangles(corners, edges, squared, _largest(squared), normal, _length(normal))
 
 
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return corners[1] - corners[0], corners[2] - corners[0], corners[2] - corners[1]
 
 
-def _longest_squared(edges: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+def _squared(edges: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first, second, third = (_dot(edge, edge) for edge in edges)
-    return np.asarray(np.maximum(np.maximum(first, second), third))
+    return first, second, third
+
+
+def _largest(values: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    return np.asarray(np.maximum(np.maximum(values[0], values[1]), values[2]))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

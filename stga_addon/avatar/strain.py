@@ -130,13 +130,14 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     """
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     p0, p1, p2 = np.take(rows, basis.corners, axis=1).transpose(1, 0, 2)
-    return edge_strain(basis, p1 - p0, p2 - p0)
+    e1, e2 = p1 - p0, p2 - p0
+    return gram_strain(basis, _row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2))
 
 
-def edge_strain(basis: StrainBasis, e1: np.ndarray, e2: np.ndarray) -> np.ndarray:
-    """`face_strain` from the posed triangles' edges (3, F), p1 − p0 and p2 − p0, in meters."""
+def gram_strain(basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.ndarray) -> np.ndarray:
+    """`face_strain` from scalar products (F,) of the posed triangles' edges p1 − p0 and p2 − p0, in square meters."""
     # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time of short columns.
-    change = np.asarray(np.stack([_row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2)]) - basis.gram.T, np.float32)
+    change = np.asarray(np.stack([d11, d12, d22]) - basis.gram.T, np.float32)
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
     tensors = np.ascontiguousarray(tensor.T)  # as rows again: what is gathered lies side by side
     at_vertex = np.take(tensors, basis.touching[0], axis=0)

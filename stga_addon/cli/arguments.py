@@ -11,7 +11,7 @@ from typing import Any
 
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..jobs.delegate import OpenHead
-from ..training.settings import is_device
+from ..raster.device import is_device
 
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""

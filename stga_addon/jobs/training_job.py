@@ -22,11 +22,11 @@ from ..capture.open import open_capture
 from ..capture.region import write_region
 from ..errors import StgaError, shorten
 from ..files import read_json, write_json, write_npz
-from ..raster.device import choose_device
+from ..raster.device import choose_device, is_device
 from ..training.run.folder import SELECTION, Run, read_run
 from ..training.run.open_run import device_of, open_run
 from ..training.run.request import Extension, Request, request_from_json, request_to_json
-from ..training.settings import TrainingSettings, from_json, is_device, to_json
+from ..training.settings import TrainingSettings, from_json, to_json
 from ..worker.launch import prepare_status_folder
 from ..worker.status import StatusWriter, remove_status_folder, status_writer
 
@@ -45,7 +45,7 @@ class TrainingJob:
     """What to train.
 
     settings  None to resume the run in the folder, or to continue another one
-    device    as `settings.is_device` allows; "auto" resumes a run on the device that it was trained on
+    device    as `raster.device.is_device` allows; "auto" resumes a run on the device that it was trained on
     continues what is asked of a run that continues another one, which the folder is to hold
     """
 

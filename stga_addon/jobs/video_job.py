@@ -17,9 +17,9 @@ from ..capture.camera import Camera
 from ..errors import StgaError, shorten
 from ..files import check_writable, read_json, write_json
 from ..raster.compose import Composer
+from ..raster.device import is_device
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..raster.render_protocol import pack_layers, receive, send, unpack_layers
-from ..training.settings import is_device
 from ..worker.launch import prepare_status_folder
 from ..worker.status import remove_status_folder, status_writer
 

@@ -2,7 +2,7 @@
 
 from functools import cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..errors import StgaError
 
@@ -11,6 +11,16 @@ if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
 
 GPU = "gpu:"
 """Before the adapter's name in a device."""
+DEVICES = ("auto", "cpu", "gpu")
+"""Choices of `choose_device`, beside "gpu:NAME"."""
+MAX_DEVICE_LENGTH = 255
+
+
+def is_device(value: Any) -> bool:
+    """Whether a value is one of DEVICES or "gpu:" and a name."""
+    if not isinstance(value, str):
+        return False
+    return value in DEVICES or (value.startswith(GPU) and len(GPU) < len(value) <= MAX_DEVICE_LENGTH)
 
 
 def choose_device(wanted: str, task: str = "Training") -> tuple[str, str]:

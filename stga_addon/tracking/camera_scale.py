@@ -10,8 +10,8 @@ from .landmarks import CameraLandmarks
 from .mesh_image import vertex_normals
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
 
-MAX_SCALE_DIFFERENCE = 0.04
-"""Of a camera from the median of all. Landmarks alone differ by up to 0.036 from the side; 5 % of focal length show."""
+MAX_SCALE_DIFFERENCE = 0.043
+"""Of a camera from the median of all. Landmarks alone differ by up to 0.041 from the side; 5 % of focal length show."""
 MIN_CAMERAS = 4
 MIN_VISIBILITY = 0.1
 """Squared cosine of the angle at which a camera sees a landmark's surface, below which the landmark is not used."""

@@ -18,8 +18,6 @@ CONTINUATIONS = ("refine", "extend")
 """Strategies of runs that continue a finished one (`run.continuation`)."""
 SCHEDULES = ("default", "paper")
 GLOBAL_UNITS = ("iteration", "frame")
-DEVICES = ("auto", "cpu", "gpu")
-"""Choices of `choose_device`, beside "gpu:NAME". Not part of the settings: a run may be continued on another device."""
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
 MAX_RATE = 1e3
@@ -245,11 +243,6 @@ def validate(settings: TrainingSettings) -> None:
     if effects and (settings.schedule == "paper" or settings.strategy == "gaussian-avatars"):
         other = "--schedule paper" if settings.schedule == "paper" else "--strategy gaussian-avatars"
         raise StgaError(f"--effect cannot be combined with {other}")
-
-
-def is_device(value: Any) -> bool:
-    """Whether a value is one of DEVICES or "gpu:" and a name."""
-    return isinstance(value, str) and (value in DEVICES or (4 < len(value) < 256 and value.startswith("gpu:")))
 
 
 def to_json(settings: TrainingSettings) -> dict[str, Any]:

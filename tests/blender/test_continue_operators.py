@@ -168,6 +168,30 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
     assert not any(temporary.iterdir())
 
 
+def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypatch, tmp_path):
+    """Catches a result that is thrown away because the head is being edited, and an old error beside a new command."""
+    write_npz(tmp_path / "given.npz", {"00000": np.ones(len(head.data.polygons), bool)})
+    program = write_interpreter(
+        tmp_path / "python", f"import shutil\nshutil.copy({str(tmp_path / 'given.npz')!r}, sys.argv[-1])"
+    )
+    background, settings = extension.operators.background, bpy.context.scene.stga
+    monkeypatch.setattr(background, "training_python", lambda context: program)
+    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    bpy.context.view_layer.objects.active = head
+    bpy.ops.object.mode_set(mode="EDIT")
+    settings.extension_error = "of last time"
+    assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
+    assert settings.extension_error == ""
+    background._running[bpy.context.scene.session_uid][1]._thread.join(60)
+    assert background.is_waiting(bpy.context.scene)
+    assert background.tick() is not None
+    assert "stga_0" not in head.vertex_groups
+    bpy.ops.object.mode_set(mode="OBJECT")
+    tick_until_done(extension)
+    assert settings.extension_error == ""
+    assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
+
+
 @pytest.mark.slow
 def test_refine_and_extend_end_to_end(head, tmp_path):
     """Catches a job that the worker does not understand, and an avatar that is not that of the continued run."""

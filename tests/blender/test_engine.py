@@ -24,6 +24,7 @@ from stga_addon.scene.compat import choose_image_file, enable_nodes  # noqa: E40
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
 from stga_addon.scene.render import engine, view_transform  # noqa: E402
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
 from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
@@ -485,6 +486,17 @@ def test_changed_topology_is_refused():
         bpy.ops.render.render()
 
 
+def test_a_head_in_edit_mode_is_named():
+    """Catches a head that is being edited and is said to have other triangles than its splats."""
+    _, head = show(avatar_of("stga", 10))
+    bpy.context.view_layer.objects.active = head
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(StgaError, match="head: is in Edit Mode; head splats are drawn again when you leave it"):
+        visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
+
+
 @pytest.mark.parametrize(
     ("stage", "raised", "message"),
     [
@@ -569,7 +581,7 @@ def test_interpreter_is_looked_up_by_the_main_thread(monkeypatch):
             raise answer
         return answer
 
-    interpreter = engine.Interpreter(find, lambda: "cpu")
+    interpreter = engine.RenderEnvironment(find, lambda: "cpu")
     interpreter.update()
     with pytest.raises(StgaError, match="no environment"):
         interpreter.path()

@@ -57,10 +57,10 @@ def test_depth_of_a_view(is_perspective):
     assert (view.near, view.far) == pytest.approx((0.1 + back, 10 + back), rel=1e-5)
 
 
-@pytest.mark.parametrize("distance", [0.5, 1000.0])
+@pytest.mark.parametrize("distance", [0.5, 2.0, 1000.0])
 @pytest.mark.parametrize("spread", [0.2, 400.0])
 def test_drawing_order(distance, spread):
-    """Catches splats out of order, whatever their distance and depth, and those behind the camera."""
+    """Catches splats out of order, by keys of either length, and those behind the camera."""
     rng = np.random.default_rng(1)
     splats = random_splats(1, 3000)
     xyz = rng.normal(0, spread / 4, (3000, 3)).astype(np.float32)

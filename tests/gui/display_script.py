@@ -117,6 +117,11 @@ def pictures(shown: Any) -> None:
     scene.view_settings.view_transform = "Filmic"
     scene.render.engine, space.shading.type = engine.ENGINE, "RENDERED"
     picture("engine filmic")
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
+    space.overlay.show_overlays = True
+    picture("engine filmic points")
+    set_input(shown, splat_nodes.DISPLAY, AS_TRAINED)
+    space.overlay.show_overlays = False
     scene.view_settings.view_transform = "Standard"
     picture("engine")
     scene.render.engine = "BLENDER_WORKBENCH"

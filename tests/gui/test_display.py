@@ -95,7 +95,7 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
     assert psnr_db(found, picture) >= MIN_PSNR_DB
 
 
-@pytest.mark.parametrize("name", ["material agx", "engine filmic"])
+@pytest.mark.parametrize("name", ["material agx", "engine filmic", "engine filmic points"])
 def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: str) -> None:
     """Catches splats that AgX or Filmic changes, in a mode that goes through the scene's view transform."""
     folder, result = shown

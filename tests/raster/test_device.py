@@ -8,8 +8,7 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.raster import device as device_module
-from stga_addon.raster.device import adapter_names, choose_device
-from stga_addon.training.settings import is_device
+from stga_addon.raster.device import adapter_names, choose_device, is_device
 
 pytest.importorskip("wgpu")
 

@@ -22,8 +22,10 @@ LAYER_TEXELS = 5
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
 
-MAX_SORT_KEY = (1 << 24) - (1 << 8)
-"""Of 24 bits, less what rounding may add."""
+MAX_SHORT_KEY, MAX_LONG_KEY = (1 << 16) - 1, (1 << 24) - (1 << 8)
+"""Depths to sort by, of 16 bits and of 24, as many as float32 has, less what rounding may add."""
+MAX_RELATIVE_STEP = 1e-5
+"""Largest step of depth between short keys as a share of the nearest splat's: 5 µm at 0.5 m."""
 
 
 @dataclass(frozen=True)
@@ -153,16 +155,26 @@ def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.n
         depth = depth[chosen]
     if not len(depth):
         return np.empty(0, np.float32)
-    # Keys of 24 bits, as many as float32 has, sorted in two stable passes of 8 and 16, for which numpy uses radix sort.
-    # Fewer bits would swap close splats.
-    nearest, farthest = float(depth.min()), float(depth.max())
-    depth -= np.float32(nearest)
-    depth *= np.float32(MAX_SORT_KEY / max(farthest - nearest, 1e-30))
-    key = depth.astype(np.uint32)
-    order = np.argsort(key.astype(np.uint8), kind="stable")
-    order = order[np.argsort((key >> 8).astype(np.uint16)[order], kind="stable")]
+    order = _ascending(depth, frames.base)
     # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
     return np.asarray(order[::-1] if chosen is None else chosen[order[::-1]], np.float32)
+
+
+def _ascending(depth: np.ndarray, base: float) -> np.ndarray:
+    """Indices that sort depths (M,), less `base`, by keys of 16 bits, for which numpy uses radix sort; changes `depth`.
+
+    Where these would swap close splats, as in a large scene, by keys of 24 bits in two passes: twice the time.
+    """
+    nearest, farthest = float(depth.min()), float(depth.max())
+    span = max(farthest - nearest, 1e-30)
+    is_short = span <= MAX_RELATIVE_STEP * MAX_SHORT_KEY * (nearest + base)
+    depth -= np.float32(nearest)
+    depth *= np.float32((MAX_SHORT_KEY if is_short else MAX_LONG_KEY) / span)
+    if is_short:
+        return np.argsort(depth.astype(np.uint16), kind="stable")
+    key = depth.astype(np.uint32)
+    order = np.argsort(key.astype(np.uint8), kind="stable")
+    return np.asarray(order[np.argsort((key >> 8).astype(np.uint16)[order], kind="stable")])
 
 
 def _depths(static: StaticSplats, frames: PosedFrames) -> np.ndarray:

@@ -33,6 +33,14 @@ OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
 EXACT, COMPACT = "RGBA32F", "RGBA16F"
 """Formats of the color target."""
 DEPTH_FORMAT = "RG32F"
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
+"""Parts of the names, in lower case, of OpenGL and Vulkan drivers that compute on the CPU."""
+
+
+def fastest_format() -> str:
+    """The format that a viewport is drawn in: half the traffic on a card, but software would convert each pixel."""
+    name = gpu.platform.renderer_get().lower()
+    return EXACT if any(software in name for software in SOFTWARE_RENDERERS) else COMPACT
 
 
 class SplatRenderer:

@@ -251,7 +251,7 @@ def splat_shader() -> Any:
     info.typedef_source(_DEFINES)
     info.vertex_in(0, "VEC2", "corner")
     passed = GPUStageInterfaceInfo("stga_splat")
-    passed.smooth("VEC2", "offset")
+    passed.no_perspective("VEC2", "offset")
     passed.flat("VEC4", "shade")
     passed.flat("FLOAT", "depth")
     info.vertex_out(passed)

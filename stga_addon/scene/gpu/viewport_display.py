@@ -25,7 +25,7 @@ from ..render.scene_splats import SplatCache, visible_layers
 from ..render.view_transform import keeps_colors
 from .front_bones import NO_BONES, front_bones
 from .packing import NEAR_M, View
-from .renderer import COMPACT, SplatRenderer
+from .renderer import SplatRenderer, fastest_format
 
 ENGINE = "STGA_SPLATS"
 """The render engine, which draws all splats in *Rendered* mode."""
@@ -87,7 +87,7 @@ class GpuDisplay:
         space, depsgraph = context.space_data, context.evaluated_depsgraph_get()
         if is_drawn_by_engine(context):
             return
-        everything = is_engine_view(context)
+        everything = is_engine_view(context)  # and nothing else, although its depth buffer has other displays of splats
         layers = visible_layers(
             depsgraph, self._cache, space, lambda shown: everything or display_mode(shown) == AS_TRAINED
         )
@@ -96,14 +96,14 @@ class GpuDisplay:
                 self._renderer = None  # frees its textures
             return
         if self._renderer is None:
-            self._renderer = SplatRenderer(COMPACT)
+            self._renderer = SplatRenderer(fastest_format())
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
         is_plain = space.shading.type in ("SOLID", "WIREFRAME") or keeps_colors(context.scene)
         bones = front_bones(space, context.region_data, width, height) if is_plain else NO_BONES
         self._renderer.composite(
-            (x, y), to_depth, expected_background(context), has_scene_depth(space),
+            (x, y), to_depth, expected_background(context), has_scene_depth(space) and not everything,
             bones, self._scene_target, background_source(context) != "SCENE",
         )  # fmt: skip
 

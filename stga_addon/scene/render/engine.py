@@ -40,7 +40,7 @@ VIEW_TRANSFORM_UNKNOWN = (
 SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
 
 
-class Interpreter:
+class RenderEnvironment:
     """The Python that renders where Blender's own cannot, and the device: looked up by the main thread, used by render
     threads.
 
@@ -68,8 +68,8 @@ class Interpreter:
         return self._path
 
 
-_interpreter = Interpreter(lambda: "", lambda: "auto")
-_client = RenderClient(_interpreter.path, lambda: _interpreter.device)
+_environment = RenderEnvironment(lambda: "", lambda: "auto")
+_client = RenderClient(_environment.path, lambda: _environment.device)
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -111,7 +111,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
         image = draw_image(layers, camera)
         if image is None:
-            _interpreter.update()
+            _environment.update()
             image = _client.compose([layer.posed() for layer in layers], camera, with_depth=True)
             if _client.failure:
                 self.report({"WARNING"}, _client.failure)
@@ -199,7 +199,7 @@ class Viewport:
             return False
         camera = viewport_camera(context.region_data, region.width, region.height)
         if not self.renderer.is_busy():
-            _interpreter.update()
+            _environment.update()
         return self.renderer.request(RenderRequest(self._posed, camera, _background(depsgraph.scene)))
 
     def _update_layers(self, context: Any, depsgraph: Any) -> bool:
@@ -312,9 +312,9 @@ def _before_render(*_: Any) -> None:
 
 def register(find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
     """find_python, find_device: as in `raster.render_client.RenderClient`."""
-    global _interpreter, _client
-    _interpreter = Interpreter(find_python, find_device)
-    _client = RenderClient(_interpreter.path, lambda: _interpreter.device)
+    global _environment, _client
+    _environment = RenderEnvironment(find_python, find_device)
+    _client = RenderClient(_environment.path, lambda: _environment.device)
     bpy.utils.register_class(SplatsEngine)
     bpy.app.handlers.render_pre.append(_before_render)
     for panel in _shared_panels():
