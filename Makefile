@@ -2,10 +2,14 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: demo test test-fast test-gui lint lint-web fuzz extension clean
+.PHONY: demo demo-footage test test-fast test-gui lint lint-web fuzz extension clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
+
+# The demo, and then a second avatar from its images and cameras alone
+demo-footage: .venv/ready
+	$(BIN)/python -m stga_addon demo --out out/demo --footage
 
 test: lint
 	$(BIN)/python -m pytest

@@ -84,6 +84,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("out/extend"))
     options = parser.parse_args()
     precompile_kernels()
+    options.folder.mkdir(parents=True, exist_ok=True)
     runs: dict[str, dict[str, list[list[Line]]]] = {}
     for seed in options.seeds:
         for kind, prepared, arms in comparisons(options, seed):

@@ -1,11 +1,14 @@
 """Benchmark of refined tracking: quality and time with and without it, at the same number of iterations.
 
-    python benchmarks/tracking.py CAPTURE --flame FILE [--iterations 500] [--errors 0 0.5 1]
+    python benchmarks/tracking.py CAPTURE --flame FILE [--iterations 500] [--errors 0 0.5 1] [--tracked TRACKED]
 
 CAPTURE should be tracked exactly, as the demo's is. Disturbs the parameters of its training timesteps by random steps
 (1: 2 mm, 1° a joint, 0.15 of an expression), trains with the effect and without, and prints a table in Markdown: what
 Auto would decide, how far the meshes are from where they should be, the PSNR of the held-out view and of the unseen
 timesteps, which are not disturbed, and the time of an iteration, for which the machine should be idle.
+
+With --tracked, a capture that `stga track` made of CAPTURE's images takes the place of the disturbed ones: trained on
+CAPTURE's meshes, on its own, and on its own refined. Distances are then those of the vertices of the face.
 """
 
 import argparse
@@ -24,6 +27,7 @@ from stga_addon.effects.facts import CaptureFacts
 from stga_addon.effects.plan import plan_effects
 from stga_addon.effects.rules import tracking
 from stga_addon.flame.forward import FlameFrame
+from stga_addon.tracking.fit import Similarity, similarity
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.tracking import (
     POSE_SIZE,
@@ -58,10 +62,48 @@ def lose_track(capture: Capture, error: float) -> Capture:
     return with_sequence(capture, replace(sequence, frame=frame))
 
 
-def millimeters(capture: Capture, true: Capture) -> float:
+def to_world_of(tracked: Capture, true: Capture) -> Similarity:
+    """From the world of the true capture to that of the tracked one, by the places of their cameras."""
+    places = [
+        {view.camera_index: view.camera.position for views in capture.views.values() for view in views}
+        for capture in (true, tracked)
+    ]
+    both = sorted(places[0].keys() & places[1].keys())
+    ours, theirs = (np.array([own[number] for number in both]) for own in places)
+    world = similarity(ours, theirs)
+    assert np.allclose(world.apply(ours), theirs, atol=1e-3), "the captures number their cameras differently"
+    return world
+
+
+def with_true_meshes(tracked: Capture, true: Capture) -> Capture:
+    """The tracked capture's views with the other capture's meshes, in the tracked one's world."""
+    world = to_world_of(tracked, true)
+    return replace(
+        tracked,
+        mesh=lambda timestep: world.apply(true.mesh(timestep)),
+        neutral=world.scale * true.neutral,
+        expression_mesh=lambda timestep, zero_pose: world.scale * true.expression_mesh(timestep, zero_pose),
+    )
+
+
+def millimeters(capture: Capture, true: Capture, vertices: np.ndarray | slice = slice(None)) -> float:
     """Mean distance of vertices between two captures' training timesteps."""
     timesteps = {view.timestep for view in true.views["train"]}
-    return 1000 * float(np.mean([np.linalg.norm(capture.mesh(t) - true.mesh(t), axis=1).mean() for t in timesteps]))
+    away = [np.linalg.norm((capture.mesh(t) - true.mesh(t))[vertices], axis=1).mean() for t in timesteps]
+    return 1000 * float(np.mean(away))
+
+
+def compare_tracked(tracked: Capture, true: Capture, flame: Path, iterations: int) -> None:
+    """Print a table in Markdown of training on the true meshes, on the tracked ones, and on those refined."""
+    assert true.flame is not None
+    face, aim = true.flame.model.masks["face"], with_true_meshes(tracked, true)
+    scale = to_world_of(tracked, true).scale
+    print("| meshes | mm | val | ms an iteration |")
+    print("|" + " --- |" * 4)
+    for name, capture, choice in (("true", aim, "off"), ("tracked", tracked, "off"), ("refined", tracked, "on")):
+        shown, psnr, pace = trained(capture, flame, iterations, choice)
+        error = millimeters(shown, aim, face) / scale
+        print(f"| {name} | {error:.2f} | {psnr['val']:.2f} | {1000 * pace:.1f} |", flush=True)
 
 
 def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tuple[Capture, Mapping[str, float], float]:
@@ -70,7 +112,8 @@ def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tupl
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         shown, last = with_refined_tracking(capture, Path(folder)), read_metrics(Path(folder))[-1]
-    quality = {split: evaluate_avatar(avatar, shown, split).psnr for split in ("val", "test")}
+    splits = [split for split in ("val", "test") if shown.views.get(split)]
+    quality = {split: evaluate_avatar(avatar, shown, split).psnr for split in splits}
     return shown, quality, last["seconds"] / last["iteration"]
 
 
@@ -80,8 +123,12 @@ def main() -> None:
     parser.add_argument("--flame", type=Path, required=True)
     parser.add_argument("--iterations", type=int, default=500)
     parser.add_argument("--errors", type=float, nargs="+", default=[0, 0.5, 1])
+    parser.add_argument("--tracked", type=Path)
     options = parser.parse_args()
     true = open_capture(options.capture, options.flame)
+    if options.tracked is not None:
+        compare_tracked(open_capture(options.tracked, options.flame), true, options.flame, options.iterations)
+        return
     print("| error | mesh outside the masks | Auto | tracking | mm | val | unseen | ms an iteration |")
     print("|" + " --- |" * 8)
     for error in options.errors:

@@ -27,18 +27,19 @@ CANDIDATES = 48
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
 
 
-def calibrate(model: FlameModel, detector: Detector) -> tuple[SurfacePoints, np.ndarray]:
+def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[SurfacePoints, np.ndarray]:
     """The detector's landmarks on the neutral head: their places, and (N,) bool which of them are reliable.
 
     Renders the template from nine directions, triangulates what the detector finds and takes the nearest points of the
-    surface. The model looks along +z with y up. Raises StgaError where the detector does not see a face.
+    surface. The model looks along +z with y up; `name` is what errors call it. Raises StgaError where the detector does
+    not see a face.
     """
     cameras = picture_cameras(model.v_template)
     found = [(camera, detector.detect(shaded_image(model.v_template, model.faces, camera))) for camera in cameras]
     seen = [(camera, faces[0]) for camera, faces in found if faces]
     if len(seen) < MIN_PICTURES:
         raise StgaError(
-            f"the head model shows a face in {len(seen)} of {len(cameras)} pictures from the front, expected at least "
+            f"{name}: shows a face in {len(seen)} of {len(cameras)} pictures from the front, expected at least "
             f"{MIN_PICTURES}; it must look along +z with y up"
         )
     points = np.stack([face for _, face in seen])

@@ -89,7 +89,7 @@ def track(
     else:
         detector = make_detector(task)
         report("Head model", 0, 1)
-        places, reliable = calibrate(head.model, detector)
+        places, reliable = calibrate(head.model, detector, str(head_file))
         _begin(out, footage, head_file, task)
         write_places(out / LANDMARKS_FOLDER / PLACES_FILE, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)

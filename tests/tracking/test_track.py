@@ -15,7 +15,7 @@ from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
-from stga_addon.tracking.correspondence import calibrate, nearest_points
+from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
@@ -231,6 +231,16 @@ def test_wrong_landmark_files_are_named(recorded, capsys, change, expected):
     assert "points" in message
 
 
+def test_a_resolution_that_changes_is_named(recorded, capsys):
+    """Catches a capture that is half written when an image of another size is met."""
+    folder, _ = recorded
+    Image.new("RGB", (SIZE // 2, SIZE // 2)).save(folder / "footage/images/3_4.png")
+    assert command(folder) == 2
+    message = capsys.readouterr().err
+    assert re.search(rf"3_4.png: .*{SIZE // 2} x {SIZE // 2}", message)
+    assert not (folder / "out").exists()
+
+
 def test_footage_without_a_face(recorded, capsys):
     """Catches a crash, or a capture of nothing, where nobody is in the picture."""
     folder, _ = recorded
@@ -382,11 +392,12 @@ def test_mediapipe_tracks_pictures_of_a_head(tmp_path, head):
         assert np.median(np.linalg.norm(pixels - expected, axis=1)) < 5  # of a face of 120 pixels
 
 
-def test_mediapipe_finds_no_face_on_the_back_of_a_head(head):
+def test_mediapipe_finds_no_face_on_the_back_of_a_head(recorded, capsys, head):
     """Catches a head model without a face that is fitted all the same."""
     pytest.importorskip("mediapipe", reason="mediapipe is not installed")
-    from stga_addon.tracking.detectors import make_detector
-
-    turned = replace(head.model, v_template=head.model.v_template * [-1, 1, -1])
-    with pytest.raises(StgaError, match=r"shows a face in . of 9 pictures"):
-        calibrate(turned, make_detector())
+    folder, _ = recorded
+    write_flame(replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz")
+    command = ["track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
+    assert main(command) == 2
+    assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
+    assert not (folder / "out").exists()

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import TrainState, tensors_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import late_rates, prepare_refinement
+from stga_addon.training.run.continuation import late_rates, prepare_refinement, starting_state
 from stga_addon.training.run.folder import Continuation, Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
@@ -136,6 +136,19 @@ def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
     (parent / "avatar.npz").write_bytes(b"")
     with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
         train(prepared.capture, tmp_path / "refined", prepared.run, prepared.selection)
+
+
+def test_colors_of_another_range_of_strain_are_not_continued(parent: Path) -> None:
+    """Catches an avatar of an earlier version, whose colors all change when today's strain is put into them."""
+    avatar = read_avatar(parent / "avatar.npz")
+    assert avatar.strain_range is not None
+    wider = avatar.strain_range.copy()
+    wider[0, 1, 0] = 0.0
+    write_avatar(parent / "avatar.npz", replace(avatar, strain_range=wider))
+    prepared = prepare_refinement(Refinement(parent, "mouth", iterations=ITERATIONS), "cpu")
+    assert prepared.run.continuation is not None
+    with pytest.raises(StgaError, match="as in an earlier version"):
+        starting_state(prepared.run.continuation, True)
 
 
 def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent: Path, toy: Capture, tmp_path: Path) -> None:

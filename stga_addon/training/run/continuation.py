@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from ...avatar.file import read_avatar
+from ...avatar.strain import COLOR_RANGE
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import open_capture
 from ...capture.region import find_region
@@ -151,12 +152,16 @@ def starting_state(continuation: Continuation, strain_color: bool) -> TrainState
     """The parent's avatar as a state of training; strain_color: with coefficients of strain, zero where it had none.
 
     The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
-    Raises StgaError where the avatar is not the one that the continuation was made for.
+    Raises StgaError where the avatar is not the one that the continuation was made for, or its colors follow strain
+    beyond COLOR_RANGE, as those that an earlier version trained: they would change at once.
     """
     folder = continuation.parent
     if file_digest(folder / "avatar.npz") != continuation.avatar:
         raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
-    splats = read_avatar(folder / "avatar.npz").splats
+    avatar = read_avatar(folder / "avatar.npz")
+    splats, limits = avatar.splats, avatar.strain_range
+    if limits is not None and ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any():
+        raise StgaError(f"{folder / 'avatar.npz'}: colors follow strain as in an earlier version; train it anew")
     state = new_state(splats)
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
