@@ -16,7 +16,7 @@ def draw_running(layout: Any, context: Any) -> bool:
         return False
     row = layout.row(align=True)
     waits = background.is_waiting(context.scene)
-    row.label(text="Done: leave Edit Mode to see it" if waits else "Analyzing…", icon="INFO" if waits else "VIEWZOOM")
+    row.label(text="Done: leave Edit Mode" if waits else "Analyzing…", icon="INFO" if waits else "VIEWZOOM")
     row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
     return True
 
