@@ -4,8 +4,8 @@
 
 Renders a few pictures of the demo's head per camera, which are shown again and again, tracks them with MediaPipe, and
 prints the time of each stage and the peak memory; with --landmarks, exact landmarks take the detector's place, so that
-only fit, contact sheet and files are measured. Run it on a quiet machine; memory is flat if it is about the same for
---timesteps 100 and 300.
+only fit, contact sheet and files are measured. Run it on a quiet machine. Of a further timestep, landmarks and points
+are kept, about 0.5 MB for 16 cameras; images are not.
 """
 
 import argparse
