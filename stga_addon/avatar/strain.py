@@ -67,6 +67,9 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
     corners = np.ascontiguousarray(faces.T, np.intp)
     order, count, touching = _touching(corners, len(neutral))
     twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
+    if strain_range is None:
+        ends = np.array([[-MAX_STRAIN], [MAX_STRAIN]], np.float32)
+        strain_range = np.broadcast_to(ends, (len(faces), 2, STRAIN_COMPONENTS))
     return StrainBasis(
         faces=faces,
         gram=_by_component(np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1)),
@@ -81,7 +84,7 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
         rank=np.argsort(order)[corners],
         touching=touching,
         share=(1 / (3 * count[:, None])).astype(np.float32),
-        range=_by_component(_full_range(len(faces)) if strain_range is None else strain_range),
+        range=_by_component(strain_range),
     )
 
 
@@ -98,12 +101,6 @@ def _touching(corners: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndar
 def color_range(count: int) -> np.ndarray:
     """COLOR_RANGE for each of `count` triangles: (count, 2, 3) float32."""
     return np.broadcast_to(COLOR_RANGE, (count, *COLOR_RANGE.shape)).copy()
-
-
-def _full_range(count: int) -> np.ndarray:
-    """(count, 2, 3) float32: −MAX_STRAIN and MAX_STRAIN, for every triangle and component."""
-    ends = np.array([-MAX_STRAIN, MAX_STRAIN], np.float32)[:, None]
-    return np.broadcast_to(ends, (count, 2, STRAIN_COMPONENTS)).copy()
 
 
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
