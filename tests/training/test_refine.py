@@ -138,13 +138,14 @@ def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
         train(prepared.capture, tmp_path / "refined", prepared.run, prepared.selection)
 
 
-def test_colors_of_another_range_of_strain_are_not_continued(parent: Path) -> None:
+@pytest.mark.parametrize("limited", [True, False])
+def test_colors_of_another_range_of_strain_are_not_continued(parent: Path, limited: bool) -> None:
     """Catches an avatar of an earlier version, whose colors all change when today's strain is put into them."""
     avatar = read_avatar(parent / "avatar.npz")
     assert avatar.strain_range is not None
     wider = avatar.strain_range.copy()
     wider[0, 1, 0] = 0.0
-    write_avatar(parent / "avatar.npz", replace(avatar, strain_range=wider))
+    write_avatar(parent / "avatar.npz", replace(avatar, strain_range=wider if limited else None))
     prepared = prepare_refinement(Refinement(parent, "mouth", iterations=ITERATIONS), "cpu")
     assert prepared.run.continuation is not None
     with pytest.raises(StgaError, match="as in an earlier version"):

@@ -160,7 +160,9 @@ def starting_state(continuation: Continuation, strain_color: bool) -> TrainState
         raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
     avatar = read_avatar(folder / "avatar.npz")
     splats, limits = avatar.splats, avatar.strain_range
-    if limits is not None and ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any():
+    if splats.strain_color.shape[1] and (
+        limits is None or ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any()
+    ):
         raise StgaError(f"{folder / 'avatar.npz'}: colors follow strain as in an earlier version; train it anew")
     state = new_state(splats)
     if (folder / CHECKPOINT).exists():
