@@ -83,6 +83,8 @@ def main() -> None:
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     parser.add_argument("--folder", type=Path, default=Path("out/extend"))
     options = parser.parse_args()
+    if options.parent is not None and options.refine is None:
+        parser.error("--parent needs --refine")
     precompile_kernels()
     options.folder.mkdir(parents=True, exist_ok=True)
     runs: dict[str, dict[str, list[list[Line]]]] = {}

@@ -41,7 +41,8 @@ from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 
-COEFFICIENT, RADIAN, METRE = 0.15, 0.0175, 0.002
+EXPRESSION_ERROR, JOINT_ERROR_RAD, TRANSLATION_ERROR_M = 0.15, 0.0175, 0.002
+"""Standard deviations of the random steps at error 1."""
 
 
 def lose_track(capture: Capture, error: float) -> Capture:
@@ -49,7 +50,9 @@ def lose_track(capture: Capture, error: float) -> Capture:
     sequence = capture.flame
     assert sequence is not None
     expressions = sequence.model.n_expression
-    sizes = np.repeat([COEFFICIENT, RADIAN, METRE], [expressions, POSE_SIZE, TRANSLATION_SIZE])
+    sizes = np.repeat(
+        [EXPRESSION_ERROR, JOINT_ERROR_RAD, TRANSLATION_ERROR_M], [expressions, POSE_SIZE, TRANSLATION_SIZE]
+    )
     disturbed = {view.timestep for view in capture.views["train"]}
 
     def frame(timestep: int) -> FlameFrame:
