@@ -397,7 +397,7 @@ def test_mediapipe_finds_no_face_on_the_back_of_a_head(recorded, capsys, head):
     pytest.importorskip("mediapipe", reason="mediapipe is not installed")
     folder, _ = recorded
     write_flame(replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz")
-    command = ["track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
-    assert main(command) == 2
+    words = ["track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
+    assert main(words) == 2
     assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
     assert not (folder / "out").exists()
