@@ -36,6 +36,10 @@ class _Process:
     def is_running(self) -> bool:
         return self._thread.is_alive()
 
+    @property
+    def has_succeeded(self) -> bool:
+        return not self.is_running and self._process.returncode == 0
+
     def output(self) -> str:
         """Wait for the worker; what it printed. Raises StgaError with its error message where it failed."""
         self._thread.join()
@@ -95,12 +99,12 @@ def running(scene: Any) -> Command | None:
 
 
 def is_waiting(scene: Any) -> bool:
-    """Whether the scene's command has finished and is shown once the head leaves Edit Mode."""
-    command, process = _running.get(scene.session_uid, (None, None))
-    if command is None or process is None or process.is_running:
+    """Whether the scene's command has succeeded and is shown once the head leaves Edit Mode."""
+    if scene.session_uid not in _running:
         return False
+    command, process = _running[scene.session_uid]
     head = getattr(scene, ids.SETTINGS).head
-    return command.changes_head and head is not None and head.mode == "EDIT"
+    return command.changes_head and process.has_succeeded and head is not None and head.mode == "EDIT"
 
 
 def needs_idle(operator: Any, context: Any) -> bool:

@@ -169,7 +169,7 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
 
 
 def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypatch, tmp_path):
-    """Catches a result that is thrown away because the head is being edited, and an old error beside a new command."""
+    """Catches a result lost because the head is edited, a failure held back, and an old error beside a new command."""
     write_npz(tmp_path / "given.npz", {"00000": np.ones(len(head.data.polygons), bool)})
     program = write_interpreter(
         tmp_path / "python", f"import shutil\nshutil.copy({str(tmp_path / 'given.npz')!r}, sys.argv[-1])"
@@ -190,6 +190,12 @@ def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypa
     tick_until_done(extension)
     assert settings.extension_error == ""
     assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
+    bpy.ops.object.mode_set(mode="EDIT")
+    write_interpreter(tmp_path / "python", "sys.exit('stga: no such run')")
+    assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
+    tick_until_done(extension)
+    assert settings.extension_error == "no such run"
+    bpy.ops.object.mode_set(mode="OBJECT")
 
 
 @pytest.mark.slow

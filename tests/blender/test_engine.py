@@ -569,7 +569,7 @@ def test_panels_drop_the_engine_on_unregister():
     engine.register(no_python)
 
 
-def test_interpreter_is_looked_up_by_the_main_thread(monkeypatch):
+def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
     """Catches preferences, which belong to the main thread, read from a render thread, and an error that is lost."""
     monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
     answers, callers = [StgaError("no environment"), "python"], []
@@ -581,13 +581,13 @@ def test_interpreter_is_looked_up_by_the_main_thread(monkeypatch):
             raise answer
         return answer
 
-    interpreter = engine.RenderEnvironment(find, lambda: "cpu")
-    interpreter.update()
+    environment = engine.RenderEnvironment(find, lambda: "cpu")
+    environment.update()
     with pytest.raises(StgaError, match="no environment"):
-        interpreter.path()
-    interpreter.update()
+        environment.path()
+    environment.update()
     found: list[str] = []
-    thread = threading.Thread(target=lambda: found.append(interpreter.path()))
+    thread = threading.Thread(target=lambda: found.append(environment.path()))
     thread.start()
     thread.join()
     assert found == ["python"]

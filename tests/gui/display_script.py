@@ -185,7 +185,8 @@ def parts_of_the_view(area: Any) -> None:
 def textures() -> list[Any]:
     """What the display holds on the GPU, besides shaders."""
     renderer = display._renderer
-    return [*renderer._static_textures.values(), renderer._color, renderer._depth]
+    projected = renderer._projected.values()
+    return [*renderer._static_textures.values(), *projected, renderer._color, renderer._depth]
 
 
 def freed(held: list[Any]) -> bool:

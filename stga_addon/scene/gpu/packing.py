@@ -23,9 +23,9 @@ MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
 
 MAX_SHORT_KEY, MAX_LONG_KEY = (1 << 16) - 1, (1 << 24) - (1 << 8)
-"""Depths to sort by, of 16 bits and of 24, as many as float32 has, less what rounding may add."""
+"""Largest sort keys: of 16 bits, and of 24, as many as float32 has, less what rounding may add."""
 MAX_RELATIVE_STEP = 1e-5
-"""Largest step of depth between short keys as a share of the nearest splat's: 5 µm at 0.5 m."""
+"""Largest step of depth from one short key to the next, as a share of the nearest splat's depth: 5 µm at 0.5 m."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from .front_bones import NO_BONES
 from .packing import StaticSplats, View
 from .shaders import (
     BLOCK_SPLATS,
+    PACKED_TEXTURES,
     PROJECTED_TEXTURES,
-    SPLAT_TEXTURES,
     TEXTURE_WIDTH,
     composite_shader,
     projection_shader,
@@ -47,8 +47,9 @@ class SplatRenderer:
     """Shaders, the textures of the layers drawn last, and the targets they were drawn to."""
 
     def __init__(self, color_format: str = EXACT) -> None:
-        self._projection, self._shader, self._composite = projection_shader(), splat_shader(), composite_shader()
-        self._screen, self._block = _rectangles(1), _rectangles(BLOCK_SPLATS)
+        self._projection_shader, self._splat_shader = projection_shader(), splat_shader()
+        self._composite_shader = composite_shader()
+        self._screen, self._splat_rectangles = _rectangles(1), _rectangles(BLOCK_SPLATS)
         self._color_format = color_format
         self._static: StaticSplats | None = None
         self._static_textures: dict[str, Any] = {}
@@ -60,7 +61,11 @@ class SplatRenderer:
         self._projected_target: Any = None
 
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
-        """Draw layers, sorted together, to this renderer's own targets."""
+        """Draw layers, sorted together, to this renderer's own targets.
+
+        In two passes: the first projects and colors each splat, into a texel of the projected textures; the second
+        reads these and draws the splats from far to near.
+        """
         self._resize(view.camera.width, view.camera.height)
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
@@ -117,7 +122,7 @@ class SplatRenderer:
         gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
         gpu.state.depth_mask_set(False)
         gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
-        shader, bone_image = self._composite, _image(bones)  # a texture lives as long as its name
+        shader, bone_image = self._composite_shader, _image(bones)  # a texture lives as long as its name
         shader.bind()
         shader.uniform_sampler("color_image", self._color)
         shader.uniform_sampler("depth_image", self._depth)
@@ -157,7 +162,7 @@ class SplatRenderer:
             self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
 
     def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
-        """Compute what is drawn of each splat, once for its four corners; returns how many are to be drawn."""
+        """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
         static = self._update_static(layers)
         frames = packing.posed_frames(layers, self._frame_blocks(layers), view)
         order = packing.drawing_order(static, frames, view)
@@ -167,11 +172,11 @@ class SplatRenderer:
             "orders": _texture(order[:, None], "R32F"), "frames": _texture(frames.texels.reshape(-1, 4)),
             "table": _texture(packing.table(static, layers, view)),
         }  # fmt: skip
-        shader = self._projection
+        shader = self._projection_shader
         with self._projected_target.bind():
             gpu.state.blend_set("NONE")
             shader.bind()
-            for name in SPLAT_TEXTURES:
+            for name in PACKED_TEXTURES:
                 shader.uniform_sampler(name, textures[name])
             shader.uniform_int("faces", frames.texels.shape[1])
             shader.uniform_int("count", len(order))
@@ -179,17 +184,18 @@ class SplatRenderer:
         return len(order)
 
     def _draw_splats(self, count: int) -> None:
+        """Draw the first `count` splats of the projected textures to the active framebuffer."""
         gpu.state.blend_set("ALPHA_PREMULT")
-        shader = self._shader
+        shader = self._splat_shader
         shader.bind()
         for name in PROJECTED_TEXTURES:
             shader.uniform_sampler(name, self._projected[name])
-        self._block.draw_instanced(shader, instance_start=0, instance_count=-(-count // BLOCK_SPLATS))
+        self._splat_rectangles.draw_instanced(shader, instance_start=0, instance_count=-(-count // BLOCK_SPLATS))
         gpu.state.blend_set("NONE")
 
 
 def _rectangles(count: int) -> Any:
-    """Rectangles of four vertices with corners at ±1."""
+    """`count` rectangles in one batch, each with its own four vertices at ±1."""
     layout = GPUVertFormat()
     layout.attr_add(id="corner", comp_type="F32", len=2, fetch_mode="FLOAT")
     vertices = GPUVertBuf(len=4 * count, format=layout)

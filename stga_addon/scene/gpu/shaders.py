@@ -10,7 +10,8 @@ Textures of `packing.py`, each 2048 texels wide and read by texel index:
              per layer: first color, first splat, colors per splat, degree; antialiased, strained, size, opacity
              threshold; three rows of the matrix to directions, with percentage, show selection, selected only
 
-Of these, the projection shader makes once per splat, in the order of drawing, what the corners of its rectangle read:
+From these, a first pass computes what is drawn of each splat, once for the four corners of its rectangle; a second
+pass draws the rectangles. In between are textures as wide, in the order of drawing:
     places   center in normalized device coordinates, depth in meters, standard deviations up to the rectangle's sides
              (0: the splat is not drawn)
     sides    the rectangle's two half axes in normalized device coordinates
@@ -27,10 +28,12 @@ from ..layers import FROZEN_COLOR_SRGB
 from .packing import CLIP_PLANES, LAYER_TEXELS, VIEW_TEXELS
 
 TEXTURE_WIDTH = 2048
-SPLAT_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
+PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
 BLOCK_SPLATS = 128
-"""Splats in an instance, a divisor of TEXTURE_WIDTH: GPUs, and software even more, are slow at tiny instances."""
+"""Splats drawn by one instance: GPUs, and software even more, are slow at instances of four vertices.
+
+A divisor of TEXTURE_WIDTH: the last instance then reads no further than the projected textures' last row."""
 
 _DEFINES = f"""
 #define WIDTH {TEXTURE_WIDTH}
@@ -155,11 +158,11 @@ void main()
 {
   int index = gl_InstanceID * BLOCK_SPLATS + gl_VertexID / 4;
   ivec2 texel = ivec2(index % WIDTH, index / WIDTH);
-  vec4 place = texelFetch(places, texel, 0), axes = texelFetch(sides, texel, 0);
+  vec4 place = texelFetch(places, texel, 0), half_axes = texelFetch(sides, texel, 0);
   offset = place.w * corner;
   depth = place.z;
   shade = texelFetch(shades, texel, 0);
-  gl_Position = vec4(place.xy + corner.x * axes.xy + corner.y * axes.zw, place.w > 0.0 ? 0.0 : 2.0, 1.0);
+  gl_Position = vec4(place.xy + corner.x * half_axes.xy + corner.y * half_axes.zw, place.w > 0.0 ? 0.0 : 2.0, 1.0);
 }
 """
 
@@ -230,13 +233,13 @@ void main()
 
 
 def projection_shader() -> Any:
-    """Fills PROJECTED_TEXTURES, as large as `orders`, for the first `count` splats; the rest is not drawn."""
+    """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`; others become 0."""
     info = GPUShaderCreateInfo()
     info.typedef_source(_DEFINES)
     info.vertex_in(0, "VEC2", "corner")
     for slot, name in enumerate(("place_out", "sides_out", "shade_out")):
         info.fragment_out(slot, "VEC4", name)
-    for slot, name in enumerate(SPLAT_TEXTURES):
+    for slot, name in enumerate(PACKED_TEXTURES):
         info.sampler(slot, "FLOAT_2D", name)
     for name in ("faces", "count"):
         info.push_constant("INT", name)
@@ -246,7 +249,10 @@ def projection_shader() -> Any:
 
 
 def splat_shader() -> Any:
-    """Draws instances of BLOCK_SPLATS rectangles; two color targets: sRGB premultiplied, and (depth · alpha, alpha)."""
+    """Second pass: draws PROJECTED_TEXTURES, a rectangle for each splat, in instances of BLOCK_SPLATS of them.
+
+    Two color targets: sRGB premultiplied, and (depth · alpha, alpha).
+    """
     info = GPUShaderCreateInfo()
     info.typedef_source(_DEFINES)
     info.vertex_in(0, "VEC2", "corner")
