@@ -105,6 +105,7 @@ def bring_in(
     scene_settings(context).head = head
     _show_first_frame(context.scene, capture)
     _select_only(context, head)
+    _hide_start_up_cube(context)
     middle = central(cameras)
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, context.view_layer, False)
@@ -121,6 +122,16 @@ def bring_in(
 def _show_first_frame(scene: Any, capture: Capture) -> None:
     scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
     scene.frame_set(capture.timesteps[0])
+
+
+def _hide_start_up_cube(context: Any) -> None:
+    """Hide the cube of Blender's start-up scene where it is as it came: 2 m wide, it would enclose the head."""
+    cube = context.view_layer.objects.get("Cube")
+    if cube is None or cube.type != "MESH" or len(cube.data.vertices) != 8 or cube.modifiers or cube.animation_data:
+        return
+    if cube.matrix_world.is_identity and tuple(cube.dimensions) == (2.0, 2.0, 2.0):
+        cube.hide_set(True)
+        cube.hide_render = True
 
 
 def _select_only(context: Any, head: Any) -> None:

@@ -46,6 +46,17 @@ def test_viewports_look_at_the_head(head):
         np.testing.assert_allclose(np.array(region.view_rotation.to_matrix()), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved):
+    """Catches a first look from within Blender's cube of 2 m, and a cube of the artist's own that disappears."""
+    bpy.ops.mesh.primitive_cube_add()
+    cube = bpy.context.object
+    cube.location.x = float(moved)
+    bpy.context.view_layer.update()
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    assert (cube.name, cube.hide_get(), cube.hide_render) == ("Cube", not moved, not moved)
+
+
 def test_pose_the_jaw_and_back(head):
     """Catches bones that stay hidden, another bone that is selected, and no way back."""
     layer = bpy.context.view_layer
