@@ -67,12 +67,12 @@ def measure(count: int, view: View, repeats: int) -> None:
     static, block = StaticSplats([layer]), frame_block(layer.frames)
 
     def moving_view() -> None:
-        drawing_order(static, posed_frames([layer], [block], view), view)
+        drawing_order(static, posed_frames([layer], [block], view), view, short_keys=True)
         table(static, [layer], view)
 
     def playback(of: Avatar) -> None:
         posed = SceneLayer(of.splats, of.frames(of.neutral), np.eye(4))
-        drawing_order(static, posed_frames([posed], [frame_block(posed.frames)], view), view)
+        drawing_order(static, posed_frames([posed], [frame_block(posed.frames)], view), view, short_keys=True)
         table(static, [posed], view)
 
     cases = {

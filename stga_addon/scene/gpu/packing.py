@@ -146,8 +146,11 @@ def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], vie
     return PosedFrames(texels, depth_rows, base or 0.0)
 
 
-def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.ndarray:
-    """Indices (M,) float32 of the splats within the view's near and far ends, farthest first."""
+def drawing_order(static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool = False) -> np.ndarray:
+    """Indices (M,) float32 of the splats within the view's near and far ends, farthest first.
+
+    short_keys: whether splats that are a few micrometers apart in depth may be swapped, which takes half the time.
+    """
     depth = _depths(static, frames)
     near, far, chosen = view.near - frames.base, view.far - frames.base, None
     if not (len(depth) and depth.min() >= near and depth.max() <= far):
@@ -155,19 +158,20 @@ def drawing_order(static: StaticSplats, frames: PosedFrames, view: View) -> np.n
         depth = depth[chosen]
     if not len(depth):
         return np.empty(0, np.float32)
-    order = _ascending(depth, frames.base)
+    order = _ascending(depth, frames.base, short_keys)
     # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
     return np.asarray(order[::-1] if chosen is None else chosen[order[::-1]], np.float32)
 
 
-def _ascending(depth: np.ndarray, base: float) -> np.ndarray:
-    """Indices that sort depths (M,), less `base`, by keys of 16 bits, for which numpy uses radix sort; changes `depth`.
+def _ascending(depth: np.ndarray, base: float, short_keys: bool) -> np.ndarray:
+    """Indices that sort depths (M,), less `base`, by keys of 24 bits in two passes; changes `depth`.
 
-    Where these would swap close splats, as in a large scene, by keys of 24 bits in two passes: twice the time.
+    Keys and passes have 8 or 16 bits, for which numpy uses radix sort. With short_keys, one pass by keys of 16 bits,
+    except where these would swap splats farther apart, as in a large scene.
     """
     nearest, farthest = float(depth.min()), float(depth.max())
     span = max(farthest - nearest, 1e-30)
-    is_short = span <= MAX_RELATIVE_STEP * MAX_SHORT_KEY * (nearest + base)
+    is_short = short_keys and span <= MAX_RELATIVE_STEP * MAX_SHORT_KEY * (nearest + base)
     depth -= np.float32(nearest)
     depth *= np.float32((MAX_SHORT_KEY if is_short else MAX_LONG_KEY) / span)
     if is_short:

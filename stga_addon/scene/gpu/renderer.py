@@ -44,13 +44,16 @@ def fastest_format() -> str:
 
 
 class SplatRenderer:
-    """Shaders, the textures of the layers drawn last, and the targets they were drawn to."""
+    """Shaders, the textures of the layers drawn last, and the targets they were drawn to.
 
-    def __init__(self, color_format: str = EXACT) -> None:
+    color_format: EXACT or COMPACT; short_keys: as of `packing.drawing_order`, for viewports.
+    """
+
+    def __init__(self, color_format: str = EXACT, short_keys: bool = False) -> None:
         self._projection_shader, self._splat_shader = projection_shader(), splat_shader()
         self._composite_shader = composite_shader()
         self._screen, self._splat_rectangles = _rectangles(1), _rectangles(BLOCK_SPLATS)
-        self._color_format = color_format
+        self._color_format, self._short_keys = color_format, short_keys
         self._static: StaticSplats | None = None
         self._static_textures: dict[str, Any] = {}
         self._layers: Sequence[SceneLayer] = ()
@@ -165,7 +168,7 @@ class SplatRenderer:
         """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
         static = self._update_static(layers)
         frames = packing.posed_frames(layers, self._frame_blocks(layers), view)
-        order = packing.drawing_order(static, frames, view)
+        order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0
         textures = self._static_textures | {

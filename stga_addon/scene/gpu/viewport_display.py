@@ -96,7 +96,7 @@ class GpuDisplay:
                 self._renderer = None  # frees its textures
             return
         if self._renderer is None:
-            self._renderer = SplatRenderer(fastest_format())
+            self._renderer = SplatRenderer(fastest_format(), short_keys=True)
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
