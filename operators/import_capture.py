@@ -127,7 +127,9 @@ def _show_first_frame(scene: Any, capture: Capture) -> None:
 def _hide_start_up_cube(context: Any) -> None:
     """Hide the cube of Blender's start-up scene where it is as it came: 2 m wide, it would enclose the head."""
     cube = context.view_layer.objects.get("Cube")
-    if cube is None or cube.type != "MESH" or len(cube.data.vertices) != 8 or cube.modifiers or cube.animation_data:
+    if cube is None or cube.library or cube.type != "MESH" or len(cube.data.vertices) != 8:
+        return
+    if cube.modifiers or cube.animation_data:
         return
     if cube.matrix_world.is_identity and tuple(cube.dimensions) == (2.0, 2.0, 2.0):
         cube.hide_set(True)

@@ -491,7 +491,7 @@ def test_a_head_in_edit_mode_is_named():
     _, head = show(avatar_of("stga", 10))
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    with pytest.raises(StgaError, match="head: is in Edit Mode; head splats are drawn again when you leave it"):
+    with pytest.raises(StgaError, match="head: is in Edit Mode; head splats is drawn again when you leave it"):
         visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     bpy.ops.object.mode_set(mode="OBJECT")
     assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1

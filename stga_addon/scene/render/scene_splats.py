@@ -131,7 +131,7 @@ def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -
     posed = head.evaluated_get(depsgraph)
     if posed.type != "MESH" or len(posed.data.loops) != 3 * n_faces:
         if head.mode == "EDIT":
-            raise StgaError(f"{head.name}: is in Edit Mode; {splat_object.name} are drawn again when you leave it")
+            raise StgaError(f"{head.name}: is in Edit Mode; {splat_object.name} is drawn again when you leave it")
         raise StgaError(
             f"{head.name}: has other triangles than {splat_object.name}, which follows it; check its modifiers"
         )
