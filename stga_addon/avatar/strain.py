@@ -103,19 +103,28 @@ def color_range(count: int) -> np.ndarray:
     return np.broadcast_to(COLOR_RANGE, (count, *COLOR_RANGE.shape)).copy()
 
 
+def rest_strain(limits: np.ndarray) -> np.ndarray:
+    """Strain (…, 3) of a mesh at rest within limits (…, 2, 3)."""
+    return np.clip(np.float32(0), limits[..., 0, :], limits[..., 1, :])
+
+
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
-    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), RANGE_MARGIN times as far
-    from that of the neutral mesh.
+    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), with a margin.
 
     It includes the neutral mesh, and stays within that of the basis. Colors fitted to a few expressions are not
     extrapolated to stronger ones.
     """
-    rest = np.clip(np.float32(0), basis.range[:, 0], basis.range[:, 1])
-    seen = np.stack([rest, rest], axis=1)
-    for mesh in meshes:
-        strain = rest + np.float32(RANGE_MARGIN) * (face_strain(basis, mesh) - rest)
-        seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], strain), np.maximum(seen[:, 1], strain)
+    seen = range_with_margin(rest_strain(basis.range), (face_strain(basis, mesh) for mesh in meshes))
     return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
+
+
+def range_with_margin(rest: np.ndarray, strains: Iterable[np.ndarray]) -> np.ndarray:
+    """Lowest and highest (F, 2, D) of rest (F, D) and of values (F, D) that are RANGE_MARGIN times as far from it."""
+    seen = np.stack([rest, rest], axis=1)
+    for strain in strains:
+        wider = rest + np.float32(RANGE_MARGIN) * (strain - rest)
+        seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], wider), np.maximum(seen[:, 1], wider)
+    return seen
 
 
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..avatar.strain import range_with_margin
 from .samples import Samples
 
 FOLDS = 4
@@ -125,13 +126,13 @@ def linear_evidence(
     features: np.ndarray,
     group: np.ndarray,
     max_error: float = np.inf,
-    range_margin: float | None = None,
+    rest: np.ndarray | None = None,
 ) -> Evidence:
     """Whether each triangle's color follows its features linearly, by cross-validation over groups of views.
 
     color (S, K, 3), NaN where not seen; features (S, K, D); group (S,): views that are held out together; errors of
-    more than `max_error` times the median are clipped to that; range_margin: features of views that are held out are
-    clipped to the range, times this, of 0 and those that the model was fitted to.
+    more than `max_error` times the median are clipped to that; rest (K, D): features of views that are held out are
+    clipped to the range, with its margin, of those that the model was fitted to, as an avatar's strain is.
     """
     before, after = [], []
     fold = np.searchsorted(np.unique(group), group) % min(FOLDS, len(np.unique(group)))
@@ -139,9 +140,9 @@ def linear_evidence(
         held = fold == number
         mean, center, slope = _ridge(color[~held], features[~held])
         error, given = color[held] - mean, features[held]
-        if range_margin is not None:
-            fitted = range_margin * features[~held]
-            given = np.clip(given, np.minimum(fitted.min(0), 0), np.maximum(fitted.max(0), 0))
+        if rest is not None:
+            lowest, highest = range_with_margin(rest, features[~held]).swapaxes(0, 1)
+            given = np.clip(given, lowest, highest)
         predicted = np.einsum("skd,kdc->skc", given - center, slope)
         known = ~np.isnan(error)
         before.append(error[known])

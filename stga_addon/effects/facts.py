@@ -5,7 +5,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from ..avatar.strain import RANGE_MARGIN, STRAIN_GAIN
+from ..avatar.strain import STRAIN_GAIN, color_range, rest_strain
 from ..capture.model import Capture, evenly_spread
 from ..flame.forward import FlameFrame
 from ..flame.sequence import joint_angles
@@ -70,14 +70,17 @@ class CaptureFacts:
     @cached_property
     def strain_dependence(self) -> Evidence:
         """In timesteps that are left out, as in unseen expressions."""
-        samples = self.samples
-        return linear_evidence(self.matched_colors, samples.strain, samples.timestep, range_margin=RANGE_MARGIN)
+        return self._strain_evidence(self.samples.timestep)
 
     @cached_property
     def strain_dependence_known(self) -> Evidence:
         """In cameras that are left out, as in other views of known expressions."""
-        samples = self.samples
-        return linear_evidence(self.matched_colors, samples.strain, samples.camera, range_margin=RANGE_MARGIN)
+        return self._strain_evidence(self.samples.camera)
+
+    def _strain_evidence(self, group: np.ndarray) -> Evidence:
+        """Within the range of strain that a training on the views that are not left out would write."""
+        rest = rest_strain(color_range(len(self.samples.faces)))
+        return linear_evidence(self.matched_colors, self.samples.strain, group, rest=rest)
 
     @cached_property
     def pixel_range(self) -> float:

@@ -10,7 +10,15 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.strain import MAX_STRAIN, RANGE_MARGIN, face_strain, seen_range, strain_basis
+from stga_addon.avatar.strain import (
+    MAX_STRAIN,
+    MIN_COMPRESSION,
+    RANGE_MARGIN,
+    color_range,
+    face_strain,
+    seen_range,
+    strain_basis,
+)
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
 from stga_addon.raster.render import render, render_avatar
@@ -113,6 +121,26 @@ def test_strain_stays_within_what_was_seen() -> None:
     np.testing.assert_array_equal(face_strain(limited, stronger), np.clip(free, limits[:, 0], limits[:, 1]))
     assert (np.abs(free) > np.abs(face_strain(limited, stronger)) + 0.01).any()
     assert np.abs(seen_range(basis, [30 * neutral])).max() <= MAX_STRAIN
+
+
+def test_the_margin_is_counted_from_rest() -> None:
+    """Catches a margin counted from 0 where a mesh at rest is clipped to less, and one beyond what may be followed."""
+    neutral, rng = sheet(), np.random.default_rng(4)
+    allowed = color_range(len(FACES))
+    posed = [neutral + rng.normal(0, 3e-4, neutral.shape) for _ in range(3)]
+    posed.append(0.7 * neutral)
+    strains = np.stack([face_strain(strain_basis(neutral, FACES, allowed), mesh) for mesh in posed])
+    limits = seen_range(strain_basis(neutral, FACES, allowed), posed)
+    rest = np.array([-MIN_COMPRESSION, -MIN_COMPRESSION, 0])
+    for face in range(len(FACES)):
+        for component in range(3):
+            values = [rest[component], *strains[:, face, component]]
+            lowest = rest[component] - 1.2 * (rest[component] - min(values))
+            highest = rest[component] + 1.2 * (max(values) - rest[component])
+            expected = max(lowest, -MAX_STRAIN), min(highest, allowed[face, 1, component])
+            np.testing.assert_allclose(limits[face, :, component], expected, atol=1e-6)
+    assert limits[:, 0, :2].max() < -MIN_COMPRESSION
+    assert (limits[:, 1, :2] == np.float32(-MIN_COMPRESSION)).all()
 
 
 def test_the_range_is_in_the_file_and_in_renderings(tmp_path: Path) -> None:

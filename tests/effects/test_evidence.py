@@ -29,7 +29,18 @@ def test_features_beyond_the_fitted_range_are_clipped() -> None:
     features[..., 0] = strength[GROUP][:, None]
     color = 100 + 20 * np.clip(features[..., :1], -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
     assert linear_evidence(color, features, GROUP).gain == 0
-    assert linear_evidence(color, features, GROUP, range_margin=1.2).gain > 5
+    rest = np.zeros((TRIANGLES, 3))
+    assert linear_evidence(color, features, GROUP, rest=rest).gain > 5
     inside = features[GROUP != 7], GROUP[GROUP != 7]
-    free, limited = (linear_evidence(color[GROUP != 7], *inside, range_margin=margin) for margin in (None, 1.2))
+    free, limited = (linear_evidence(color[GROUP != 7], *inside, rest=given) for given in (None, rest))
     assert abs(free.gain - limited.gain) < 0.5
+
+
+def test_the_range_is_counted_from_rest() -> None:
+    """Catches a margin counted from 0: a constant added to all strain, at rest too, changes nothing that colors say."""
+    rng = np.random.default_rng(2)
+    rest, features = np.zeros((TRIANGLES, 3)), rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
+    color = 100 + 20 * np.clip(features, -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
+    plain, shifted = (linear_evidence(color, features + by, GROUP, rest=rest + by) for by in (0.0, -0.2))
+    assert plain.gain > 5
+    np.testing.assert_allclose(shifted.gain, plain.gain, rtol=1e-9)
