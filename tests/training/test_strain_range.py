@@ -9,6 +9,7 @@ import pytest
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.strain import COLOR_RANGE, MIN_COMPRESSION, color_range, face_strain, strain_basis
 from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.run import strain_range as module
 from stga_addon.training.run.folder import Continuation, Run
@@ -77,6 +78,26 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> Non
     shear = face_strain(basis, sheared)[:, 2]
     assert shear.min() < -0.05
     assert shear.max() > 0.05
+
+
+@pytest.mark.parametrize("limited", [True, False])
+def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, limited: bool) -> None:
+    """Catches a run of an earlier version that is resumed, which changes all its colors at once, and one that is
+    finished but cannot be opened."""
+    settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
+    run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
+    path = train(toy, out, run, report=lambda progress: progress.iteration == 2)
+    avatar = read_avatar(path)
+    wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 3)).copy()
+    write_avatar(path, replace(avatar, strain_range=wider if limited else None))
+    before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
+    with pytest.raises(StgaError, match=r"avatar\.npz: colors follow strain as in an earlier version; train it anew"):
+        train(toy, out, run, resume=True)
+    assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
+    write_avatar(path, avatar)
+    train(toy, out, run, resume=True)
+    write_avatar(path, replace(avatar, strain_range=wider))
+    train(toy, out, run, resume=True)
 
 
 def test_long_captures_are_sampled(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from ...avatar.file import read_avatar
-from ...avatar.strain import COLOR_RANGE
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import open_capture
 from ...capture.region import find_region
@@ -33,6 +32,7 @@ from .identity import file_digest, identity_of
 from .open_run import OpenedRun, open_run
 from .replay import replayed_views
 from .request import Extension, Refinement, Request
+from .strain_range import require_color_range
 
 START_SHARE = {"refine": 0.5, "extend": 0.3}
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
@@ -152,23 +152,18 @@ def starting_state(continuation: Continuation, strain_color: bool) -> TrainState
     """The parent's avatar as a state of training; strain_color: with coefficients of strain, zero where it had none.
 
     The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
-    Raises StgaError where the avatar is not the one that the continuation was made for, or its colors follow strain
-    beyond COLOR_RANGE, as those that an earlier version trained: they would change at once.
+    Raises StgaError where the avatar is not the one that the continuation was made for, or `require_color_range` does.
     """
     folder = continuation.parent
     if file_digest(folder / "avatar.npz") != continuation.avatar:
         raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
     avatar = read_avatar(folder / "avatar.npz")
-    splats, limits = avatar.splats, avatar.strain_range
-    if splats.strain_color.shape[1] and (
-        limits is None or ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any()
-    ):
-        raise StgaError(f"{folder / 'avatar.npz'}: colors follow strain as in an earlier version; train it anew")
-    state = new_state(splats)
+    require_color_range(folder / "avatar.npz", avatar)
+    state = new_state(avatar.splats)
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
         averaged = kept.averaged()
-        if all(np.array_equal(array, getattr(averaged, name)) for name, array in vars(splats).items()):
+        if all(np.array_equal(array, getattr(averaged, name)) for name, array in vars(avatar.splats).items()):
             parameters = Parameters(*(tensor.clone() for tensor in kept.average))
             zero = torch.zeros(len(kept))
             state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())

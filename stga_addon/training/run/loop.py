@@ -42,7 +42,7 @@ from .open_run import check_identity
 from .progress import Progress, Report
 from .replay import continued_order
 from .residual_file import write_residuals
-from .strain_range import trained_strain_range
+from .strain_range import require_color_range, trained_strain_range
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
@@ -193,6 +193,9 @@ class _Loop:
         self.evaluations = checkpoint.evaluations
         cut_metrics(self.out, checkpoint.iteration)
         self.lines = read_metrics(self.out)
+        path = self.out / "avatar.npz"
+        if not self._finished() and path.exists():
+            require_color_range(path, read_avatar(path))
         self._read_evaluation_views()
         write_run(self.out, self.run)  # capture, model and device may be others now
 

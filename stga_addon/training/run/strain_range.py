@@ -1,12 +1,14 @@
 """Range of strain that a run has trained on, within which its avatar's colors follow strain."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from ...avatar.file import read_avatar
-from ...avatar.strain import color_range, seen_range, strain_basis
+from ...avatar.file import Avatar, read_avatar
+from ...avatar.strain import COLOR_RANGE, color_range, seen_range, strain_basis
 from ...capture.model import Capture, evenly_spread
+from ...errors import StgaError
 from .folder import Continuation
 
 MAX_TIMESTEPS = 64
@@ -34,3 +36,15 @@ def trained_strain_range(
         return limits
     lowest, highest = np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])
     return np.stack([np.maximum(lowest, limits[:, 0]), np.minimum(highest, limits[:, 1])], axis=1)
+
+
+def require_color_range(path: Path, avatar: Avatar) -> None:
+    """Raise StgaError, naming the path, where an avatar's colors follow strain beyond COLOR_RANGE.
+
+    An earlier version trained it: more training would change these colors at once.
+    """
+    limits = avatar.strain_range
+    if avatar.splats.strain_color.shape[1] and (
+        limits is None or ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any()
+    ):
+        raise StgaError(f"{path}: colors follow strain as in an earlier version; train it anew")
