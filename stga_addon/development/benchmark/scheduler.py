@@ -132,3 +132,6 @@ class _Worker:
         reply = json.loads(line) if line else {"error": f"Worker exited unexpectedly. Log: {log}"}
         self._ready = "share" in reply
         self.error = reply.get("error", "")
+        if not self._ready:  # it ends: left unawaited, it would stay a process until the last run is trained
+            self.stop()
+            self.wait()

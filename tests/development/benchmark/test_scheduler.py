@@ -2,6 +2,8 @@
 
 import io
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +110,27 @@ def test_a_benchmark_is_interrupted_and_goes_on(toy: Capture, tmp_path: Path, mo
     assert printed == ["Deciding effects"]
     with pytest.raises(StgaError, match="holds a run with other settings"):
         run_benchmark(toy, run, VARIANTS, 3.0, 2, tmp_path, printed.append)
+
+
+def test_ended_workers_are_reaped(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches processes that have ended but are left unreaped until all other runs are trained."""
+    interpreter = tmp_path / "python"
+    interpreter.write_text("#!/bin/sh\necho '{\"share\": 0.1}'\nread share\necho '{\"done\": true}'\n")
+    interpreter.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(interpreter))
+    monkeypatch.setattr(scheduler, "TURN_S", 0.5)
+    started: list[subprocess.Popen[str]] = []
+
+    class Recorded(subprocess.Popen[str]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    ended: list[list[bool]] = []
+    monkeypatch.setattr(subprocess, "Popen", Recorded)
+    runs = [run_in(toy, tmp_path / name, seconds=1.0) for name in ("first", "second")]
+    train_in_turns(runs, lambda text: ended.append([process.returncode is not None for process in started]))
+    assert ended == [[], [False], [False, False], [True, True]]  # two starts, two turns
 
 
 @pytest.mark.slow
