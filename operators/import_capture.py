@@ -16,7 +16,7 @@ from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.scene.viewports import frame_head
 from ..stga_addon.tracking.folder import is_tracked
 from . import ids
-from .common import FileImport, file_path, flame_model_path, flame_property, reporting, scene_settings
+from .common import FileImport, file_path, flame_model_path, flame_property, is_head, reporting, scene_settings
 
 
 class ImportCapture(bpy.types.Operator, FileImport):
@@ -97,6 +97,7 @@ def bring_in(
 
     model = flame_model_path(context, flame)
     capture = open_capture(source, flame=model, principal_point=principal_point)
+    is_first = not any(is_head(thing) for thing in context.scene.objects)
     head = import_head(capture, warn=warn, correctives=correctives)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(model or "")
@@ -105,7 +106,8 @@ def bring_in(
     scene_settings(context).head = head
     _show_first_frame(context.scene, capture)
     _select_only(context, head)
-    _hide_start_up_cube(context)
+    if is_first:  # later on, a cube that is shown was shown by the user
+        _hide_start_up_cube(context)
     middle = central(cameras)
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, context.view_layer, False)

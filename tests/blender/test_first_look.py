@@ -57,6 +57,19 @@ def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved)
     assert (cube.name, cube.hide_get(), cube.hide_render) == ("Cube", not moved, not moved)
 
 
+def test_a_cube_that_the_artist_shows_again_stays(extension, tmp_path):
+    """Catches a cube that every import hides, also where it is meant to be seen."""
+    bpy.ops.mesh.primitive_cube_add()
+    cube, folder = bpy.context.object, str(write_mesh_capture(tmp_path / "capture"))
+    bpy.ops.stga.import_capture(directory=folder)
+    assert cube.hide_get()
+    cube.hide_set(False)
+    cube.hide_render = False
+    bpy.ops.stga.import_capture(directory=folder)
+    assert not cube.hide_get()
+    assert not cube.hide_render
+
+
 def test_pose_the_jaw_and_back(head):
     """Catches bones that stay hidden, another bone that is selected, and no way back."""
     layer = bpy.context.view_layer
