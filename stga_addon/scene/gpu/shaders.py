@@ -27,6 +27,8 @@ from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
 from .packing import CLIP_PLANES, LAYER_TEXELS, VIEW_TEXELS
 
+MIN_ALPHA = 1 / 255
+"""A splat adds nothing to a pixel where its alpha is less, as in the rasterizer; a pixel with less shows nothing."""
 TEXTURE_WIDTH = 2048
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
@@ -41,12 +43,12 @@ _DEFINES = f"""
 #define VIEW_TEXELS {VIEW_TEXELS}
 #define LAYER_TEXELS {LAYER_TEXELS}
 #define CLIP_PLANES {CLIP_PLANES}
+#define MIN_ALPHA {MIN_ALPHA!r}
 #define FROZEN_COLOR vec3({", ".join(f"{channel:.6f}" for channel in FROZEN_COLOR_SRGB)})
 """
 
 _PROJECTION_FRAGMENT = """
 const float LOW_PASS_PX2 = 0.3;
-const float MIN_ALPHA = 1.0 / 255.0;
 
 ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
 
@@ -170,7 +172,7 @@ _SPLAT_FRAGMENT = """
 void main()
 {
   float alpha = min(0.999, shade.a * exp(-0.5 * dot(offset, offset)));
-  if (alpha < 1.0 / 255.0) {
+  if (alpha < MIN_ALPHA) {
     discard;
   }
   color_out = vec4(shade.rgb * alpha, alpha);
@@ -209,7 +211,7 @@ void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy) - ivec2(corner_px.xy);
   vec4 splats = texelFetch(color_image, texel, 0), distances = texelFetch(depth_image, texel, 0);
-  if (splats.a < 1.0 / 255.0 || is_near_bone(vec2(texel) + 0.5) != (part.x > 0.5)) {
+  if (splats.a < MIN_ALPHA || is_near_bone(vec2(texel) + 0.5) != (part.x > 0.5)) {
     discard;
   }
   /* From z along the view axis to the depth of the projection: (x + y·z) / (z + w·z), by its matrix. */
@@ -277,6 +279,7 @@ def composite_shader() -> Any:
     many bones; bones: for each, two texels as `front_bones` returns them.
     """
     info = GPUShaderCreateInfo()
+    info.typedef_source(_DEFINES)
     info.vertex_in(0, "VEC2", "corner")
     info.fragment_out(0, "VEC4", "color_final")
     allow_depth_write(info)

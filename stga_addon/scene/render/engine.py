@@ -23,6 +23,7 @@ from ..display.colors import linear_to_srgb, srgb_to_linear
 from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer
+from ..gpu.shaders import MIN_ALPHA
 from ..gpu.viewport_display import ENGINE, is_drawn_by_engine, region_view, world_color
 from ..layers import SceneLayer
 from . import redraw
@@ -32,7 +33,6 @@ from .view_transform import InverseView, inverse_view, measure, needs_inverse
 from .viewport import RenderRequest, ViewportImage, ViewportRenderer
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
-MIN_DEPTH_ALPHA = 1 / 255  # pixels with less show nothing
 VIEW_TRANSFORM_UNKNOWN = (
     "The view transform could not be measured in time and changes the splats' colors; render again, or choose Standard"
 )
@@ -119,7 +119,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         if view is None and needs_inverse(scene):
             self.report({"WARNING"}, VIEW_TRANSFORM_UNKNOWN)
         assert image.depth is not None
-        covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_DEPTH_ALPHA)
+        covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_ALPHA)
         return {
             "Combined": combined(image.rgb, image.alpha, _background(scene), view),
             "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],

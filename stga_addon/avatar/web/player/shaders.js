@@ -3,6 +3,7 @@
 export const TEXTURE_WIDTH = 2048;
 export const SPLAT_TEXELS = 4; // xyz, triangle | rotation | scale, opacity | color
 export const FACE_TEXELS = 4; // rows of the frame in camera space | strain, selected
+const MIN_ALPHA = 1 / 255;
 
 const SH = [
   '-0.4886025119029199 * y',
@@ -61,7 +62,7 @@ flat out mat2 vToUnit;
 flat out vec4 vColor;
 
 const float SNAP = 0.07; // pixels: more than a corner moves to the driver's grid, of 1/16 pixel at the coarsest
-const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.15, MIN_ALPHA = 1.0 / 255.0;
+const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.15;
 
 ivec2 texel(int index) {
   return ivec2(index & ${TEXTURE_WIDTH - 1}, index >> ${Math.log2(TEXTURE_WIDTH)});
@@ -103,7 +104,7 @@ void main() {
   float det = sharp + LOW_PASS * (xx + yy - LOW_PASS); // never cancels to zero or below
   float opacity = shape.w;
   if (uAntialiased) opacity *= sqrt(sharp / det);
-  if (!(opacity >= MIN_ALPHA)) return;
+  if (!(opacity >= ${MIN_ALPHA})) return;
 
   float middle = 0.5 * (xx + yy);
   float longer = middle + length(vec2(0.5 * (xx - yy), xy));
@@ -111,7 +112,7 @@ void main() {
   axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
   vec2 deviation = vec2(sqrt(longer), sqrt(det / longer));
-  vec2 reach = corner * (sqrt(2.0 * log(255.0 * opacity)) * deviation + SNAP);
+  vec2 reach = corner * (sqrt(2.0 * log(opacity / ${MIN_ALPHA})) * deviation + SNAP);
   vec2 pixel = uFocal * center.xy / center.z + uCenter;
   vCenter = vec2(pixel.x, uSize.y - pixel.y); // gl_FragCoord counts from below
   vToUnit = mat2(vec2(axis.x, -axis.y) / deviation.x, -axis.yx / deviation.y);
@@ -139,7 +140,7 @@ out vec4 result;
 void main() {
   vec2 offset = (gl_FragCoord.xy - vCenter) * vToUnit; // in standard deviations
   float alpha = min(0.999, vColor.a * exp(-0.5 * dot(offset, offset)));
-  if (alpha < 1.0 / 255.0) discard;
+  if (alpha < ${MIN_ALPHA}) discard;
   result = vec4(vColor.rgb * alpha, alpha);
 }`;
 
