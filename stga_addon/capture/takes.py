@@ -33,8 +33,9 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
     starts = first_timesteps(takes)
     views: dict[str, tuple[View, ...]] = {}
     for take, start in zip(takes, starts, strict=True):
+        free = 1 + max((view.camera_index for members in views.values() for view in members), default=-1)
         for split, members in take.views.items():
-            views[split] = (*views.get(split, ()), *_shifted(members, start, first))
+            views[split] = (*views.get(split, ()), *_shifted(members, start, first, free))
     flame = [take.flame for take in takes]
     numbered = list(zip(takes, starts, strict=True))
 
@@ -75,15 +76,14 @@ def require_same_head(first: Capture, other: Capture) -> None:
         )
 
 
-def _shifted(views: Sequence[View], start: int, first: Capture) -> list[View]:
-    """The views at the joined timesteps, with indices for cameras that the first take does not have."""
+def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
+    """The views at the joined timesteps, with indices from `free` up for cameras that the first take does not have."""
     cameras = {view.camera_index: view.camera for members in first.views.values() for view in members}
-    offset = max(cameras, default=-1) + 1
     shifted = []
     for view in views:
         known, camera = cameras.get(view.camera_index), view.camera
         same = known is not None and np.allclose(known.world_to_camera, camera.world_to_camera, atol=1e-6)
-        index = view.camera_index if start == 0 or same else offset + start + view.camera_index
+        index = view.camera_index if start == 0 or same else free + view.camera_index
         shifted.append(replace(view, timestep=start + view.timestep, camera_index=index))
     return shifted
 

@@ -53,6 +53,19 @@ def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> 
     assert kept[1] not in before
 
 
+def test_cameras_of_different_takes_have_different_indices(toy: Capture) -> None:
+    """Catches two cameras that count as one because their takes begin as far apart as their numbers."""
+    start = max(toy.timesteps) + 1
+    (view,) = (view for view in toy.views["train"] if (view.timestep, view.camera_index) == (0, 0))
+    away = replace(view.camera, world_to_camera=np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.camera.world_to_camera)
+    second, third = (
+        replace(toy, views={"train": (replace(view, camera=away, camera_index=index),)}) for index in (start, 0)
+    )
+    joined = join_takes([toy, second, third])
+    indices = [found.camera_index for found in joined.views["train"][-2:]]
+    assert len({*indices, *(found.camera_index for found in toy.views["train"])}) == 2 + 3
+
+
 def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
     """Catches one person's expressions trained into another's avatar."""
     with pytest.raises(StgaError, match=r"^other: its neutral mesh is up to 1\.7 mm from that of"):
