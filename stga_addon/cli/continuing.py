@@ -9,6 +9,13 @@ from ..format import format_duration
 from .arguments import add_device, duration, usable_path, whole_number
 from .train import train_run
 
+BEGUN_WITH = {
+    "takes": "CAPTURE",
+    "select_only": "--select-only",
+    **{name: f"--{name}" for name in ("region", "frames", "growth", "out", "budget", "iterations", "seed")},
+}
+"""Options that a continuation begins with, which resuming it cannot change, and how a message names them."""
+
 
 def add_continued_run(parser: ArgumentParser, default_seconds: float) -> None:
     parser.add_argument("run_folder", type=usable_path, metavar="RUN", help="folder of a run")
@@ -49,11 +56,14 @@ def budget_of(options: Namespace, default_seconds: float) -> dict[str, Any]:
 
 
 def resume_continuation(options: Namespace) -> None:
-    """Continue a run that was stopped."""
+    """Continue a run that was stopped. Raises StgaError for an option that would have no effect."""
     from dataclasses import replace
 
     from ..training.run.open_run import device_of, open_run
 
+    for name, shown in BEGUN_WITH.items():
+        if getattr(options, name, None):
+            raise StgaError(f"{shown}: cannot be combined with --resume, which continues the run in RUN as it began")
     opened = open_run(options.run_folder, flame=options.flame)
     if opened.run.continuation is None:
         raise StgaError(f"{options.run_folder}: does not continue another run; resume it with `stga train --resume`")

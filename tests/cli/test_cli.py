@@ -633,6 +633,28 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (tmp_path / "anna_4").exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("refine", ("--region", "mouth")),
+        ("refine", ("--frames", "1-3")),
+        ("refine", ("--growth", "0.5")),
+        ("refine", ("--out", "anna_2")),
+        ("refine", ("--budget", "1m")),
+        ("extend", ("--iterations", "9")),
+        ("extend", ("--seed", "1")),
+        ("extend", ("smile",)),
+    ],
+)
+def test_resumed_continuations_take_no_other_choice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, option: tuple[str, ...]
+) -> None:
+    """Catches an option that has no effect and no message, such as a longer budget of a run that is resumed."""
+    message = refused(capsys, command, tmp_path, *option, "--resume")
+    expected = option[0] if option[0].startswith("--") else "CAPTURE"
+    assert f"{expected}: cannot be combined with --resume, which continues the run in RUN as it began" in message
+
+
 def test_extend(trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches an extended run that cannot be evaluated, rendered or extended again, and one that does not say what it
     learned and forgot."""
