@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..avatar.file import read_avatar
+from ..avatar.playback import DEFAULT_FPS
 from ..avatar.ply import read_ply
 from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import TURNTABLE_S, covered_angles, to_and_fro, turntable
@@ -55,9 +56,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--camera", type=whole_number(0), metavar="INDEX", help="camera of the video (default: the central one)"
     )
-    parser.add_argument("--fps", type=real_number, default=25.0, help="frames per second of the video (default 25)")
+    parser.add_argument("--fps", type=real_number, help=f"frames per second of the video (default {DEFAULT_FPS:g})")
     parser.add_argument(
-        "--seconds", type=real_number, default=TURNTABLE_S, metavar="S",
+        "--seconds", type=real_number, metavar="S",
         help=f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
     )  # fmt: skip
     parser.add_argument("--capture", type=usable_path, help="whose meshes drive the avatar (default: the run's)")
@@ -78,6 +79,7 @@ def run(options: Namespace) -> None:
 
     if options.video is not None and options.video.suffix.lower() != ".mp4":
         raise StgaError(f"{options.video}: a video's name ends in .mp4")
+    _check_film_options(options)
     if options.cameras is None and options.video is None and options.turntable is None:
         raise StgaError("--out needs --cameras, which says what to render, or --turntable")
     principal_point = options.principal_point or _principal_point(options.source)
@@ -92,6 +94,21 @@ def run(options: Namespace) -> None:
     else:
         assert views is not None
         _write_pictures(options.out, subject, views if options.motion is None else _every_timestep(subject, views))
+
+
+def _check_film_options(options: Namespace) -> None:
+    """Fill in the defaults of a video and a turntable. Raises StgaError for an option that would have no effect."""
+    turns = options.turntable is not None
+    films = turns or options.video is not None
+    for name, has_effect, needed, default in (
+        ("camera", films, "--video or --turntable", None),
+        ("fps", films, "--video or --turntable", DEFAULT_FPS),
+        ("seconds", turns, "--turntable", TURNTABLE_S),
+    ):
+        if getattr(options, name) is None:
+            setattr(options, name, default)
+        elif not has_effect:
+            raise StgaError(f"--{name}: has no effect without {needed}")
 
 
 @dataclass(frozen=True)
