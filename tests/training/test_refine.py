@@ -12,6 +12,7 @@ import pytest
 
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.model import Capture
+from stga_addon.capture.region import write_region
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import TrainState, tensors_of
 from stga_addon.training.run import continuation as module
@@ -128,6 +129,14 @@ def test_the_avatar_before_is_the_first_evaluation(parent: Path, toy: Capture, t
     assert (first["iteration"], last["iteration"]) == (0, ITERATIONS)
     assert {"psnr_region", "psnr_frames", "psnr_region_frames", "psnr_other_frames"} <= set(last)
     assert last["psnr_region"] > first["psnr_region"]
+
+
+def test_a_region_that_no_camera_faces_is_refused(parent: Path, toy: Capture, tmp_path: Path) -> None:
+    """Catches a refinement that has no view to train on, which ends in a traceback after the start."""
+    away = np.asarray(toy.neutral)[toy.faces].mean(1)[:, 2] < -0.09
+    write_region(tmp_path / "away.npz", away)
+    with pytest.raises(StgaError, match=r"region '.*away\.npz': faces no training camera from timestep 0 to 4"):
+        prepare_refinement(Refinement(parent, str(tmp_path / "away.npz"), iterations=ITERATIONS), "cpu")
 
 
 def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from .checkpoint import read_checkpoint
 from .folder import CHECKPOINT, Continuation, Run, Take
 from .identity import file_digest, identity_of
 from .open_run import OpenedRun, open_run
-from .replay import replayed_views
+from .replay import is_faced, replayed_views
 from .request import Extension, Refinement, Request
 from .strain_range import require_color_range
 
@@ -63,7 +63,8 @@ def prepare(wanted: Request, device: str, flame: Path | None = None) -> Prepared
 
 
 def prepare_refinement(wanted: Refinement, device: str, flame: Path | None = None) -> Prepared:
-    """Check what is asked for. Raises StgaError where the run, the region or the frames do not exist."""
+    """Check what is asked for. Raises StgaError where the run, the region or the frames do not exist, or no camera sees
+    the region."""
     opened = open_run(wanted.parent, flame=flame)
     capture = with_refined_tracking(opened.capture, wanted.parent)
     region = find_region(capture, wanted.region)
@@ -75,8 +76,11 @@ def prepare_refinement(wanted: Refinement, device: str, flame: Path | None = Non
         opened.run.settings, "refine", wanted.growth * count / len(face), wanted.seconds, wanted.iterations, wanted.seed
     )
     frames = wanted.frames or (min(capture.timesteps), max(capture.timesteps))
-    if not any(frames[0] <= view.timestep <= frames[1] for view in capture.views.get("train", ())):
+    views = [view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]]
+    if not views:
         raise StgaError(f"{wanted.parent}: its capture has no training views from timestep {frames[0]} to {frames[1]}")
+    if not is_faced(capture, views, region):
+        raise StgaError(f"region '{wanted.region}': faces no training camera from timestep {frames[0]} to {frames[1]}")
     run = replace(
         opened.run,
         settings=settings,

@@ -87,6 +87,11 @@ def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray)
     return [view for view, area in zip(views, seen, strict=True) if area >= MIN_REGION_SHARE * seen.max() > 0]
 
 
+def is_faced(capture: Capture, views: Sequence[View], region: np.ndarray) -> bool:
+    """Whether `views_of_region` finds any view; looks at views only until it does."""
+    return any(_facing_area(capture, view, region) > 0 for view in views)
+
+
 def _facing_area(capture: Capture, view: View, region: np.ndarray) -> float:
     """Pixels that the region's triangles facing the camera cover."""
     mesh = np.asarray(capture.mesh(view.timestep))
