@@ -48,7 +48,13 @@ def add_training(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--stop-when-flat", action="store_true", default=None, help="stop when more time no longer helps"
     )
-    parser.add_argument("--threshold", type=real_number, metavar="METERS", help="selection threshold")
+    parser.add_argument(
+        "--threshold",
+        type=real_number,
+        metavar="METERS",
+        help=f"movement from which --strategy selective selects a triangle (default {SelectionOptions.threshold:g}; "
+        "0.01 with --schedule paper)",
+    )
     add_effects(parser)
     add_device(parser)
     parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
@@ -177,13 +183,13 @@ def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
         changes["seconds"] = 120.0 if options.preset is None else _preset_seconds(capture, options.preset, device)
     if options.strategy is not None:
         changes["strategy"] = options.strategy
-    if options.threshold is not None:
-        changes["selection"] = SelectionOptions(threshold=options.threshold)
     flame = None if options.flame is None else options.flame.resolve()
     choices = parse_choices(options.effect)
     if choices or (options.schedule != "paper" and options.strategy != "gaussian-avatars"):
         changes["effects"] = choices
     settings = make_settings(schedule=options.schedule or "default", preset=options.preset, **changes)
+    if options.threshold is not None:
+        settings = replace(settings, selection=replace(settings.selection, threshold=options.threshold))
     return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings, device=device)
 
 

@@ -24,6 +24,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli import info
 from stga_addon.cli.main import main, make_parser
 from stga_addon.errors import StgaError
+from stga_addon.selection import SelectionOptions
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 
@@ -111,6 +112,13 @@ def test_train_with_defaults_and_every_option(root: Path, tmp_path: Path, capsys
     assert (run.settings.seed, run.settings.selection.threshold, run.settings.strategy) == (5, 0.0005, "selective")
     splats = read_avatar(out / "avatar.npz").splats
     assert (~splats.unbound).sum() == 6 * 320
+
+
+def test_a_threshold_changes_nothing_else_of_a_schedule(root: Path, tmp_path: Path) -> None:
+    """Catches the paper's settings with jaw and eyes left in, because a threshold replaced the whole selection."""
+    arguments = ["--schedule", "paper", "--threshold", "0.005", "--iterations", "1"]
+    assert main(["train", str(root), "--out", str(tmp_path / "run"), *arguments]) == 0
+    assert read_run(tmp_path / "run").settings.selection == SelectionOptions(threshold=0.005, zero_pose="all")
 
 
 def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
