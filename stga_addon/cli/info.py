@@ -4,6 +4,7 @@ import json
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
+from ..errors import StgaError
 from ..jobs.delegate import OpenHead
 from ..training.effect_plan import effect_plan_to_json, parse_choices
 from ..training.settings import make_settings
@@ -27,6 +28,8 @@ def run(options: Namespace) -> None:
     from ..effects.plan import describe_effects, plan_effects
     from ..raster.device import choose_device
 
+    if options.presets and not options.json:
+        raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
     capture = open_named_capture(options)
     plan: tuple[Any, ...] = ()
     if capture.views.get("train"):

@@ -74,6 +74,11 @@ def test_info(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "40 x 60" in text
 
 
+def test_info_of_presets_is_for_json(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an option that has no effect and no message."""
+    assert "--presets: has no effect without --json" in refused(capsys, "info", root, "--presets")
+
+
 def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a threshold that is ignored, timesteps without a line, and masks written under another timestep."""
     out = tmp_path / "selection.npz"
