@@ -16,8 +16,11 @@ NAME, HELP = "eval", "PSNR, SSIM and LPIPS on held-out views"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
-    parser.add_argument("run_folder", type=usable_path, metavar="RUN")
-    parser.add_argument("--split", choices=("train", "val", "test"), default="val")
+    parser.add_argument("run_folder", type=usable_path, metavar="RUN", help="folder of a run")
+    parser.add_argument(
+        "--split", choices=("train", "val", "test"), default="val", help="views to measure on (default val)"
+    )
+    parser.add_argument("--flame", type=usable_path, metavar="FILE", help="FLAME model file, if it has moved")
 
 
 def run(options: Namespace) -> None:

@@ -10,7 +10,7 @@ NAME, HELP = "job", "carry out the job that Blender's panel wrote: a tracking, a
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
-    parser.add_argument("run_folder", type=usable_path, metavar="RUN")
+    parser.add_argument("run_folder", type=usable_path, metavar="RUN", help="folder that holds job/job.json")
 
 
 def run(options: Namespace) -> None:

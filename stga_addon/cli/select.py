@@ -13,8 +13,19 @@ NAME, HELP = "select", "show which triangles each frame selects for training"
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_capture(parser, head)
-    parser.add_argument("--threshold", type=real_number, default=SelectionOptions.threshold, metavar="METERS")
-    parser.add_argument("--zero-pose", choices=("head", "all"), default="head")
+    parser.add_argument(
+        "--threshold",
+        type=real_number,
+        default=SelectionOptions.threshold,
+        metavar="METERS",
+        help=f"movement from which a triangle is selected (default {SelectionOptions.threshold:g})",
+    )
+    parser.add_argument(
+        "--zero-pose",
+        choices=("head", "all"),
+        default="head",
+        help="FLAME motion that does not count: the head's (default), or the jaw's and the eyes' as well",
+    )
     parser.add_argument("--out", type=usable_path, metavar="NPZ", help="also write timestep -> triangles")
 
 

@@ -306,6 +306,17 @@ def test_export_refuses_what_does_not_fit(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_eval_with_a_model_that_has_moved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a run that cannot be measured any more because its FLAME file is elsewhere now."""
+    root, model = factory.write_flame_capture(tmp_path / "flame")
+    out, elsewhere = tmp_path / "run", tmp_path / "elsewhere.npz"
+    options = ["--flame", str(model), "--iterations", "2", "--strategy", "gaussian-avatars"]
+    assert main(["train", str(root), "--out", str(out), *options]) == 0
+    model.rename(elsewhere)
+    assert "cannot be read" in refused(capsys, "eval", out)
+    assert main(["eval", str(out), "--flame", str(elsewhere)]) == 0
+
+
 def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a pair without motion, and one that is made up for a mesh capture, which has none."""
     root, model = factory.write_flame_capture(tmp_path / "flame")
