@@ -7,7 +7,6 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.common import register_classes, unregister_classes
 from ..operators.environment import environment_folder, has_training_python
-from ..operators.render_engine import render_device_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, status_folder
 from ..stga_addon.worker.status import WorkerState
@@ -32,7 +31,15 @@ class Preferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
     )
 
-    render_device: render_device_property()
+    render_device: bpy.props.EnumProperty(
+        name="Rendering Device",
+        description="Device that renders splats for videos, and for images where Blender has no GPU context",
+        items=(
+            ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
+            ("cpu", "CPU", "The processor"),
+            ("gpu", "GPU", "A GPU; rendering fails if none works"),
+        ),
+    )
 
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "flame_model")
