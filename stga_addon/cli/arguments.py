@@ -25,10 +25,10 @@ def add_capture(command: argparse.ArgumentParser, head: OpenHead | None) -> None
     add_principal_point(command)
 
 
-def add_principal_point(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--principal-point", choices=tuple(PRINCIPAL_POINTS), help="what cy means in the capture (default vhap)"
-    )
+def add_principal_point(
+    command: argparse.ArgumentParser, help: str = "what cy means in the capture (default vhap)"
+) -> None:
+    command.add_argument("--principal-point", choices=tuple(PRINCIPAL_POINTS), help=help)
 
 
 def add_avatar(command: argparse.ArgumentParser, name: str, metavar: str, head: OpenHead | None) -> None:

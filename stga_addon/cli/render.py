@@ -70,8 +70,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
     )
     add_device(parser)
-    parser.add_argument("--background", type=color, default="white", help="white, black or R,G,B in 0…1")
-    add_principal_point(parser)
+    parser.add_argument("--background", type=color, default="white", help="white (default), black or R,G,B in 0…1")
+    add_principal_point(parser, "what cy means in the file of --cameras (default: as in training; of a PLY vhap)")
 
 
 def run(options: Namespace) -> None:
