@@ -1,5 +1,6 @@
 """Render an avatar: one PNG per camera entry, a video of its motion, or a turntable."""
 
+import itertools
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -133,7 +134,7 @@ def _write_pictures(folder: Path, subject: _Subject, views: list[View]) -> None:
 
     from ..raster.render import to_uint8
 
-    names = _unique_names([view.name for view in views])
+    names = unique_names([view.name for view in views])
     for view, name in zip(tqdm(views, desc="Rendering", unit="image"), names, strict=True):
         with replacing(folder / name) as partial:
             Image.fromarray(to_uint8(subject.image(view))).save(partial, format="PNG")
@@ -256,14 +257,14 @@ def _every_timestep(subject: _Subject, views: list[View]) -> list[View]:
     ]
 
 
-def _unique_names(paths: list[str]) -> list[str]:
+def unique_names(paths: list[str]) -> list[str]:
     """File names with the suffix .png; where entries share one, their folders become part of it, then a number."""
     pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
     names = [png.name for png in pngs]
     if len(set(names)) < len(names):
         names = ["_".join(part for part in png.parts if part not in ("..", "/")) for png in pngs]
-    unique: list[str] = []
+    unique: dict[str, None] = {}
     for name in names:
-        candidates = (name, *(f"{PurePosixPath(name).stem}_{n}.png" for n in range(2, len(names) + 2)))
-        unique.append(next(c for c in candidates if c not in unique))
-    return unique
+        numbered = (f"{PurePosixPath(name).stem}_{n}.png" for n in itertools.count(2))
+        unique[next(c for c in itertools.chain((name,), numbered) if c not in unique)] = None
+    return list(unique)

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from time import process_time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -23,6 +24,7 @@ from stga_addon.avatar.ply import read_ply
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import info
 from stga_addon.cli.main import main, make_parser
+from stga_addon.cli.render import unique_names
 from stga_addon.errors import StgaError
 from stga_addon.selection import SelectionOptions
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -228,6 +230,15 @@ def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
     assert {"a_0.png", "b_0.png"} <= set(pictures(out))
     assert all(name.endswith(".png") for name in pictures(out))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball", "out"]
+
+
+def test_names_of_a_long_capture() -> None:
+    """Catches minutes before the first image of thousands, and two images with one name."""
+    paths = [f"images/{timestep:05d}_{camera:02d}.png" for timestep in range(1000) for camera in range(16)]
+    begin = process_time()
+    assert unique_names(paths) == [Path(path).name for path in paths]
+    assert process_time() - begin < 5
+    assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == ["a.png", "a_2.png", "a_2_2.png", "a_3.png"]
 
 
 def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
