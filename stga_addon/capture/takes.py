@@ -1,7 +1,7 @@
 """Several takes of one head as one capture."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
 from typing import TypeVar
@@ -33,7 +33,7 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
     starts = first_timesteps(takes)
     views: dict[str, tuple[View, ...]] = {}
     for take, start in zip(takes, starts, strict=True):
-        free = 1 + max((view.camera_index for members in views.values() for view in members), default=-1)
+        free = _first_free_index(take, start, first, views)
         for split, members in take.views.items():
             views[split] = (*views.get(split, ()), *_shifted(members, start, first, free))
     flame = [take.flame for take in takes]
@@ -76,8 +76,19 @@ def require_same_head(first: Capture, other: Capture) -> None:
         )
 
 
+def _first_free_index(take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]) -> int:
+    """What is added to the indices of a take's own cameras, so that none is that of a camera in `joined`.
+
+    Where possible it counts from the take's start: the identities of runs hold these indices.
+    """
+    taken = {view.camera_index for members in joined.values() for view in members}
+    free = 1 + start + max((view.camera_index for members in first.views.values() for view in members), default=-1)
+    collides = any(free + view.camera_index in taken for members in take.views.values() for view in members)
+    return 1 + max(taken) if collides else free
+
+
 def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
-    """The views at the joined timesteps, with indices from `free` up for cameras that the first take does not have."""
+    """The views at the joined timesteps; `free` is added to the indices of cameras that the first take does not have."""
     cameras = {view.camera_index: view.camera for members in first.views.values() for view in members}
     shifted = []
     for view in views:

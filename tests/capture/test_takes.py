@@ -64,6 +64,7 @@ def test_cameras_of_different_takes_have_different_indices(toy: Capture) -> None
     joined = join_takes([toy, second, third])
     indices = [found.camera_index for found in joined.views["train"][-2:]]
     assert len({*indices, *(found.camera_index for found in toy.views["train"])}) == 2 + 3
+    assert indices[0] == 4 + 2 * start  # as in the identities of runs that have been extended
 
 
 def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
