@@ -135,6 +135,10 @@ def _write_pictures(folder: Path, subject: _Subject, views: list[View]) -> None:
     from ..raster.render import to_uint8
 
     names = unique_names([view.name for view in views])
+    captured, target = {view.image for view in views}, folder.resolve()
+    overwritten = next((name for name in names if target / name in captured), None)
+    if overwritten is not None:
+        raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
     for view, name in zip(tqdm(views, desc="Rendering", unit="image"), names, strict=True):
         with replacing(folder / name) as partial:
             Image.fromarray(to_uint8(subject.image(view))).save(partial, format="PNG")

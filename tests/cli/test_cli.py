@@ -232,6 +232,17 @@ def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball", "out"]
 
 
+def test_images_of_the_capture_are_not_overwritten(
+    trained: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a recording lost to a rendering, which has the names of its images."""
+    before = {path.name: path.read_bytes() for path in (root / "images").iterdir()}
+    arguments = ["--cameras", root / "transforms_val.json", "--out", root / "meshes" / ".." / "images"]
+    message = refused(capsys, "render", trained, *arguments, "--device", "cpu")
+    assert "is an image of the capture; choose another --out" in message
+    assert {path.name: path.read_bytes() for path in (root / "images").iterdir()} == before
+
+
 def test_names_of_a_long_capture() -> None:
     """Catches minutes before the first image of thousands, and two images with one name."""
     paths = [f"images/{timestep:05d}_{camera:02d}.png" for timestep in range(1000) for camera in range(16)]
