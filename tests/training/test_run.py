@@ -236,6 +236,14 @@ def test_a_folder_with_a_run_is_not_overwritten(toy: Capture, unbroken: Path, tm
     assert {p.name: p.read_bytes() for p in unbroken.iterdir()} == before
 
 
+def test_a_run_is_not_put_into_its_capture(toy: Capture) -> None:
+    """Catches files of a run among those of a recording, which nothing is to change."""
+    before = sorted(path.name for path in toy.root.iterdir())
+    with pytest.raises(StgaError, match="is the folder of the capture"):
+        train(toy, toy.root, make_run(toy))
+    assert sorted(path.name for path in toy.root.iterdir()) == before
+
+
 def test_a_capture_without_training_views(toy: Capture, tmp_path: Path) -> None:
     """Catches an endless wait for views that never come, and a folder made for nothing."""
     for views in ({}, {"train": (), "val": toy.views["val"]}):

@@ -70,9 +70,9 @@ def train(
     selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
     checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
     falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
-    Raises StgaError where the capture has nothing to train on, the folder is in use or holds another run, or
-    STGA_LPIPS names a file without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar and checkpoint
-    are saved, a second one at once.
+    Raises StgaError where the capture has nothing to train on, the folder is in use, is the capture's or holds another
+    run or one that cannot be continued (`require_color_range`), or STGA_LPIPS names a file without its weights. A first
+    Ctrl-C raises KeyboardInterrupt when avatar and checkpoint are saved, a second one at once.
     """
     try:
         return _train(capture, out, run, selection, resume, report)
@@ -94,6 +94,8 @@ def _train(
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
         raise StgaError(f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on")
+    if out.resolve() == capture.root:
+        raise StgaError(f"{out}: is the folder of the capture; train into another one")
     with locked(out):
         has_run = (out / "run.json").exists()
         if has_run and not resume:
