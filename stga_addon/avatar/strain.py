@@ -19,8 +19,8 @@ COLOR_RANGE = np.array(
 a color fitted to compression is not to be continued into stretch. Within this range, a mesh at rest has
 −MIN_COMPRESSION, not 0: a constant share of the colors, which the splats' `sh` are trained beside."""
 RANGE_MARGIN = 1.2
-"""A triangle's range of strain, as a multiple of what was seen: training may have seen a few timesteps more than were
-measured, and refined tracking moves them."""
+"""How far from rest colors follow a triangle's strain, as a multiple of what was seen: training may have seen a few
+timesteps more than were measured, and refined tracking moves them."""
 MIN_SQUARED_NORMAL = 1e-24
 """Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
 

@@ -88,7 +88,7 @@ def _first_free_index(take: Capture, start: int, first: Capture, joined: Mapping
 
 
 def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
-    """The views at the joined timesteps; `free` is added to the indices of cameras that the first take does not have."""
+    """The views at the joined timesteps; `free` is added to indices of cameras that the first take does not have."""
     cameras = {view.camera_index: view.camera for members in first.views.values() for view in members}
     shifted = []
     for view in views:
