@@ -105,7 +105,7 @@ def color_range(count: int) -> np.ndarray:
 
 def rest_strain(limits: np.ndarray) -> np.ndarray:
     """Strain (…, 3) of a mesh at rest within limits (…, 2, 3)."""
-    return np.clip(np.float32(0), limits[..., 0, :], limits[..., 1, :])
+    return np.asarray(np.clip(np.float32(0), limits[..., 0, :], limits[..., 1, :]))
 
 
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
