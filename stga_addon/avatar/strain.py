@@ -124,7 +124,7 @@ def range_with_margin(rest: np.ndarray, strains: Iterable[np.ndarray]) -> np.nda
     for strain in strains:
         wider = rest + np.float32(RANGE_MARGIN) * (strain - rest)
         seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], wider), np.maximum(seen[:, 1], wider)
-    return seen
+    return np.asarray(seen)
 
 
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
