@@ -21,7 +21,7 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, ExtendStrategy
 from stga_addon.training.run import continuation
-from stga_addon.training.run.continuation import prepare_extension
+from stga_addon.training.run.continuation import START_SHARE, prepare_extension
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
@@ -29,6 +29,7 @@ from stga_addon.training.run.open_run import open_run
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import EXTEND_REPLAY_SHARE, continued_order
 from stga_addon.training.run.request import Extension
+from stga_addon.training.schedule import learning_rates
 
 from .test_run import assert_same_state
 from .toys import quick_settings
@@ -166,6 +167,14 @@ def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
     is_old = [view.timestep < 4 for view in views]
     assert sum(is_old) == round(40 * EXTEND_REPLAY_SHARE)
     assert not any(first and second for first, second in pairwise(is_old))
+
+
+def test_strain_color_begins_with_its_first_rate(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches strain coefficients as slow as colors that the old takes have trained, and other rates that jump."""
+    original = read_run(parent).settings.rates
+    extended = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu").run.settings.rates
+    middle = learning_rates(original, START_SHARE)
+    assert learning_rates(extended, 0.0) == pytest.approx({**middle, "strain_color": original.strain_color})
 
 
 def test_what_new_takes_need_is_trained_first() -> None:

@@ -34,7 +34,7 @@ from .replay import is_faced, replayed_views
 from .request import Extension, Refinement, Request
 from .strain_range import require_color_range
 
-START_SHARE = {"refine": 0.5, "extend": 0.3}
+START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
@@ -191,14 +191,21 @@ def continued_settings(
     iterations: int | None,
     seed: int,
 ) -> TrainingSettings:
-    """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a value not allowed."""
+    """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a value not allowed.
+
+    An extension's strain color begins with the first rate of the run: other expressions strain triangles in directions
+    that the old takes never showed.
+    """
+    rates = late_rates(settings.rates, START_SHARE)
+    if strategy == "extend":
+        rates = replace(rates, strain_color=settings.rates.strain_color)
     continued = replace(
         settings,
         strategy=strategy,
         seconds=seconds,
         iterations=iterations,
         seed=seed,
-        rates=late_rates(settings.rates, START_SHARE[strategy]),
+        rates=rates,
         views_per_visit=1,
         warm_up_share=0.0,
         sh_steps=(0.0,) * settings.sh_degree,
