@@ -1,7 +1,7 @@
 """Compares ways to extend an avatar by a take, and to refine a region of it, at equal training time.
 
     python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2] [--refine mouth]
-                                [--arms extend all-in-turn anew refine] [--parent RUN]
+                                [--arms extend all-in-turn anew refine] [--parent RUN] [--report FILE]
 
 The training timesteps are split into two takes, alternating by how much of the face moves. An avatar is trained on the
 first; each arm then continues it for the same time, but training anew on both takes has three times as long. With
@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", help="only these (names as in the table)")
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     parser.add_argument("--folder", type=Path, default=Path("out/extend"))
+    parser.add_argument("--report", type=Path, help="also write the tables of all seeds into this file")
     options = parser.parse_args()
     if options.parent is not None and options.refine is None:
         parser.error("--parent needs --refine")
@@ -93,8 +94,10 @@ def main() -> None:
             for name, arm in arms.items():
                 if not options.arms or name in options.arms:
                     runs.setdefault(kind, {}).setdefault(name, []).append(compare(name, prepared, arm, options))
-    for of_kind in runs.values():
-        print("\n".join(["", *table(of_kind), "", *differences(of_kind)]))
+    report = "\n\n".join("\n".join([*table(of_kind), "", *differences(of_kind)]) for of_kind in runs.values())
+    print(f"\n{report}")
+    if options.report is not None:
+        options.report.write_text(report + "\n", encoding="utf-8")
 
 
 def comparisons(options: argparse.Namespace, seed: int) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
@@ -290,7 +293,7 @@ def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
         shares = [time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"] for lines, anew in pairs]
         found.append(f"98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time")
     found += [f"region: {name} over before {gain(name, 'region', None)} dB" for name in runs if "refine" in name]
-    return found
+    return [f"- {line}" for line in found]
 
 
 def spread(values: list[float], digits: int = 2) -> str:

@@ -2,9 +2,9 @@
 
     python benchmarks/results.py CAPTURE [CAPTURE …] [--out docs/results.md] [--folder out/results]
 
-The first capture answers every question, further ones the comparison at equal time. A FLAME capture brings its model
-as `flame_model.npz` in its folder, as the demo's does. Takes about half an hour per capture on an otherwise idle
-machine. Runs stay in --folder; finished ones are not repeated.
+The first capture answers every question, further ones the comparison at equal time and how an avatar is extended. A
+FLAME capture brings its model as `flame_model.npz` in its folder, as the demo's does. Takes about three quarters of an
+hour per capture on an otherwise idle machine. Runs stay in --folder; finished ones are not repeated.
 """
 
 import argparse
@@ -32,6 +32,17 @@ training timesteps, 15 training cameras at 275×401 and a tracked mesh of 10,696
 PARTS = (("whole image", ""), ("head", "_mask"), ("moving region", "_moving"))
 """Row of the table and suffix of the metrics, as `stga eval` writes them."""
 
+EXTEND_ARGUMENTS = (
+    *("--base", "1200", "--seconds", "20", "--seeds", "0", "1", "2", "--refine", "mouth"),
+    *("--arms", "extend", "all-in-turn", "all-new-only", "anew", "refine", "all"),
+)
+EXTEND_WORDS = """ splits the training timesteps into two takes and trains an
+avatar on the first (*before*). Each way to go on has the same time, training *anew* on both takes three times as long;
+*all-in-turn* trains all splats in views of both takes, *all-new-only* in those of the new take. *take_1*: the old take,
+*take_2*: the new one. *region*: the mouth, which *refine* trains alone and *all* with everything else. PSNR of the
+held-out camera. *s to same*: seconds until the moving region of the new take (or the region) is as good as
+*all-in-turn* (or *all*) leaves it; *s to 98 %*: until both takes have 98 % of the PSNR that *anew* ends with."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -52,6 +63,8 @@ def main() -> None:
         sections += benchmark_section(title, capture, folder / f"benchmark-{capture.name}", arguments)
     title = f"What does a single setting cost or bring? ({first.name})"
     sections += benchmark_section(title, first, folder / "knobs", ["--knobs", "--budget", "10s", "--seeds", "1"])
+    for capture in options.captures:
+        sections += extend_section(capture, folder / f"extend-{capture.name}")
     options.out.write_text("\n".join(sections), encoding="utf-8")
     print(options.out)
 
@@ -98,14 +111,31 @@ def benchmark_section(title: str, capture: Path, out: Path, arguments: list[str]
     return [f"## {title}", "", f"`stga benchmark {capture.name} {' '.join(arguments)}`", "", report, ""]
 
 
+def extend_section(capture: Path, folder: Path) -> list[str]:
+    """The report of `benchmarks/extend.py`: extending and refining against the other ways to go on."""
+    report, arguments = folder / "report.md", EXTEND_ARGUMENTS
+    if not report.exists():
+        call(
+            str(Path(__file__).with_name("extend.py")), str(capture), *flame_of(capture), *arguments,
+            "--folder", str(folder), "--report", str(report),
+        )  # fmt: skip
+    title = f"## What do extending and refining a trained avatar bring? ({capture.name})"
+    command = f"`python benchmarks/extend.py {capture.name} {' '.join(arguments)}`"
+    return [title, "", command + EXTEND_WORDS, "", report.read_text(encoding="utf-8")]
+
+
 def flame_of(capture: Path) -> list[str]:
     model = capture / "flame_model.npz"
     return ["--flame", str(model)] if model.exists() else []
 
 
 def stga(*arguments: str) -> None:
-    print("stga", *arguments, flush=True)
-    subprocess.run([sys.executable, "-m", "stga_addon", *arguments], check=True)
+    call("-m", "stga_addon", *arguments)
+
+
+def call(*arguments: str) -> None:
+    print("python", *arguments, flush=True)
+    subprocess.run([sys.executable, *arguments], check=True)
 
 
 if __name__ == "__main__":
