@@ -1,6 +1,7 @@
 """Fixtures that several test folders share."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -9,6 +10,9 @@ from capture import factory
 
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+
+# A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
