@@ -183,7 +183,7 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
     region = np.any(list(prepared.selection.values()), axis=0)
-    base = Trainer(capture, settings, prepared.selection, starting_state(continuation, settings.strain_color))
+    base = Trainer(capture, settings, prepared.selection, starting_state(continuation, settings, len(capture.faces)))
     share = float(region[base.state.face.numpy()].mean())
     grown = replace(settings, growth=share, density_interval=DENSITY_INTERVAL)
     every = view_order(capture.views["train"], 1, seed)
@@ -206,7 +206,7 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     """Train one arm; returns and prints its quality before, during and after."""
     assert prepared.run.continuation is not None
     capture, clock = prepared.capture, CLOCKS[options.clock]
-    state = None if arm.anew else starting_state(prepared.run.continuation, arm.settings.strain_color)
+    state = None if arm.anew else starting_state(prepared.run.continuation, arm.settings, len(prepared.capture.faces))
     trainer = Trainer(capture, arm.settings, prepared.selection or {}, state)
     trainer.strategy = arm.strategy
     region = arm_region(prepared)

@@ -86,6 +86,17 @@ def face_frames(
     return FaceFrames(origin, rotation, scale, deformed)
 
 
+def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
+    """The frames with their origins moved by shift (F, 3), in each triangle's own axes and unit."""
+    moved = frames.scale[:, None] * np.einsum("fij,fj->fi", frames.rotation, shift)
+    return replace(frames, origin=frames.origin + moved)
+
+
+def position_shift(strain_position: np.ndarray, nearby: np.ndarray) -> np.ndarray:
+    """(F, 3) for `shifted_frames`: strain_position (F, 3 components, 3 axes) times `nearby_strain` (F, 3)."""
+    return np.asarray(np.einsum("fk,fkc->fc", nearby, strain_position))
+
+
 def frame_backward(
     vertices: np.ndarray,
     faces: np.ndarray,

@@ -12,9 +12,9 @@ import numpy as np
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
-from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
+from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames, position_shift, shifted_frames
 from .splats import MAX_SH_DEGREE, Splats
-from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
+from .strain import STRAIN_COMPONENTS, StrainBasis, nearby_strain, strain_basis
 
 FORMAT = "stga-avatar"
 VERSION = 2
@@ -34,8 +34,10 @@ class Avatar:
     background  red, green, blue in 0 to 1 that it was trained against
     antialiased  whether it was trained with opacity compensation (`render_forward`), and is rendered so
     principal_point  convention of the capture that it was trained on (`read_transforms`)
-    strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors follow (`avatar.strain`);
-                None: the same for all, ±MAX_STRAIN
+    strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and positions follow
+                (`avatar.strain`); None: the same for all, ±MAX_STRAIN
+    strain_position  (F, 3, 3) float32 how far a triangle's splats move with its `nearby_strain`: for each component of
+                strain a vector in the triangle's frame; None where positions follow the mesh alone
     """
 
     splats: Splats
@@ -48,10 +50,20 @@ class Avatar:
     antialiased: bool = False
     principal_point: str = "vhap"
     strain_range: np.ndarray | None = None
+    strain_position: np.ndarray | None = None
+
+    @property
+    def follows_strain(self) -> bool:
+        """Whether colors or positions depend on the strain of the mesh."""
+        return self.splats.strain_color.shape[1] > 0 or self.strain_position is not None
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
-        """The triangles' local frames on a posed mesh (V, 3), with strain where the splats' colors follow it."""
-        return face_frames(mesh, self.faces, self.neutral, self.convention, self._strain, self._areas)
+        """The triangles' local frames on a posed mesh (V, 3), with strain, and moved by it, where splats follow it."""
+        basis = self._strain
+        frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
+        if self.strain_position is None or basis is None:
+            return frames
+        return shifted_frames(frames, position_shift(self.strain_position, nearby_strain(basis, frames.strain)))
 
     @cached_property
     def _areas(self) -> np.ndarray:
@@ -59,8 +71,7 @@ class Avatar:
 
     @cached_property
     def _strain(self) -> StrainBasis | None:
-        strained = self.splats.strain_color.shape[1] > 0
-        return strain_basis(self.neutral, self.faces, self.strain_range) if strained else None
+        return strain_basis(self.neutral, self.faces, self.strain_range) if self.follows_strain else None
 
 
 def write_avatar(path: Path, avatar: Avatar) -> None:
@@ -82,8 +93,9 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     arrays = {name: getattr(avatar.splats, name) for name in _SPLAT_FIELDS}
     arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
     arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
-    if avatar.strain_range is not None:
-        arrays["strain_range"] = avatar.strain_range
+    for name in _STRAIN_FIELDS:
+        if getattr(avatar, name) is not None:
+            arrays[name] = getattr(avatar, name)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -109,7 +121,7 @@ def read_avatar(path: Path) -> Avatar:
         background=tuple(header["background"]),
         antialiased=header["antialiased"],
         principal_point=header["principal_point"],
-        strain_range=arrays.get("strain_range"),
+        **{name: arrays.get(name) for name in _STRAIN_FIELDS},
     )
     _check(path, avatar)
     return avatar
@@ -126,6 +138,8 @@ _SPLAT_FIELDS: dict[str, tuple[str, tuple[int, ...]]] = {
     "unbound": ("bool", ()),
     "strain_color": ("float32", (-1, 3)),
 }
+_STRAIN_FIELDS = {"strain_range": (2, STRAIN_COMPONENTS), "strain_position": (STRAIN_COMPONENTS, 3)}
+"""Arrays by triangle that an avatar may lack: the shape after the number of triangles."""
 
 
 def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -176,8 +190,9 @@ def _check(path: Path, avatar: Avatar) -> None:
     if avatar.splats.strain_color.shape[1] not in (0, STRAIN_COMPONENTS):
         size = avatar.splats.strain_color.shape[1]
         raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAIN_COMPONENTS}")
-    if avatar.strain_range is not None:
-        _check_array(path, "strain_range", avatar.strain_range, "float32", (len(avatar.faces), 2, STRAIN_COMPONENTS))
+    for name, tail in _STRAIN_FIELDS.items():
+        if getattr(avatar, name) is not None:
+            _check_array(path, name, getattr(avatar, name), "float32", (len(avatar.faces), *tail))
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))

@@ -1,4 +1,4 @@
-"""Strain of triangles, on which splat colors may depend: wrinkles darken where skin is compressed."""
+"""Strain of triangles, which colors and positions may follow: skin that is compressed darkens and bulges."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,6 +21,8 @@ a color fitted to compression is not to be continued into stretch. Within this r
 RANGE_MARGIN = 1.2
 """How far from rest colors follow a triangle's strain, as a multiple of what was seen: training may have seen a few
 timesteps more than were measured, and refined tracking moves them."""
+AVERAGING_ROUNDS = 3
+"""How often `nearby_strain` averages over triangles that share an edge: a bulge moves more than one triangle."""
 MIN_SQUARED_NORMAL = 1e-24
 """Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
 
@@ -37,6 +39,8 @@ class StrainBasis:
     touching: of each of the first vertices in that order its first triangle, of those with two their second, …
     share (T, 1): a third of one over how many triangles touch each vertex in that order.
     range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
+    neighbors: arrays (F,): a triangle that shares an edge with each triangle, another one, …; F where there is none.
+    neighbor_share (F, 1): one over how many neighbors a triangle has and itself.
     """
 
     faces: np.ndarray
@@ -48,6 +52,8 @@ class StrainBasis:
     touching: list[np.ndarray]
     share: np.ndarray
     range: np.ndarray
+    neighbors: list[np.ndarray]
+    neighbor_share: np.ndarray
 
 
 def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None) -> StrainBasis:
@@ -66,6 +72,8 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
     across = np.cross(normal, along) * np.sqrt(inverse)
     corners = np.ascontiguousarray(faces.T, np.intp)
     order, count, touching = _touching(corners, len(neutral))
+    neighbors = edge_neighbors(faces)
+    sharing = sum((column < len(faces) for column in neighbors), np.zeros(len(faces), np.float32))
     twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
     if strain_range is None:
         ends = np.array([[-MAX_STRAIN], [MAX_STRAIN]], np.float32)
@@ -85,6 +93,8 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
         touching=touching,
         share=(1 / (3 * count[:, None])).astype(np.float32),
         range=_by_component(strain_range),
+        neighbors=neighbors,
+        neighbor_share=(1 / (1 + sharing))[:, None].astype(np.float32),
     )
 
 
@@ -96,6 +106,47 @@ def _touching(corners: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndar
     first, sorted_count = (np.cumsum(count) - count)[order], count[order]
     touching = [triangles[first[sorted_count > nth] + nth] for nth in range(max(sorted_count[0], 1))]
     return order, sorted_count[sorted_count > 0], touching
+
+
+def edge_neighbors(faces: np.ndarray) -> list[np.ndarray]:
+    """Arrays (F,) of the triangles that share an edge with each of faces (F, 3), once an edge; F where there is none.
+
+    An edge of more than two triangles makes all of them neighbors.
+    """
+    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
+    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(edge.ravel(), kind="stable")
+    owner, size = order // 3, count[edge.ravel()[order]]
+    place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    pairs = []
+    for step in range(1, int(count.max(initial=1))):
+        other = owner[np.arange(len(order)) - place + (place + step) % size]
+        shared = (size > step) & (other != owner)
+        pairs.append(np.stack([owner[shared], other[shared]], -1))
+    one, other = np.concatenate([*pairs, np.zeros((0, 2), np.intp)]).T
+    by_one = np.argsort(one, kind="stable")
+    one, other = one[by_one], other[by_one]
+    rank = np.arange(len(one)) - np.searchsorted(one, one)
+    neighbors = [np.full(len(faces), len(faces), np.intp) for _ in range(int(rank.max(initial=-1)) + 1)]
+    for nth, column in enumerate(neighbors):
+        column[one[rank == nth]] = other[rank == nth]
+    return neighbors
+
+
+def nearby_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
+    """Strain (F, 3) float32 around each triangle, which positions follow: 0 for a mesh at rest.
+
+    strain (F, 3): of `face_strain`. Less that at rest, then AVERAGING_ROUNDS times the mean of a triangle and those
+    that share an edge with it, component by component.
+    """
+    rows = np.zeros((len(strain) + 1, STRAIN_COMPONENTS), np.float32)  # the last one for a neighbor that is missing
+    rows[:-1] = strain - rest_strain(basis.range)
+    for _ in range(AVERAGING_ROUNDS):
+        total = rows[:-1].copy()
+        for column in basis.neighbors:
+            total += np.take(rows, column, axis=0)
+        np.multiply(total, basis.neighbor_share, out=rows[:-1])
+    return rows[:-1]
 
 
 def color_range(count: int) -> np.ndarray:

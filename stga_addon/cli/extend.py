@@ -58,8 +58,9 @@ def run(options: Namespace) -> None:
     share = np.any(list(prepared.selection.values()), axis=0).mean()
     print(f"takes: {1 + len(prepared.run.takes)}; the new ones need {share:.0%} of the triangles")
     run = with_effects_of_takes(prepared.run, prepared.capture)
-    if run.settings.strain_color != prepared.run.settings.strain_color:
-        print(next(f"strain-color  {decision}" for decision in run.effect_plan if decision.effect == "strain-color"))
+    for before, now in zip(prepared.run.effect_plan, run.effect_plan, strict=True):
+        if now.on != before.on:
+            print(f"{now.effect}  {now}")
     train_run(folder, run, prepared.capture, prepared.selection, resume=False, falls_back=options.device == "auto")
 
 

@@ -77,10 +77,24 @@ class CaptureFacts:
         """In cameras that are left out, as in other views of known expressions."""
         return self._strain_evidence(self.samples.camera)
 
+    @cached_property
+    def nearby_dependence(self) -> Evidence:
+        """As `strain_dependence`, on the strain around a triangle: what moves over it changes its color as well."""
+        return self._nearby_evidence(self.samples.timestep)
+
+    @cached_property
+    def nearby_dependence_known(self) -> Evidence:
+        """As `strain_dependence_known`, on the strain around a triangle."""
+        return self._nearby_evidence(self.samples.camera)
+
     def _strain_evidence(self, group: np.ndarray) -> Evidence:
         """Within the range of strain that a training on the views that are not left out would write."""
         rest = rest_strain(color_range(len(self.samples.faces)))
         return linear_evidence(self.matched_colors, self.samples.strain, group, rest=rest)
+
+    def _nearby_evidence(self, group: np.ndarray) -> Evidence:
+        nearby = self.samples.nearby
+        return linear_evidence(self.matched_colors, nearby, group, rest=np.zeros_like(nearby[0]))
 
     @cached_property
     def pixel_range(self) -> float:

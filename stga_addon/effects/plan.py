@@ -9,12 +9,13 @@ from ..errors import StgaError
 from ..training.effect_plan import EffectDecision
 from ..training.settings import TrainingSettings
 from .facts import CaptureFacts
-from .rules import EFFECTS, Effect, Verdict, strain_color
+from .rules import EFFECTS, Effect, Verdict
 
 if TYPE_CHECKING:
     from ..training.run.folder import Run
 
-STRAIN_COLOR = "strain-color"
+ADDED_LATER = ("strain-color", "strain-position")
+"""Effects that a continuation may switch on, in a run that went without."""
 
 
 def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
@@ -30,18 +31,22 @@ def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run"
 
 
 def with_effects_of_takes(run: "Run", capture: Capture) -> "Run":
-    """The run with strain color where all its takes together call for it and the run it continues went without.
+    """The run with colors and positions that follow strain where all its takes together call for it and the run it
+    continues went without.
 
-    Splats can be given no other effect later: coefficients of zero leave their color as it was. A user's choice stays.
+    Splats can be given no other effect later: coefficients of zero leave them as they were. A user's choice stays.
     capture: of all takes.
     """
+    facts, settings = CaptureFacts(capture, run.settings), run.settings
     plan = {decision.effect: decision for decision in run.effect_plan}
-    before = plan.get(STRAIN_COLOR)
-    if before is None or before.on or before.choice != "auto":
-        return run
-    verdict = strain_color(CaptureFacts(capture, run.settings))
-    plan[STRAIN_COLOR] = replace(before, on=verdict.on, reason=verdict.reason)
-    return replace(run, settings=replace(run.settings, strain_color=verdict.on), effect_plan=tuple(plan.values()))
+    for effect in EFFECTS:
+        before = plan.get(effect.name)
+        if effect.name in ADDED_LATER and before is not None and not before.on and before.choice == "auto":
+            verdict = effect.rule(facts)
+            assert verdict is not None
+            plan[effect.name] = replace(before, on=verdict.on, reason=verdict.reason)
+            settings = replace(settings, **(effect.on if verdict.on else effect.off))
+    return replace(run, settings=settings, effect_plan=tuple(plan.values()))
 
 
 def plan_effects(

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..flame.sequence import MIN_JOINT_ANGLE_DEG
 from ..tracking.folder import is_tracked
+from .evidence import Evidence
 from .facts import CaptureFacts
 
 MIN_CAMERAS_FOR_VIEW_COLOR = 4
@@ -17,7 +18,7 @@ MIN_VIEW_DEPENDENCE_LEVELS = 1.0
 MIN_CAMERA_DIFFERENCE_LEVELS = 1.5
 """Gain in levels of 255 from which differences between cameras are corrected."""
 MIN_STRAIN_DEPENDENCE_LEVELS = 1.0
-"""Gain in levels of 255, in frames and in cameras that are left out, from which colors depend on deformation."""
+"""Gain in levels of 255, in frames and in cameras that are left out, from which splats follow deformation."""
 MIN_STRETCH = 1e-6
 """Share of a triangle's size; less is rounding."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
@@ -151,17 +152,34 @@ def selection(facts: CaptureFacts) -> Verdict:
 
 
 def strain_color(facts: CaptureFacts) -> Verdict:
+    return _undeformed(facts, "color follows") or _dependent(
+        facts, "colors depend on deformation", facts.strain_dependence, facts.strain_dependence_known
+    )
+
+
+def strain_position(facts: CaptureFacts) -> Verdict:
+    return _undeformed(facts, "positions follow") or _dependent(
+        facts, "triangles' colors depend on deformation around them", facts.nearby_dependence,
+        facts.nearby_dependence_known,
+    )  # fmt: skip
+
+
+def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
+    """The verdict where nothing can be learned from how the mesh deforms."""
     if facts.strain < MIN_STRETCH:
         return Verdict(False, "the mesh has the same shape in every training frame", only=True)
     if facts.timesteps < 3:
-        return Verdict(False, f"{facts.timesteps} frames are too few to tell how color follows deformation")
-    found = facts.strain_dependence
-    reason = f"colors depend on deformation by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
-    if facts.cameras == 1:
-        return Verdict(found.gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
-    known = facts.strain_dependence_known
-    reason += f" in frames that were left out, and by {known.gain:.1f} in cameras that were"
-    return Verdict(min(found.gain, known.gain) >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
+        return Verdict(False, f"{facts.timesteps} frames are too few to tell how {follows} deformation")
+    return None
+
+
+def _dependent(facts: CaptureFacts, what: str, unseen: Evidence, known: Evidence) -> Verdict:
+    """On where the evidence in frames that are left out is enough, and that in cameras that are, if there are two."""
+    reason, gain = f"{what} by {unseen.gain:.1f} of 255 levels ({unseen.share:.1%} of the variance)", unseen.gain
+    if facts.cameras > 1:
+        reason += f" in frames that were left out, and by {known.gain:.1f} in cameras that were"
+        gain = min(gain, known.gain)
+    return Verdict(gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
 
 
 def teeth(facts: CaptureFacts) -> Verdict | None:
@@ -250,6 +268,13 @@ EFFECTS = (
         strain_color,
         on={"strain_color": True},
         off={"strain_color": False},
+    ),
+    Effect(
+        "strain-position",
+        "9 coefficients a triangle, and the strain of every frame",
+        strain_position,
+        on={"strain_position": True},
+        off={"strain_position": False},
     ),
     Effect("teeth", "splats on 168 triangles", teeth, on={"teeth": True}, off={"teeth": False}),
     joint("neck", 1),

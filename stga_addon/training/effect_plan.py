@@ -17,6 +17,7 @@ EFFECTS = (
     "density",
     "selection",
     "strain-color",
+    "strain-position",
     "teeth",
     "neck",
     "jaw",

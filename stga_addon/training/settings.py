@@ -87,6 +87,7 @@ class TrainingSettings:
     stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
+    strain_position  splats move with the strain around their triangle (`avatar.strain.nearby_strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
@@ -135,6 +136,7 @@ class TrainingSettings:
     stop_when_flat: bool = False
     preset: str | None = None
     strain_color: bool = False
+    strain_position: bool = False
     antialiased: bool = False
     teeth: bool = True
     exposure: tuple[tuple[float, ...], ...] = ()

@@ -158,7 +158,7 @@ def test_colors_of_another_range_of_strain_are_not_continued(parent: Path, limit
     prepared = prepare_refinement(Refinement(parent, "mouth", iterations=ITERATIONS), "cpu")
     assert prepared.run.continuation is not None
     with pytest.raises(StgaError, match="as in an earlier version"):
-        starting_state(prepared.run.continuation, True)
+        starting_state(prepared.run.continuation, prepared.run.settings, len(prepared.capture.faces))
 
 
 def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent: Path, toy: Capture, tmp_path: Path) -> None:

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ...avatar.embedding import frame_backward
+from ...avatar.embedding import FaceFrames, frame_backward, position_shift, shifted_frames
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..settings import TrainingSettings
-from . import adam
+from . import adam, strain_position
 from .backend import Batch
 from .frames import FrameStore
 from .losses import image_gradient, scale_limits, tile_rectangles, whole_image
@@ -38,10 +38,11 @@ class CpuBackend:
         focus = None if batch.selected is None else batch.selected[state.face.numpy()]
         target = self._target(batch)
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
+        epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
         if batch.refinement_rate:
             self._refine_tracking(batch, rows)
+        self._step_strain_position(batch, rows, epsilon)
         self._add_limit_gradients(rows)
-        epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
         adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
             state.screen_gradient.numpy()[rows] += screen[rows]
@@ -51,7 +52,9 @@ class CpuBackend:
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
         """The view with the splats' running average: a new (3, H, W) float32 image."""
         average = Parameters(*(tensor.numpy() for tensor in self.state.average))
-        return self._forward(average, view, background, sh_degree).image.copy()
+        following = self.state.strain_position
+        frames = self._moved_frames(view.timestep, None if following is None else following.average)
+        return self._forward(average, frames, view, background, sh_degree).image.copy()
 
     def _target(self, batch: Batch) -> np.ndarray:
         """The target over the batch's background."""
@@ -69,7 +72,9 @@ class CpuBackend:
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
-        rendering = self._forward(self.state.arrays(), view, background, sh_degree, focus)
+        following = self.state.strain_position
+        frames = self._moved_frames(view.timestep, None if following is None else following.value)
+        rendering = self._forward(self.state.arrays(), frames, view, background, sh_degree, focus)
         rectangles = whole_image(height, width) if focus is None else tile_rectangles(rendering.touched, height, width)
         v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
@@ -80,10 +85,18 @@ class CpuBackend:
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
 
+    def _moved_frames(self, timestep: int, coefficients: np.ndarray | None) -> FaceFrames:
+        """The timestep's frames, moved by strain with these coefficients of `StrainPosition`."""
+        frames = self._frames.of(timestep)
+        if coefficients is None:
+            return frames
+        return shifted_frames(frames, position_shift(coefficients, self._frames.nearby(timestep)))
+
     def _forward(
-        self, splats: Parameters, view: View, background: np.ndarray, sh_degree: int, focus: np.ndarray | None = None
-    ) -> RenderOutput:
-        self._frames_in_camera = frames_in_camera(self._frames.of(view.timestep), view.camera)
+        self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray, sh_degree: int,
+        focus: np.ndarray | None = None,
+    ) -> RenderOutput:  # fmt: skip
+        self._frames_in_camera = frames_in_camera(frames, view.camera)
         return render_forward(
             splats, self.state.face.numpy(), self._frames_in_camera, sh_degree, background, focus, LOSS_REACH_PX,
             antialiased=self._settings.antialiased, buffers=self._buffers,
@@ -94,10 +107,23 @@ class CpuBackend:
         store, state, timestep = self._frames, self.state, batch.view.timestep
         assert store.tracking is not None
         frames, gradients = store.of(timestep), Parameters(*(g.numpy() for g in state.gradients))
-        gradients_of_frames = frame_gradient(state.arrays(), state.face.numpy(), gradients, rows, frames)
+        splats, face = state.arrays(), state.face.numpy()
+        if state.strain_position is not None:
+            shift = position_shift(state.strain_position.value, store.nearby(timestep))
+            splats = splats._replace(xyz=splats.xyz + shift[face])
+        gradients_of_frames = frame_gradient(splats, face, gradients, rows, frames)
         vertex_gradient = frame_backward(store.mesh(timestep), store.capture.faces, frames, *gradients_of_frames)
         store.tracking.step(timestep, vertex_gradient, batch.refinement_rate)
         store.clear()
+
+    def _step_strain_position(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
+        """Step how the triangles' splats move with strain; before limits, which are no part of the image's gradient."""
+        following, state = self.state.strain_position, self.state
+        if following is not None:
+            strain_position.step(
+                following, state.face.numpy()[rows], state.gradients.xyz.numpy()[rows],
+                self._frames.nearby(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
+            )  # fmt: skip
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:
         """Add the gradients that keep splats near what they cover, and unbound ones out of the air."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, face_frames
-from ...avatar.strain import color_range, strain_basis
+from ...avatar.strain import color_range, nearby_strain, strain_basis
 from ...capture.model import Capture
 from .tracking import Tracking
 
@@ -17,12 +17,13 @@ CACHED_TIMESTEPS = 12
 class _Timestep:
     mesh: np.ndarray
     frames: FaceFrames | None = None
+    nearby: np.ndarray | None = None
 
 
 class FrameStore:
     """Meshes (V, 3) and face frames by timestep, float64; the latest CACHED_TIMESTEPS are kept.
 
-    strain    `strain_basis` of the neutral mesh, None if colors do not depend on strain
+    strain    `strain_basis` of the neutral mesh, None if neither colors nor positions depend on strain
     tracking  meshes of its timesteps come from here instead of the capture, None if no tracking is refined
     """
 
@@ -39,6 +40,14 @@ class FrameStore:
         if entry.frames is None:
             entry.frames = face_frames(entry.mesh, capture.faces, capture.neutral, self.convention, self.strain)
         return entry.frames
+
+    def nearby(self, timestep: int) -> np.ndarray:
+        """(F, 3) `nearby_strain`; only where there is a `strain` basis."""
+        assert self.strain is not None
+        frames, entry = self.of(timestep), self._latest(timestep)
+        if entry.nearby is None:
+            entry.nearby = nearby_strain(self.strain, frames.strain)
+        return entry.nearby
 
     def mesh(self, timestep: int) -> np.ndarray:
         """(V, 3) that the frames of the timestep are computed from."""

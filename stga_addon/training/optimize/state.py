@@ -1,7 +1,7 @@
 """State of the splats in training: parameters, optimizer moments and statistics for density control."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,29 @@ import torch
 from ...avatar.splats import Splats
 from ...avatar.strain import STRAIN_COMPONENTS
 from ...raster.cpu.layout import Parameters
+
+
+@dataclass
+class StrainPosition:
+    """`Avatar.strain_position` of a mesh's F triangles in training.
+
+    value, first, second, average  (F, 3, 3) float32 coefficients, Adam's two moments, and the running average from
+                                   which the avatar is made
+    steps                          (F,) int32 Adam steps of each triangle
+    """
+
+    value: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    average: np.ndarray
+    steps: np.ndarray
+
+
+def new_strain_position(coefficients: np.ndarray) -> StrainPosition:
+    """A copy of coefficients (F, 3, 3), with zero moments."""
+    value = np.array(coefficients, np.float32)
+    zeros, steps = np.zeros_like(value), np.zeros(len(value), np.int32)
+    return StrainPosition(value, zeros, zeros.copy(), value.copy(), steps)
 
 
 @dataclass
@@ -24,6 +47,7 @@ class TrainState:
                      parent; 0 for bound splats
     screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density control
     gradient_count   (N,) float32 number of summands
+    strain_position  of the mesh's triangles, not of the splats; None where positions follow the mesh alone
     """
 
     parameters: Parameters
@@ -37,6 +61,7 @@ class TrainState:
     unseen_share: torch.Tensor
     screen_gradient: torch.Tensor
     gradient_count: torch.Tensor
+    strain_position: StrainPosition | None = None
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -104,15 +129,23 @@ def with_strain_coefficients(state: TrainState) -> TrainState:
     )
 
 
+def with_strain_position(state: TrainState, triangles: int) -> TrainState:
+    """The state with positions that follow the strain of so many triangles, by zero where they did not before."""
+    if state.strain_position is not None:
+        return state
+    still = new_strain_position(np.zeros((triangles, STRAIN_COMPONENTS, 3), np.float32))
+    return replace(state, strain_position=still)
+
+
 def join(state: TrainState, other: TrainState) -> TrainState:
     """All rows of both states, in order."""
     return _map(lambda tensors: torch.cat(tensors), state, other)
 
 
 def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
-    """Every tensor under a flat name such as "first/xyz"; the inverse of `state_of`."""
+    """Every tensor of the splats under a flat name such as "first/xyz"; the inverse of `state_of`."""
     flat = {}
-    for f in fields(state):
+    for f in _splat_fields():
         value = getattr(state, f.name)
         if isinstance(value, torch.Tensor):
             flat[f.name] = value
@@ -124,7 +157,7 @@ def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
 def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
     """Rebuild a state from `tensors_of`. Raises KeyError with the name of a missing tensor."""
     values: dict[str, Any] = {}
-    for f in fields(TrainState):
+    for f in _splat_fields():
         if f.name in tensors:
             values[f.name] = tensors[f.name]
         else:
@@ -132,6 +165,12 @@ def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
     return TrainState(**values)
 
 
+def _splat_fields() -> list[Field[Any]]:
+    return [f for f in fields(TrainState) if f.name != "strain_position"]
+
+
 def _map(function: Callable[[list[torch.Tensor]], torch.Tensor], *states: TrainState) -> TrainState:
+    """The first state with other splats."""
     flat = [tensors_of(s) for s in states]
-    return state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})
+    mapped = state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})
+    return replace(mapped, strain_position=states[0].strain_position)

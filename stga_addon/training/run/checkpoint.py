@@ -15,12 +15,12 @@ from ...avatar.file import SH_SIZES
 from ...avatar.strain import STRAIN_COMPONENTS
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
-from ..optimize.state import TrainState, state_of, tensors_of
+from ..optimize.state import StrainPosition, TrainState, state_of, tensors_of
 from ..optimize.tracking import RefinementState
 from .folder import CHECKPOINT, SELECTION
 
 VERSION = 3
-REFINEMENT, IDENTITY = "tracking/", "identity"
+REFINEMENT, POSITION, IDENTITY = "tracking/", "strain_position/", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
 OTHER_RUN = "belongs to another run than run.json beside it; remove it, or train into another folder"
@@ -74,8 +74,8 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
     arrays = {k: t.numpy() for k, t in tensors_of(checkpoint.state).items() if not k.startswith("gradients/")}
-    if checkpoint.tracking is not None:
-        arrays.update({REFINEMENT + name: array for name, array in vars(checkpoint.tracking).items()})
+    for prefix, part in ((REFINEMENT, checkpoint.tracking), (POSITION, checkpoint.state.strain_position)):
+        arrays.update({prefix + name: array for name, array in (vars(part) if part is not None else {}).items()})
     values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
     arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
     write_npz(folder / CHECKPOINT, arrays)
@@ -89,7 +89,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         meta = _meta(arrays.pop("meta"))
         if meta.pop("version") != VERSION:
             raise StgaError(f"{path}: was written by another version")
-        refinement = _refinement(path, arrays)
+        refinement, position = _refinement(path, arrays), _strain_position(path, arrays)
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         for name in [n for n in tensors if n.startswith("first/")]:
             tensors[name.replace("first/", "gradients/")] = torch.zeros_like(tensors[name])
@@ -97,6 +97,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             raise StgaError(f"{path}: an array has no rows")
         state = state_of(tensors)
         _check_state(path, state)
+        state.strain_position = position
         return Checkpoint(state=state, tracking=refinement, **meta)
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
@@ -152,19 +153,39 @@ def _check_state(path: Path, state: TrainState) -> None:
 
 def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | None:
     """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
-    names = [name for name in arrays if name.startswith(REFINEMENT)]
-    if not names:
+    taken = _taken(arrays, REFINEMENT)
+    if not taken:
         return None
-    found = RefinementState(**{name.removeprefix(REFINEMENT): arrays.pop(name) for name in names})
+    found = RefinementState(**taken)
     whole = found.change.shape
     if len(whole) != 2:
         raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")
     shapes = {"change": whole, "first": whole, "second": whole[1:], "steps": whole[:1]}
-    for name, array in vars(found).items():
-        dtype = np.dtype(np.int64 if name == "steps" else np.float64)
-        if array.dtype != dtype or array.shape != shapes[name]:
-            expected = f"{dtype} {shapes[name]}"
-            raise StgaError(f"{path}: {REFINEMENT}{name} is {array.dtype} {array.shape}, expected {expected}")
-        if not np.isfinite(array).all():
-            raise StgaError(f"{path}: {REFINEMENT}{name} holds a value that is not finite")
+    for name, array in taken.items():
+        _check_array(path, REFINEMENT + name, array, "int64" if name == "steps" else "float64", shapes[name])
     return found
+
+
+def _strain_position(path: Path, arrays: dict[str, np.ndarray]) -> StrainPosition | None:
+    """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
+    taken = _taken(arrays, POSITION)
+    if not taken:
+        return None
+    found = StrainPosition(**taken)
+    triangles = found.steps.shape[:1]
+    for name, array in taken.items():
+        tail = () if name == "steps" else (STRAIN_COMPONENTS, 3)
+        _check_array(path, POSITION + name, array, "float32" if tail else "int32", (*triangles, *tail))
+    return found
+
+
+def _taken(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with the prefix, under the rest of their names; removed from `arrays`."""
+    return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
+
+
+def _check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
+    if array.dtype != dtype or array.shape != shape:
+        raise StgaError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} {shape}")
+    if not np.isfinite(array).all():
+        raise StgaError(f"{path}: {name} holds a value that is not finite")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...avatar.file import read_avatar
+from ...avatar.file import Avatar, read_avatar
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import open_capture
 from ...capture.region import find_region
@@ -23,7 +23,13 @@ from ..evaluate.evaluation_views import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
-from ..optimize.state import TrainState, new_state, with_strain_coefficients
+from ..optimize.state import (
+    TrainState,
+    new_state,
+    new_strain_position,
+    with_strain_coefficients,
+    with_strain_position,
+)
 from ..optimize.tracking import with_refined_tracking
 from ..settings import Rates, TrainingSettings, validate
 from .checkpoint import read_checkpoint
@@ -152,9 +158,10 @@ def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
     return take
 
 
-def starting_state(continuation: Continuation, strain_color: bool) -> TrainState:
-    """The parent's avatar as a state of training; strain_color: with coefficients of strain, zero where it had none.
+def starting_state(continuation: Continuation, settings: TrainingSettings, triangles: int) -> TrainState:
+    """The parent's avatar as a state of training on a mesh of so many triangles.
 
+    Where the settings have colors or positions follow strain and the avatar's do not, they begin by zero.
     The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
     Raises StgaError where the avatar is not the one that the continuation was made for, or `require_color_range` does.
     """
@@ -164,14 +171,28 @@ def starting_state(continuation: Continuation, strain_color: bool) -> TrainState
     avatar = read_avatar(folder / "avatar.npz")
     require_color_range(folder / "avatar.npz", avatar)
     state = new_state(avatar.splats)
+    if avatar.strain_position is not None:
+        state.strain_position = new_strain_position(avatar.strain_position)
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
-        averaged = kept.averaged()
-        if all(np.array_equal(array, getattr(averaged, name)) for name, array in vars(avatar.splats).items()):
+        if _is_of(kept, avatar):
             parameters = Parameters(*(tensor.clone() for tensor in kept.average))
             zero = torch.zeros(len(kept))
             state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
-    return with_strain_coefficients(state) if strain_color else state
+            if kept.strain_position is not None:
+                kept.strain_position.value = kept.strain_position.average.copy()
+    if settings.strain_color:
+        state = with_strain_coefficients(state)
+    return with_strain_position(state, triangles) if settings.strain_position else state
+
+
+def _is_of(state: TrainState, avatar: Avatar) -> bool:
+    """Whether the avatar was made of this state."""
+    averaged, position = state.averaged(), state.strain_position
+    moved = None if position is None else position.average
+    return np.array_equal(moved, avatar.strain_position) and all(  # type: ignore[arg-type]
+        np.array_equal(array, getattr(averaged, name)) for name, array in vars(avatar.splats).items()
+    )
 
 
 def late_rates(rates: Rates, share: float) -> Rates:

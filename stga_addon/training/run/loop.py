@@ -162,7 +162,7 @@ class _Loop:
             wanted = self.settings.strategy == "selective"
             selection = select_capture(self.capture, self.settings.selection) if wanted else {}
         if continuation is not None:
-            state = starting_state(continuation, self.settings.strain_color)
+            state = starting_state(continuation, self.settings, len(self.capture.faces))
             self._check(state)
         self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
@@ -221,6 +221,12 @@ class _Loop:
             raise StgaError(f"{self.out}: its splats have SH degree {splats.sh_degree}, run.json says {expected}")
         if bool(splats.strain_color.shape[1]) != self.settings.strain_color:
             raise StgaError(f"{self.out}: its splats and run.json disagree on the effect strain-color")
+        position = state.strain_position
+        if (position is not None) != self.settings.strain_position:
+            raise StgaError(f"{self.out}: its checkpoint and run.json disagree on the effect strain-position")
+        if position is not None and len(position.steps) != len(self.capture.faces):
+            found, faces = len(position.steps), len(self.capture.faces)
+            raise StgaError(f"{self.out}: its positions follow {found} triangles, {self.capture.root} has {faces}")
 
     def work(self) -> None:
         """Train until the budget is spent, a goal of the settings is reached or the report asks to stop."""
@@ -379,8 +385,9 @@ class _Loop:
             self.forecast_text = "; ".join(filter(None, (self.forecast_text, far)))
 
     def _avatar(self) -> Avatar:
+        state = self.trainer.state
         return Avatar(
-            self.trainer.state.averaged(),
+            state.averaged(),
             self.settings.convention,
             self.capture.neutral.astype(np.float32),
             self.capture.faces,
@@ -390,11 +397,12 @@ class _Loop:
             self.settings.antialiased,
             self.run.principal_point,
             self._strain_range(),
+            None if state.strain_position is None else state.strain_position.average.copy(),
         )
 
     def _strain_range(self) -> np.ndarray | None:
         """Measured once, or whenever refined tracking may have moved the meshes."""
-        if not self.settings.strain_color:
+        if not (self.settings.strain_color or self.settings.strain_position):
             return None
         if self.measured_strain is None or self.trainer.tracking is not None:
             mesh = self.trainer.frames.mesh if self.trainer.tracking is not None else self.capture.mesh

@@ -1,4 +1,4 @@
-"""Range of strain that a run has trained on, within which its avatar's colors follow strain."""
+"""Range of strain that a run has trained on, within which its avatar's colors and positions follow strain."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,8 +30,8 @@ def trained_strain_range(
         return seen
     parent = read_avatar(continuation.parent / "avatar.npz")
     earlier = parent.strain_range
-    if not parent.splats.strain_color.shape[1]:
-        return seen  # its colors follow strain only from here on
+    if not parent.follows_strain:
+        return seen  # it follows strain only from here on
     if earlier is None:
         return limits
     lowest, highest = np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])
@@ -39,12 +39,12 @@ def trained_strain_range(
 
 
 def require_color_range(path: Path, avatar: Avatar) -> None:
-    """Raise StgaError, naming the path, where an avatar's colors follow strain beyond COLOR_RANGE.
+    """Raise StgaError, naming the path, where an avatar follows strain beyond COLOR_RANGE.
 
-    An earlier version trained it: more training would change these colors at once.
+    An earlier version trained it: more training would change it at once.
     """
     limits = avatar.strain_range
-    if avatar.splats.strain_color.shape[1] and (
+    if avatar.follows_strain and (
         limits is None or ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any()
     ):
         raise StgaError(f"{path}: colors follow strain as in an earlier version; train it anew")
