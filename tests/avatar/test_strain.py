@@ -11,11 +11,14 @@ from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.strain import (
+    AVERAGING_ROUNDS,
     MAX_STRAIN,
     MIN_COMPRESSION,
     RANGE_MARGIN,
     color_range,
+    edge_neighbors,
     face_strain,
+    nearby_strain,
     seen_range,
     strain_basis,
 )
@@ -184,3 +187,58 @@ def test_baking_keeps_the_picture() -> None:
     assert np.abs(render_avatar(plain, posed, camera, white) - drawn).max() > 0.05
     undeformed = face_frames(posed, FACES, neutral)
     np.testing.assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
+
+
+def following(neutral: np.ndarray, seed: int = 0) -> Avatar:
+    """An avatar without strain colors whose triangles' splats move by millimeters with strain."""
+    splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
+    position = np.random.default_rng(seed).normal(0, 3e-3, (len(FACES), 3, 3)).astype(np.float32)
+    return Avatar(splats, "stga", neutral.astype(np.float32), FACES, strain_position=position)
+
+
+def test_neighbors_share_an_edge() -> None:
+    """Catches triangles that touch at a corner only, an edge of three triangles, and one that is its own neighbor."""
+    fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [4, 1, 5], [5, 6, 7], [8, 8, 9]])
+    found = [sorted(int(column[f]) for column in edge_neighbors(fan) if column[f] < len(fan)) for f in range(len(fan))]
+    edges = [{frozenset((int(a), int(b))) for a, b in zip(face, np.roll(face, -1), strict=True)} for face in fan]
+    expected = [[g for g in range(len(fan)) if g != f and edges[f] & edges[g]] for f in range(len(fan))]
+    assert found == expected == [[1, 2], [0, 2], [0, 1, 3], [2], [], []]
+
+
+def test_nearby_strain_is_averaged_over_edges() -> None:
+    """Catches another weight or number of rounds, and a mesh at rest that is not zero."""
+    neutral, posed = sheet(), sheet(3)
+    basis = strain_basis(neutral, FACES, color_range(len(FACES)))
+    strain = face_strain(basis, posed)
+    average = np.zeros((len(FACES), len(FACES)))
+    for f, columns in enumerate(zip(*edge_neighbors(FACES), strict=True)):
+        members = [f, *(int(g) for g in columns if g < len(FACES))]
+        average[f, members] = 1 / len(members)
+    expected = np.linalg.matrix_power(average, AVERAGING_ROUNDS) @ (strain - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0])
+    np.testing.assert_allclose(nearby_strain(basis, strain), expected, atol=1e-6)
+    assert np.abs(expected).max() > 0.1
+    turned = neutral @ Rotation.from_rotvec([0.3, 1, -2]).as_matrix().T
+    np.testing.assert_allclose(nearby_strain(basis, face_strain(basis, turned)), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_positions_follow_strain(convention: str, tmp_path: Path) -> None:
+    """Catches a shift in other axes or units than the splats', one lost in the file, and a mesh at rest that moves."""
+    neutral, posed = sheet(), sheet(3)
+    avatar = replace(following(neutral), convention=convention)
+    write_avatar(tmp_path / "a.npz", avatar)
+    found = read_avatar(tmp_path / "a.npz")
+    basis = strain_basis(neutral, FACES)
+    nearby = nearby_strain(basis, face_strain(basis, posed)).astype(np.float64)
+    assert avatar.strain_position is not None
+    shift = [sum(nearby[f, k] * avatar.strain_position[f, k] for k in range(3)) for f in range(len(FACES))]
+    shifted = replace(avatar.splats, xyz=(avatar.splats.xyz + np.array(shift)[avatar.splats.face]).astype(np.float32))
+    plain = face_frames(posed, FACES, neutral, convention)
+    baked = to_world(found.splats, found.frames(posed))
+    np.testing.assert_allclose(baked.xyz, to_world(shifted, plain).xyz, atol=1e-7)
+    np.testing.assert_array_equal(baked.rotation, to_world(shifted, plain).rotation)
+    assert np.abs(baked.xyz - to_world(avatar.splats, plain).xyz).max() > 1e-4
+    still = to_world(avatar.splats, face_frames(neutral, FACES, neutral, convention))
+    np.testing.assert_allclose(to_world(found.splats, found.frames(neutral)).xyz, still.xyz, atol=1e-7)
+    with pytest.raises(StgaError, match="strain_position is float32 \\(3, 3, 3\\), expected float32 \\(4, 3, 3\\)"):
+        write_avatar(tmp_path / "b.npz", replace(avatar, strain_position=avatar.strain_position[1:]))

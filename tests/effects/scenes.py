@@ -29,6 +29,11 @@ def wrinkles(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np
     return 60 * np.minimum(strain[:, 0], 0)
 
 
+def sliding(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Stripes that move over triangles which shrink."""
+    return 30 * np.sin(12 * (place[:, 0] + 0.3 * np.minimum(strain[:, 0] + strain[:, 1], 0)))
+
+
 def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
     """A light beside the cameras, mirrored where the ball is polished."""
     mirrored = direction - 2 * np.einsum("fi,fi->f", direction, place)[:, None] * place

@@ -1,5 +1,6 @@
 """Effect plan: decided once, printed, stored with the run and kept on resume."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -39,20 +40,24 @@ def test_the_run_keeps_its_plan(trained):
     assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
 
 
+@pytest.mark.parametrize("effect", ["strain-color", "strain-position"])
 @pytest.mark.parametrize(("choice", "expected"), [("auto", True), ("off", False)])
-def test_takes_can_call_for_strain_color(root, monkeypatch, choice, expected):
+def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
     """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is overruled."""
     capture = open_capture(root)
-    settings = make_settings(iterations=1, effects={} if choice == "auto" else {"strain-color": choice})
+    settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
     run = with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
-    assert not run.settings.strain_color
-    monkeypatch.setattr(planning, "strain_color", lambda facts: Verdict(True, "two takes say so"))
-    extended = with_effects_of_takes(run, capture)
-    assert extended.settings.strain_color == expected
-    changed = [now for now, then in zip(extended.effect_plan, run.effect_plan, strict=True) if now != then]
-    assert [(each.effect, each.on, each.reason) for each in changed] == expected * [
-        ("strain-color", True, "two takes say so")
+    setting = effect.replace("-", "_")
+    assert not getattr(run.settings, setting)
+    called_for = [
+        replace(each, rule=lambda facts: Verdict(True, "two takes say so")) if each.name == effect else each
+        for each in planning.EFFECTS
     ]
+    monkeypatch.setattr(planning, "EFFECTS", called_for)
+    extended = with_effects_of_takes(run, capture)
+    assert getattr(extended.settings, setting) == expected
+    changed = [now for now, then in zip(extended.effect_plan, run.effect_plan, strict=True) if now != then]
+    assert [(each.effect, each.on, each.reason) for each in changed] == expected * [(effect, True, "two takes say so")]
     assert with_effects_of_takes(extended, capture) == extended
 
 
@@ -63,7 +68,9 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     train = ["train", str(root), "--out", str(trained), "--resume"]
     assert main([*train, "--effect", "strain-color=on"]) == 0
     assert read_run(trained) == before
-    assert "strain-color  on, as asked" in capsys.readouterr().out
+    assert any(
+        line.split()[:4] == ["strain-color", "on,", "as", "asked:"] for line in capsys.readouterr().out.splitlines()
+    )
     assert main([*train, "--effect", "strain-color=off"]) == 2
     assert "differs from what was decided for this run" in capsys.readouterr().err
 

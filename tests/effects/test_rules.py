@@ -18,7 +18,7 @@ from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FIL
 from stga_addon.training.effect_plan import EFFECTS, parse_choices
 from stga_addon.training.settings import TrainingSettings, make_settings
 
-from .scenes import gloss, wrinkles
+from .scenes import gloss, sliding, wrinkles
 
 
 def planned(capture, **choices):
@@ -32,6 +32,11 @@ def on(plan):
     return {name for name, decision in plan.items() if decision.on}
 
 
+def gains(decision):
+    """Of colors in frames, and in cameras, that were left out."""
+    return [float(part.split()[0]) for part in decision.reason.split("by ")[1:]]
+
+
 def test_plain(painted):
     """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there."""
     plan, settings = planned(painted())
@@ -42,11 +47,22 @@ def test_plain(painted):
 def test_color_that_follows_strain(painted):
     """Catches wrinkles that are not seen, or are taken for the cameras' doing."""
     plan, settings = planned(painted(paint=wrinkles))
-    assert on(plan) == {"antialiasing", "background", "density", "strain-color"}
+    assert on(plan) == {"antialiasing", "background", "density", "strain-color", "strain-position"}
     assert settings.strain_color
-    unseen_frames, unseen_cameras = (float(part.split()[0]) for part in plan["strain-color"].reason.split("by ")[1:])
+    unseen_frames, unseen_cameras = gains(plan["strain-color"])
     assert unseen_frames > 4
     assert unseen_cameras > 4
+
+
+def test_what_moves_over_triangles_with_strain(painted):
+    """Catches positions that follow the mesh alone where its surface slides, and that choice where it is refused."""
+    plan, settings = planned(painted(paint=sliding))
+    assert plan["strain-position"].on
+    assert settings.strain_position
+    assert min(gains(plan["strain-position"])) > 4
+    assert not planned(painted(paint=sliding), strain_position="off")[1].strain_position
+    with pytest.raises(StgaError, match="strain-position=on: is not possible, because the mesh has the same shape"):
+        planned(painted(timesteps=1, deformed=0.0), strain_position="on")
 
 
 def test_color_that_follows_the_view(painted):

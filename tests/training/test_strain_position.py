@@ -2,29 +2,26 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from stga_addon.avatar.embedding import face_frames
-from stga_addon.avatar.file import read_avatar
-from stga_addon.avatar.splats import Splats
-from stga_addon.avatar.strain import nearby_strain
+from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.raster.cpu.optimizer import adam_rows
-from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.render import render_avatar
 from stga_addon.training.optimize import adam, strain_position
 from stga_addon.training.optimize.state import new_strain_position
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state
-from stga_addon.training.run.folder import CHECKPOINT, Continuation, Run
+from stga_addon.training.run.folder import CHECKPOINT, Continuation, Run, read_run
 from stga_addon.training.run.identity import file_digest
 from stga_addon.training.run.loop import train
+from stga_addon.training.run.strain_range import trained_strain_range
 
 from .toys import quick_settings
 
@@ -70,11 +67,11 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
     gradient = first / (1 - float(adam.BETA1))
     assert (position.steps == (position.steps > 0)).all()
     touched = np.flatnonzero(position.steps)
-    assert 0 < len(touched) < len(capture.faces)  # those behind have no gradient
+    assert len(touched)
     strongest = touched[np.argsort(-np.abs(gradient[touched]).max((1, 2)))[:6]]
     for face in strongest:
         component, axis = np.unravel_index(np.abs(gradient[face]).argmax(), (3, 3))
-        step = 2e-3
+        step = 5e-4
         ends = []
         for sign in (1, -1):
             changed = before.copy()
@@ -113,20 +110,132 @@ def test_the_step_is_that_of_the_splats_optimizer() -> None:
             np.float32(0.1),
         )  # fmt: skip
     for found, expected in zip((state.value, state.first, state.second, state.average), tables, strict=True):
-        np.testing.assert_allclose(found.reshape(faces, 9), expected, rtol=1e-5, atol=1e-7)
+        # The kernel's logarithms are of float32.
+        np.testing.assert_allclose(found.reshape(faces, 9), expected, rtol=2e-4, atol=1e-7)
     np.testing.assert_array_equal(state.steps, steps)
 
 
-def test_training_draws_what_the_avatar_draws(toy: Capture, tmp_path: Path) -> None:
-    """Catches a trainer that moves other splats than the avatar it writes, or by other coefficients."""
+def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
+    """Catches a trainer whose splats move otherwise than those of the avatar that it writes."""
     capture = squeezed(toy)
-    settings = quick_settings("global", iterations=30, lattice=1, strain_position=True, rates_xyz=None)
-    run = Run(toy.root, None, "vhap", settings)
-    avatar = read_avatar(train(capture, tmp_path / "run", run))
+    trainer = make_trainer(capture)
+    position = trainer.state.strain_position
+    assert position is not None
+    position.average[:] = 10 * position.value
+    view = capture.views["val"][0]
+    seen = trained_strain_range(capture, capture.mesh, None)
+    avatar = Avatar(
+        trainer.state.averaged(), "stga", capture.neutral.astype(np.float32), capture.faces,
+        strain_range=seen, strain_position=position.average,
+    )  # fmt: skip
+    drawn = trainer.render(view, 0.0)
+    expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
+    np.testing.assert_allclose(drawn, expected, atol=2e-5)
+    still = render_avatar(
+        replace(avatar, strain_position=None), capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0)
+    )
+    assert np.abs(still - drawn).max() > 0.005
+
+
+def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
+    """Catches triangles that are not selected, whose splats would move in all frames."""
+    capture = squeezed(toy)
+    settings = quick_settings("selective", lattice=1, strain_position=True, warm_up_share=0.0, global_interval=1000)
+    selected = np.zeros(len(capture.faces), bool)
+    selected[:200] = True
+    trainer = Trainer(capture, settings, dict.fromkeys(capture.timesteps, selected))
+    view = capture.views["train"][0]
+    target = np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
+    for _ in range(3):
+        trainer.step(view, target, 0.5)
+    position = trainer.state.strain_position
+    assert position is not None
+    assert position.steps[:200].max() > 0
+    assert not position.steps[200:].any()
+    assert not position.value[200:].any()
+
+
+def trained(capture: Capture, out: Path, **changes: Any) -> Path:
+    settings = quick_settings(
+        "global",
+        lattice=1,
+        strain_position=True,
+        iterations=40,
+        density_interval=10,
+        density_span=(0.0, 1.0),
+        **changes,
+    )
+    train(capture, out, Run(capture.root, None, "vhap", settings))
+    return out
+
+
+def test_a_run_keeps_them(toy: Capture, tmp_path: Path) -> None:
+    """Catches coefficients that density control loses, that the avatar or the checkpoint forgets, or that a
+    continuation begins without."""
+    capture = squeezed(toy)
+    capture = replace(capture, views={"train": capture.views["train"]})  # the avatar is then that of the last state
+    out = trained(capture, tmp_path / "run")
+    avatar, kept = read_avatar(out / "avatar.npz"), read_checkpoint(out)
+    position = kept.state.strain_position
     assert avatar.strain_position is not None
-    assert np.abs(avatar.strain_position).max() > 0
     assert avatar.strain_range is not None
+    assert position is not None
+    assert np.abs(avatar.strain_position).max() > 0
+    np.testing.assert_array_equal(avatar.strain_position, position.average)
+    continuation = Continuation(out, file_digest(out / "avatar.npz"), 0, 9)
+    settings = quick_settings("global", strain_position=True)
+    state = starting_state(continuation, settings, len(capture.faces))
+    assert state.strain_position is not None
+    np.testing.assert_array_equal(state.strain_position.value, avatar.strain_position)
+    np.testing.assert_array_equal(state.strain_position.second, position.second)
+    (out / CHECKPOINT).unlink()
+    state = starting_state(continuation, settings, len(capture.faces))
+    assert state.strain_position is not None
+    np.testing.assert_array_equal(state.strain_position.average, avatar.strain_position)
+    assert not state.strain_position.second.any()
 
 
-def test_resumed_training_is_bit_exact(toy: Capture, tmp_path: Path) -> None:
+def test_a_resumed_run_ends_where_an_unbroken_one_does(toy: Capture, tmp_path: Path) -> None:
     """Catches moments, averages or step counts that a checkpoint forgets."""
+    capture = squeezed(toy)
+    whole = read_avatar(trained(capture, tmp_path / "whole") / "avatar.npz")
+    settings = read_run(tmp_path / "whole").settings
+    run = Run(capture.root, None, "vhap", settings)
+    train(capture, tmp_path / "parts", run, report=lambda progress: progress.iteration == 17)
+    assert read_checkpoint(tmp_path / "parts").iteration == 17
+    train(capture, tmp_path / "parts", run, resume=True)
+    parts = read_avatar(tmp_path / "parts" / "avatar.npz")
+    np.testing.assert_array_equal(parts.strain_position, whole.strain_position)
+    np.testing.assert_array_equal(parts.splats.xyz, whole.splats.xyz)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("first", np.zeros((3, 3, 3), np.float32), r"strain_position/first is float32 \(3, 3, 3\), expected float32"),
+        ("steps", None, "missing or malformed"),
+        ("value", np.nan, "strain_position/value holds a value that is not finite"),
+    ],
+)
+def test_a_damaged_checkpoint(toy: Capture, tmp_path: Path, name: str, value: Any, says: str) -> None:
+    """Catches coefficients that are taken for what they are not."""
+    out = trained(squeezed(toy), tmp_path / "run", seed=1)
+    arrays = read_npz(out / CHECKPOINT)
+    field = f"strain_position/{name}"
+    if value is None:
+        del arrays[field]
+    else:
+        arrays[field] = value if np.ndim(value) else np.full_like(arrays[field], value)
+    write_npz(out / CHECKPOINT, arrays)
+    with pytest.raises(StgaError, match=says):
+        read_checkpoint(out)
+
+
+def test_a_checkpoint_of_another_choice(toy: Capture, tmp_path: Path) -> None:
+    """Catches a checkpoint without coefficients that is resumed as if it had some."""
+    capture = squeezed(toy)
+    out = trained(capture, tmp_path / "run")
+    arrays = {n: a for n, a in read_npz(out / CHECKPOINT).items() if not n.startswith("strain_position/")}
+    write_npz(out / CHECKPOINT, arrays)
+    with pytest.raises(StgaError, match=r"its checkpoint and run\.json disagree on the effect strain-position"):
+        train(capture, out, read_run(out), resume=True)
