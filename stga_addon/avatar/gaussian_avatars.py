@@ -40,7 +40,7 @@ def in_convention(avatar: Avatar, convention: str) -> Splats:
     """The avatar's splats in the frames of another convention, at the same places on the neutral mesh.
 
     Both conventions have their origin at the centroid, which is left out for precision. On deformed triangles the
-    conventions scale differently, and so do the splats. Colors are those of the neutral mesh.
+    conventions scale differently, and so do the splats. What follows strain is that of the neutral mesh.
     """
     splats = avatar.splats
     if splats.strain_color.shape[1]:
