@@ -113,10 +113,11 @@ def edge_neighbors(faces: np.ndarray) -> list[np.ndarray]:
 
     An edge of more than two triangles makes all of them neighbors.
     """
-    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
-    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.ravel(), kind="stable")
-    owner, size = order // 3, count[edge.ravel()[order]]
+    start, end = np.asarray(faces, np.int64).ravel(), np.roll(faces, -1, axis=1).ravel()
+    number = np.minimum(start, end) * (int(start.max(initial=0)) + 1) + np.maximum(start, end)
+    _, edge, count = np.unique(number, return_inverse=True, return_counts=True)
+    order = np.argsort(edge, kind="stable")
+    owner, size = order // 3, count[edge[order]]
     place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
     pairs = []
     for step in range(1, int(count.max(initial=1))):
