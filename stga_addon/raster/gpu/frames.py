@@ -5,15 +5,17 @@ from typing import Any
 import numpy as np
 
 from ...avatar import embedding
-from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis
+from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, StrainBasis
 from ...capture.camera import Camera
 from .device import Device, Recording
 from .layout import FRAME_STRAIN
 
 POSE = np.dtype(
-    [("rows", np.float32, (3, 4))] + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "unused")]
+    [("rows", np.float32, (3, 4))]
+    + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "neighbors")]
 )
-"""The uniform `pose` of frames.wgsl."""
+"""The uniform of pose.wgsl."""
+INCLUDE = ("pose",)
 
 
 class Embedding:
@@ -22,12 +24,14 @@ class Embedding:
     def __init__(
         self, device: Device, neutral: np.ndarray, faces: np.ndarray, convention: str, basis: StrainBasis | None = None
     ) -> None:
-        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where colors follow strain."""
+        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where splats follow strain."""
         if convention not in embedding.CONVENTIONS:
             raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
         self.strains = 0 if basis is None else STRAIN_COMPONENTS
         self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
         rows = np.zeros(0) if basis is None else _basis_rows(basis)
+        neighbors = [] if basis is None else basis.neighbors
+        self._neighbors = device.upload("neighbors", np.array(neighbors, np.uint32)), len(neighbors)
         self._buffers = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
             "neutral_area": device.upload("neutral area", _area(neutral, faces)),
@@ -35,6 +39,12 @@ class Embedding:
             "touching": device.upload("touching", _touching(faces, len(neutral))),
             "tensors": device.buffer("strain tensors", 6 * len(faces) if self.strains else 0),
         }
+        self._rounds = [device.buffer(f"nearby strain {n}", len(faces) * self.strains) for n in range(2)]
+
+    @property
+    def nearby(self) -> Any:
+        """`nearby_strain` (F, 3) of the mesh whose frames were moved by it last."""
+        return self._rounds[AVERAGING_ROUNDS % 2]
 
     def upload(self, vertices: np.ndarray, camera: Camera) -> None:
         """Send a posed mesh (V, 3), world meters, and its camera before the recording is submitted.
@@ -51,27 +61,45 @@ class Embedding:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         pose["rows"] = np.c_[turn, turn @ center + shift]
         pose["triangles"], pose["strains"], pose["area_scales"] = self._count, self.strains, self._area_scales
+        pose["neighbors"] = self._neighbors[1]
         self._device.upload("pose", pose, "uniform")
 
-    def compose(self, work: Recording) -> Any:
-        """Record the frames of the mesh that was uploaded last; returns their table."""
+    def compose(self, work: Recording, strain_position: Any | None = None) -> Any:
+        """Record the frames of the mesh that was uploaded last; returns their table.
+
+        strain_position (F, 3, 3): the frames are moved by it as in `Avatar.frames`; needs the basis of strain.
+        """
         device, groups = self._device, self._device.groups(self._count)
         buffers = {
             **self._buffers,
             "pose": device.buffer("pose", POSE.itemsize // 4, "uniform"),
             "vertices": device.buffer("vertices", 0),
             "frames": device.buffer("frames", self._count * (FRAME_STRAIN + self.strains)),
+            "nearby": self._rounds[0],
         }
-        work.dispatch(device.kernel("frames", "compose"), groups, **buffers)
+        work.dispatch(device.kernel("frames", "compose", INCLUDE), groups, **buffers)
         if self.strains:
-            work.dispatch(device.kernel("frames", "average_strain"), groups, **buffers)
+            work.dispatch(device.kernel("frames", "average_strain", INCLUDE), groups, **buffers)
+        if strain_position is not None:
+            self._shift(work, buffers["pose"], buffers["frames"], strain_position)
         return buffers["frames"]
+
+    def _shift(self, work: Recording, pose: Any, frames: Any, strain_position: Any) -> None:
+        """Record the frames' move by strain."""
+        device, groups, rounds = self._device, self._device.groups(self._count), self._rounds
+        shared = {"pose": pose, "neighbors": self._neighbors[0], "coefficients": strain_position, "frames": frames}
+        average, shift = (device.kernel("nearby_strain", entry, INCLUDE) for entry in ("average", "shift"))
+        for n in range(AVERAGING_ROUNDS):
+            work.dispatch(average, groups, **shared, nearby=rounds[n % 2], averaged=rounds[(n + 1) % 2])
+        work.dispatch(shift, groups, **shared, nearby=self.nearby, averaged=rounds[(AVERAGING_ROUNDS + 1) % 2])
 
 
 def compile_kernels(device: Device) -> None:
     """Compile what this module dispatches."""
     for entry in ("compose", "average_strain"):
-        device.kernel("frames", entry)
+        device.kernel("frames", entry, INCLUDE)
+    for entry in ("average", "shift"):
+        device.kernel("nearby_strain", entry, INCLUDE)
 
 
 def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:

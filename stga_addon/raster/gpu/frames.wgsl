@@ -4,17 +4,6 @@
 // Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's first vertex, of
 // which only differences and means are formed: an edge is as exact as float32 can hold it.
 
-struct Pose {
-  // The matrix from the mesh, relative to its first vertex, to the camera.
-  row_x: vec4f,
-  row_y: vec4f,
-  row_z: vec4f,
-  triangles: u32,
-  strains: u32, // components of strain, 0 where colors do not follow it
-  area_scales: u32, // 1: the convention "stga", 0: "gaussian_avatars"
-  unused: u32,
-}
-
 @group(0) @binding(0) var<uniform> pose: Pose;
 // (V, 6): a position's float32 and what is left of it.
 @group(0) @binding(1) var<storage, read> vertices: array<f32>;
@@ -29,6 +18,8 @@ struct Pose {
 // (F, 6): a triangle's own strain as xx, yy, zz, xy, yz, zx.
 @group(0) @binding(6) var<storage, read_write> tensors: array<f32>;
 @group(0) @binding(7) var<storage, read_write> frames: array<f32>;
+// (F, S): strain less that at rest, which positions follow where it is averaged (nearby_strain.wgsl).
+@group(0) @binding(8) var<storage, read_write> nearby: array<f32>;
 
 const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
@@ -177,6 +168,8 @@ fn average_strain(
     let range = f * basis_stride() + TO_PLANE + TENSOR * pose.strains + k;
     strain = clamp(STRAIN_GAIN * strain, basis[range], basis[range + pose.strains]);
     // Rounding of a rigid triangle is no strain: Adam would take its sign for a gradient and step at full rate.
-    frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
+    strain = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
+    frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = strain;
+    nearby[f * pose.strains + k] = strain - clamp(0.0, basis[range], basis[range + pose.strains]);
   }
 }

@@ -100,6 +100,7 @@ CONSTANTS: dict[str, int | float] = {
     **{name: float(getattr(project, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
     **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
     "STRAIN_GAIN": strain.STRAIN_GAIN,
+    "STRAIN_COMPONENTS": strain.STRAIN_COMPONENTS,
     "WINDOW_RADIUS_PX": image_loss.WINDOW_RADIUS_PX,
     **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
     "SSIM_C1": float(image_loss.C1),

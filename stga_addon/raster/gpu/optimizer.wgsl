@@ -1,4 +1,4 @@
-// What the optimizer's kernels share: the uniform `step`, and the fields of a splat's row.
+// What the optimizer's kernels share: the uniform `step`, the fields of a splat's row, and a step's corrections.
 
 struct Step {
   rates: array<vec4f, 2>, // by field, see field_of(); the last is that of the harmonics above the constant one
@@ -12,6 +12,8 @@ struct Step {
   distance_weight: f32,
   opacity_weight: f32, // already divided by the number of splats
   statistics: u32, // 1: collect what density control asks for
+  triangles: u32, // whose splats move with strain
+  strain_position_rate: f32,
 }
 
 // Number of the parameter that a column of a row belongs to: in the order of `cpu.layout.Parameters`.
@@ -29,4 +31,32 @@ fn field_of(view: View, column: u32) -> u32 {
     return 3u;
   }
   return select(5u, 4u, column < SH + 3u * view.coefficients);
+}
+
+// For the given step of a row: what corrects the first and the second moment's bias, and its share in the average.
+fn corrections_at(step: Step, count: u32) -> vec3f {
+  let n = f32(count);
+  return vec3f(
+    1.0 / one_minus_exp(n * step.log_beta1),
+    1.0 / sqrt(one_minus_exp(n * step.log_beta2)),
+    max(step.newest, 4.0 / (n + 3.0)),
+  );
+}
+
+// 1 − exp(x) of a negative number; as a series where the difference would cancel.
+fn one_minus_exp(x: f32) -> f32 {
+  if x < -0.5 {
+    return 1.0 - exp(x);
+  }
+  var series = 1.0;
+  for (var n = 9.0; n > 1.0; n -= 1.0) {
+    series = 1.0 + series * x / n;
+  }
+  return -x * series;
+}
+
+// Whether a gradient is not finite, or so large that Adam cannot square it.
+fn is_too_large(gradient: f32) -> bool {
+  let size = bitcast<u32>(gradient) & 0x7fffffffu; // ordered like the absolute values
+  return size >= bitcast<u32>(MAX_GRADIENT);
 }

@@ -70,25 +70,7 @@ fn limit_distance(i: u32) {
 fn count_step(i: u32) {
   let count = history[3u * i] + 1u;
   history[3u * i] = count;
-  let n = f32(count);
-  let numbers = vec3f(
-    1.0 / one_minus_exp(n * step.log_beta1),
-    1.0 / sqrt(one_minus_exp(n * step.log_beta2)),
-    max(step.newest, 4.0 / (n + 3.0)),
-  );
-  corrections[i] = vec4u(bitcast<vec3u>(numbers), broken_fields(i));
-}
-
-// 1 − exp(x) of a negative number; as a series where the difference would cancel.
-fn one_minus_exp(x: f32) -> f32 {
-  if x < -0.5 {
-    return 1.0 - exp(x);
-  }
-  var series = 1.0;
-  for (var n = 9.0; n > 1.0; n -= 1.0) {
-    series = 1.0 + series * x / n;
-  }
-  return -x * series;
+  corrections[i] = vec4u(bitcast<vec3u>(corrections_at(step, count)), broken_fields(i));
 }
 
 // Bit f is set where a gradient of field f is not finite, or so large that Adam cannot square it.
@@ -96,8 +78,7 @@ fn broken_fields(i: u32) -> u32 {
   let stride = splat_stride(view);
   var broken = 0u;
   for (var c = 0u; c < stride; c++) {
-    let size = bitcast<u32>(gradients[i * stride + c]) & 0x7fffffffu; // ordered like the absolute values
-    broken |= select(0u, 1u << field_of(view, c), size >= bitcast<u32>(MAX_GRADIENT));
+    broken |= select(0u, 1u << field_of(view, c), is_too_large(gradients[i * stride + c]));
   }
   return broken;
 }

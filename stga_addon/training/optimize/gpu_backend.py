@@ -2,10 +2,12 @@
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
+from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.cpu.layout import Parameters
@@ -13,6 +15,7 @@ from ...raster.gpu import frames as frame_stage
 from ...raster.gpu import image_loss as loss_stage
 from ...raster.gpu import optimizer as optimizer_stage
 from ...raster.gpu import rasterize as raster_stage
+from ...raster.gpu import strain_position as strain_position_stage
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
 from ...raster.gpu.image_loss import image_loss, upload_target
@@ -20,13 +23,15 @@ from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_r
 from ...raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from ...raster.gpu.project import mark_focus
 from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions, upload_splats
+from ...raster.gpu.strain_position import StrainPositionTables, splats_by_triangle
 from ...raster.gpu.tiles import counts_buffer
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, image_epsilon
 from .backend import Batch
 from .frames import FrameStore
 from .losses import scale_limits
-from .state import TrainState
+from .state import StrainPosition, TrainState
+from .strain_position import RATE_SHARE
 
 QUEUED_ITERATIONS = 2
 """Iterations that the device may be behind; losses are returned as many iterations late."""
@@ -46,7 +51,7 @@ class _Queued:
 
 def compile_kernels(device: Device) -> None:
     """Compile what an iteration dispatches, before the time that is given to training."""
-    for stage in (frame_stage, raster_stage, loss_stage, optimizer_stage):
+    for stage in (frame_stage, raster_stage, loss_stage, optimizer_stage, strain_position_stage):
         stage.compile_kernels(device)
 
 
@@ -65,6 +70,7 @@ class GpuBackend:
         self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = Rasterizer(device)
         self._embedding = Embedding(device, capture.neutral, capture.faces, frames.convention, frames.strain)
+        self._triangles = len(capture.faces)
         self._limits = np.column_stack([*scale_limits(capture, settings), settings.distance_limit * units])
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
@@ -88,14 +94,18 @@ class GpuBackend:
         history, traits = read(self._tables.history, (count, 3), np.uint32), read(self._tables.traits, (count, 2))
         sums = history.view(np.float32)
         return TrainState(
-            parameters=tables.pop("splats"),
-            **tables,
+            parameters=tables["splats"],
+            gradients=tables["gradients"],
+            first=tables["first"],
+            second=tables["second"],
+            average=tables["average"],
             steps=torch.from_numpy(history[:, 0].astype(np.int32)),
             face=torch.from_numpy(read(self._splats.face, (count,), np.int32)),
             unbound=torch.from_numpy(traits[:, 0] > 0),
             unseen_share=torch.from_numpy(traits[:, 1].copy()),
             screen_gradient=torch.from_numpy(sums[:, 1].copy()),
             gradient_count=torch.from_numpy(sums[:, 2].copy()),
+            strain_position=self._read_strain_position(),
         )
 
     @state.setter
@@ -118,6 +128,8 @@ class GpuBackend:
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
         self._splats = upload_splats(self.device, _arrays(state.parameters), state.face.numpy())
+        following, face = state.strain_position, state.face.numpy()
+        self._following = None if following is None else self._upload_strain_position(following, face)
 
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last if it was a global one."""
@@ -135,9 +147,10 @@ class GpuBackend:
         """The view with the splats' running average after all queued iterations: a new (3, H, W) float32 image."""
         self._finish_all()
         average = replace(self._splats, rows=self._tables.average)
+        moved = None if self._following is None else self._following.average
         while True:
             with self.device.record() as work:
-                rendering = self._render(work, average, view, background, sh_degree)
+                rendering = self._render(work, average, moved, view, background, sh_degree)
             if self._rasterizer.pairs_fit():
                 return self.device.read(rendering.image, (3, view.camera.height, view.camera.width))
 
@@ -170,12 +183,18 @@ class GpuBackend:
         self._upload_step(batch)
         with self.device.record() as work:
             splats, camera = self._splats, batch.view.camera
-            rendering = self._render(work, splats, batch.view, batch.background, batch.sh_degree, batch.selected)
+            moved = None if self._following is None else self._following.value
+            rendering = self._render(work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected)
             v_image, loss = image_loss(
                 work, camera.width, camera.height, view=rendering.view, image=rendering.image,
                 touched=rendering.chosen.touched, whole=whole,
             )  # fmt: skip
             screen = self._rasterizer.backward(work, rendering, splats, v_image, self._gradients)
+            if self._following is not None:
+                strain_position_stage.step(
+                    work, self._triangles, self._following, view=rendering.view, wanted=rendering.lists.wanted,
+                    gradients=self._gradients, nearby=self._embedding.nearby,
+                )  # fmt: skip
             limited = bool(self._settings.scale_weight or self._settings.distance_weight)
             optimize(
                 work, splats.count, splats.stride, self._tables, limited, view=rendering.view, splats=splats.rows,
@@ -185,10 +204,13 @@ class GpuBackend:
         queued.readback.start()
 
     def _render(
-        self, work: Recording, splats: SplatTable, view: View, background: np.ndarray, sh_degree: int,
-        selected: np.ndarray | None = None,
+        self, work: Recording, splats: SplatTable, strain_position: Any | None, view: View, background: np.ndarray,
+        sh_degree: int, selected: np.ndarray | None = None,
     ) -> Rendering:  # fmt: skip
-        """Record a view; only the tiles around the splats on the selected triangles, if any are given."""
+        """Record a view of the splats, moved by strain with coefficients strain_position (F, 3, 3) on the device.
+
+        Only the tiles around the splats on the selected triangles, if any are given.
+        """
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
         options = ViewOptions(
             view.camera, sh_degree, background, self._embedding.strains, antialiased=self._settings.antialiased,
@@ -199,7 +221,8 @@ class GpuBackend:
         if selected is not None:
             marked = self.device.upload("selected", selected)
             focus = mark_focus(work, splats.count, view=uniform, face=splats.face, selected=marked)
-        return self._rasterizer.forward(work, splats, self._embedding.compose(work), options, uniform, focus)
+        frames = self._embedding.compose(work, strain_position)
+        return self._rasterizer.forward(work, splats, frames, options, uniform, focus)
 
     def _upload_target(self, batch: Batch) -> None:
         change = 255 * batch.background - 255 * np.array(self._settings.background, np.float32)
@@ -211,8 +234,28 @@ class GpuBackend:
         weights = settings.scale_weight, settings.distance_weight, settings.unseen_opacity_weight / max(len(self), 1)
         upload_step(
             self.device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
-            statistics=batch.accumulate,
+            statistics=batch.accumulate, triangles=self._triangles,
+            strain_position_rate=RATE_SHARE * batch.rates["xyz"],
         )  # fmt: skip
+
+    def _upload_strain_position(self, state: StrainPosition, face: np.ndarray) -> StrainPositionTables:
+        upload = self.device.upload
+        return StrainPositionTables(
+            **{name: upload(f"strain position {name}", table) for name, table in vars(state).items()},
+            splats_of=upload("splats by triangle", splats_by_triangle(face, self._triangles)),
+        )
+
+    def _read_strain_position(self) -> StrainPosition | None:
+        if self._following is None:
+            return None
+        read, tables, shape = self.device.read, self._following, (self._triangles, STRAIN_COMPONENTS, 3)
+        return StrainPosition(
+            value=read(tables.value, shape),
+            first=read(tables.first, shape),
+            second=read(tables.second, shape),
+            average=read(tables.average, shape),
+            steps=read(tables.steps, (self._triangles,), np.int32),
+        )
 
 
 def _arrays(tensors: Parameters) -> Parameters:

@@ -1,0 +1,66 @@
+// One step of Adam on how each triangle's splats move with strain, a thread a triangle, before the limits change the
+// splats' gradients.
+//
+// A triangle of which no splat is wanted keeps every bit.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> step: Step;
+@group(0) @binding(2) var<storage, read> wanted: array<u32>;
+@group(0) @binding(3) var<storage, read> gradients: array<f32>; // of the splats
+// (F + 1 + N): where each triangle's splats begin in this array, then those splats.
+@group(0) @binding(4) var<storage, read> splats_of: array<u32>;
+@group(0) @binding(5) var<storage, read> nearby: array<f32>; // (F, 3) see nearby_strain.wgsl
+@group(0) @binding(6) var<storage, read_write> steps: array<u32>; // (F,)
+// (F, 3, 3), as are the moments and the running average.
+@group(0) @binding(7) var<storage, read_write> value: array<f32>;
+@group(0) @binding(8) var<storage, read_write> first: array<f32>;
+@group(0) @binding(9) var<storage, read_write> second: array<f32>;
+@group(0) @binding(10) var<storage, read_write> average: array<f32>;
+
+const COEFFICIENTS: u32 = 3u * STRAIN_COMPONENTS; // of a triangle
+
+@compute @workgroup_size(WORKGROUP)
+fn main(
+  @builtin(workgroup_id) workgroup: vec3u,
+  @builtin(num_workgroups) workgroups: vec3u,
+  @builtin(local_invocation_index) local: u32,
+) {
+  let f = thread_number(workgroup, workgroups, local);
+  if f >= step.triangles {
+    return;
+  }
+  var moved = vec3f(0.0); // a triangle moves all its splats alike, so its gradient is their sum
+  var is_wanted = false;
+  for (var n = splats_of[f]; n < splats_of[f + 1u]; n++) {
+    let i = splats_of[n];
+    if wanted[i] != 0u {
+      let at = i * splat_stride(view) + XYZ;
+      moved += vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
+      is_wanted = true;
+    }
+  }
+  if !is_wanted || !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z)) {
+    return;
+  }
+  var gradient: array<f32, COEFFICIENTS>;
+  var broken = false;
+  for (var c = 0u; c < COEFFICIENTS; c++) {
+    gradient[c] = nearby[f * STRAIN_COMPONENTS + c / 3u] * moved[c % 3u];
+    broken = broken || is_too_large(gradient[c]);
+  }
+  if broken {
+    return;
+  }
+  steps[f] += 1u;
+  let correct = corrections_at(step, steps[f]);
+  for (var c = 0u; c < COEFFICIENTS; c++) {
+    let n = f * COEFFICIENTS + c;
+    let m = step.beta1 * first[n] + (1.0 - step.beta1) * gradient[c];
+    let v = step.beta2 * second[n] + (1.0 - step.beta2) * gradient[c] * gradient[c];
+    first[n] = m;
+    second[n] = v;
+    let stepped = value[n] - step.strain_position_rate * m * correct.x / (sqrt(v) * correct.y + step.epsilon);
+    value[n] = stepped;
+    average[n] += correct.z * (stepped - average[n]);
+  }
+}
