@@ -1,0 +1,95 @@
+"""Adam on positions that follow strain on a WebGPU device against the CPU's."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+
+from raster import gpu_device
+from stga_addon.raster.gpu import strain_position as on_device
+from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.layout import VIEW
+from stga_addon.raster.gpu.optimizer import upload_step
+from stga_addon.raster.gpu.strain_position import StrainPositionTables, splats_by_triangle
+from stga_addon.training.optimize import strain_position as on_cpu
+from stga_addon.training.optimize.adam import BETA1, BETA2
+from stga_addon.training.optimize.state import StrainPosition
+
+from .test_gpu_optimizer import RATES, STRIDE
+
+TRIANGLES, SPLATS = 300, 900
+EPSILON, NEWEST = np.float32(1e-3), 0.02
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return gpu_device.device()
+
+
+def random_state(seed: int = 0) -> StrainPosition:
+    """Triangles of any age."""
+    rng = np.random.default_rng(seed)
+    value, first, second, average = rng.normal(size=(4, TRIANGLES, 3, 3)).astype(np.float32)
+    return StrainPosition(value, first, second**2, average, rng.integers(0, 3000, TRIANGLES).astype(np.int32))
+
+
+def stepped(
+    device: Device, state: StrainPosition, face: np.ndarray, wanted: np.ndarray, gradients: np.ndarray,
+    nearby: np.ndarray, rate: float,
+) -> StrainPosition:  # fmt: skip
+    """The state after a step on the device."""
+    view = np.zeros(1, VIEW)
+    view["splats"], view["coefficients"], view["strain_colors"] = SPLATS, 4, 2
+    upload_step(
+        device, RATES, (BETA1, BETA2), EPSILON, NEWEST, (0, 0, 0), False, TRIANGLES, on_cpu.RATE_SHARE * rate
+    )  # fmt: skip
+    tables = StrainPositionTables(
+        **{name: device.upload(f"test position {name}", table) for name, table in vars(state).items()},
+        splats_of=device.upload("test splats by triangle", splats_by_triangle(face, TRIANGLES)),
+    )
+    with device.record() as work:
+        on_device.step(
+            work, TRIANGLES, tables, view=device.upload("view", view, "uniform"),
+            wanted=device.upload("test wanted", wanted.astype(np.uint32)),
+            gradients=device.upload("test gradients", gradients), nearby=device.upload("test nearby", nearby),
+        )  # fmt: skip
+    arrays = vars(state).items()
+    return StrainPosition(**{k: device.read(getattr(tables, k), was.shape, was.dtype) for k, was in arrays})
+
+
+def test_a_step_is_the_cpus(device: Device) -> None:
+    """Catches gradients of splats that were not trained or of other triangles, a wrong age, rate or average, a broken
+    gradient that gets in, and a triangle stepped that is not to be: over several steps."""
+    rng, state = np.random.default_rng(1), random_state()
+    expected = deepcopy(state)
+    face = rng.integers(0, TRIANGLES, SPLATS).astype(np.int32)
+    face[face == 7] = 8  # one without splats
+    for number in range(4):
+        gradients = rng.normal(size=(SPLATS, STRIDE)).astype(np.float32)
+        nearby = rng.normal(size=(TRIANGLES, 3)).astype(np.float32)
+        wanted = rng.random(SPLATS) < 0.5
+        gradients[~wanted] = np.nan  # written in another iteration
+        broken = np.flatnonzero(wanted)[:5]
+        gradients[broken, 1] = np.float32([np.nan, np.inf, -np.inf, 3e18, 1e30])
+        nearby[face[broken]] = [1, -1, 0.5]
+        nearby[face[broken[1]]] = 0  # times infinity
+        before = deepcopy(state)
+        state = stepped(device, state, face, wanted, gradients, nearby, 0.02)
+        with np.errstate(invalid="ignore", over="ignore"):
+            on_cpu.step(expected, face[wanted], gradients[wanted, :3], nearby, 0.02, NEWEST, EPSILON)
+        np.testing.assert_array_equal(state.steps, expected.steps, err_msg=str(number))
+        for name in ("value", "first", "second", "average"):
+            got, want = getattr(state, name), getattr(expected, name)
+            np.testing.assert_allclose(got, want, rtol=1e-4, atol=2e-6, err_msg=f"{number} {name}")
+            kept = before.steps == state.steps
+            assert 10 < kept.sum() < TRIANGLES / 2
+            np.testing.assert_array_equal(got[kept].view(np.uint32), getattr(before, name)[kept].view(np.uint32))
+
+
+def test_splats_by_triangle_lists_each_once() -> None:
+    """Catches a splat left out, or on another triangle, where some triangles have none."""
+    face = np.random.default_rng(3).integers(2, 17, 60).astype(np.int32)
+    table = splats_by_triangle(face, 20)
+    for triangle in range(20):
+        found = table[table[triangle] : table[triangle + 1]]
+        np.testing.assert_array_equal(found, np.flatnonzero(face == triangle))
