@@ -20,16 +20,17 @@ from pathlib import Path
 from raster.test_compose import CAMERA, scene
 from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
-from training.test_gpu_backend import batch_of, disturbed, settings_of
+from training.test_gpu_backend import batch_of
+from training.test_gpu_strain_position import position_settings, state_of
 from stga_addon.training.optimize.backend import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.losses import limit_units
 
 adapter, root = sys.argv[1:]
 compose.compose(adapter, scene(), CAMERA, True)
-toy, settings = open_capture(Path(root)), settings_of()
+toy, settings = open_capture(Path(root)), position_settings()
 lengths, frames = limit_units(toy, settings.convention), FrameStore(toy, settings.convention, True)
-backend = make_backend(f"gpu:{adapter}", settings, lengths, frames, disturbed(toy, settings))
+backend = make_backend(f"gpu:{adapter}", settings, lengths, frames, state_of(toy, settings))
 for part in (None, toy.regions["mouth"]):
     backend.step(batch_of(toy, settings, selected=part))
 assert len(backend.state.steps)
