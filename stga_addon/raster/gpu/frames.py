@@ -86,6 +86,7 @@ class Embedding:
 
     def _shift(self, work: Recording, pose: Any, frames: Any, strain_position: Any) -> None:
         """Record the frames' move by strain."""
+        assert self.strains
         device, groups, rounds = self._device, self._device.groups(self._count), self._rounds
         shared = {"pose": pose, "neighbors": self._neighbors[0], "coefficients": strain_position, "frames": frames}
         average, shift = (device.kernel("nearby_strain", entry, INCLUDE) for entry in ("average", "shift"))
