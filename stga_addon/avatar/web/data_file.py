@@ -25,8 +25,12 @@ OPACITY_STEP = 1 / 255
 COLOR_STEP = 0.004
 """Of the constant SH coefficient, which a color has 0.28 times."""
 SH_STEP = 0.005
-STRAIN_STEP = 0.008
-"""Of colors per unit of strain, and of a triangle's range of strain."""
+STRAIN_COLOR_STEP = 0.008
+STRAIN_RANGE_STEP = 0.002
+"""Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a unit err by 2 µm."""
+STRAIN_POSITION_STEP_M = POSITION_STEP_M / 16
+"""Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
+along an axis at most, where half of POSITION_STEP_M is 2 µm."""
 VERTEX_STEP_M = 2.0**-24
 """Of base and neutral mesh: so fine that no thin triangle becomes a line, or the reverse."""
 BASIS_STEP_M = 2e-6
@@ -43,7 +47,9 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     """
     order = np.argsort(avatar.splats.face, kind="stable")
     splats = avatar.splats.rows(order)
-    arrays = _splat_arrays(splats, _local_unit(avatar)) | _mesh_arrays(avatar, splats) | _rig_arrays(rig)
+    unit = _local_unit(avatar)
+    arrays = _splat_arrays(splats, unit) | _strain_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
+    arrays |= _rig_arrays(rig)
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     if exact:
@@ -103,7 +109,7 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
     if splats.sh.shape[1] > 1:
         arrays["sh"] = FixedPoint(splats.sh[:, 1:].reshape(len(splats), -1), SH_STEP)
     if splats.strain_color.shape[1]:
-        arrays["strain_color"] = FixedPoint(splats.strain_color.reshape(len(splats), -1), STRAIN_STEP)
+        arrays["strain_color"] = FixedPoint(splats.strain_color.reshape(len(splats), -1), STRAIN_COLOR_STEP)
     return arrays
 
 
@@ -117,12 +123,20 @@ def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return largest.astype(np.uint8), np.take_along_axis(q, others, 1)
 
 
+def _strain_arrays(avatar: Avatar, local_unit: float) -> Arrays:
+    """What the triangles hold for colors and positions that follow strain."""
+    arrays: Arrays = {}
+    rows = (len(avatar.faces), -1)
+    if avatar.follows_strain and avatar.strain_range is not None:
+        arrays["strain_range"] = FixedPoint(avatar.strain_range.reshape(rows), STRAIN_RANGE_STEP)
+    if avatar.strain_position is not None:
+        step = STRAIN_POSITION_STEP_M / local_unit
+        arrays["strain_position"] = FixedPoint(avatar.strain_position.reshape(rows), step)
+    return arrays
+
+
 def _mesh_arrays(avatar: Avatar, splats: Splats) -> Arrays:
-    limits: Arrays = {}
-    if splats.strain_color.shape[1] and avatar.strain_range is not None:
-        limits["strain_range"] = FixedPoint(avatar.strain_range.reshape(len(avatar.faces), -1), STRAIN_STEP)
     return {
-        **limits,
         "faces": avatar.faces,
         "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
         "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),

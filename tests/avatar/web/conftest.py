@@ -70,7 +70,14 @@ class Head:
         return [faces % (number + 2) == 0 for number in range(len(self.meshes))]
 
 
-def make_head(convention: str = "stga", sh_degree: int = 3, antialiased: bool = True, strain: bool = True) -> Head:
+def make_head(
+    convention: str = "stga",
+    sh_degree: int = 3,
+    antialiased: bool = True,
+    strain: bool = True,
+    strain_position: bool = False,
+) -> Head:
+    """strain: whether colors follow it; strain_position: whether splats move with it, by about as much as they spread."""
     model = synthetic_flame(0)
     rng = np.random.default_rng(3)
     frames = [
@@ -98,8 +105,17 @@ def make_head(convention: str = "stga", sh_degree: int = 3, antialiased: bool = 
         object.__setattr__(splats, "strain_color", strain_color)
     neutral = neutral_mesh(sequence).astype(np.float32)
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
-    limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral)) if strain else None
-    avatar = Avatar(splats, convention, neutral, model.faces, antialiased=antialiased, strain_range=limits)
+    limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
+    moves = rng.normal(0, 0.3 * unit, (len(model.faces), 3, 3)).astype(np.float32)
+    avatar = Avatar(
+        splats,
+        convention,
+        neutral,
+        model.faces,
+        antialiased=antialiased,
+        strain_range=limits if strain or strain_position else None,
+        strain_position=moves if strain_position else None,
+    )
     camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
     return Head(avatar, sequence, meshes, camera)
 

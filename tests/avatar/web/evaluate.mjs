@@ -24,6 +24,7 @@ try {
       vertices: Array.from(rig.vertices),
       frames: Array.from(frames.world),
       strain: Array.from(frames.strain?.values ?? []),
+      nearby: Array.from(frames.nearby?.values ?? []),
       order: Array.from(order),
     });
   }

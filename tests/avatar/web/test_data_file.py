@@ -13,6 +13,7 @@ from stga_addon.avatar.web.rig import BAKE_TOLERANCE_M, baked_rig
 from stga_addon.avatar.web.write import SCRIPT_NAME, write_web
 from stga_addon.errors import StgaError
 
+from .conftest import make_head
 from .web_data import read_web_data, splats_of
 
 
@@ -44,9 +45,30 @@ def test_splats_come_back_within_their_steps(head):
     assert np.abs(np.abs((found.rotation * unit).sum(1)) - 1).max() < 1e-5
     assert np.abs(found.log_scale - original.log_scale).max() <= data_file.LOG_SCALE_STEP / 2 + 1e-6
     assert np.abs(found.sh[:, 1:] - original.sh[:, 1:]).max() <= data_file.SH_STEP / 2 + 1e-6
-    assert np.abs(found.strain_color - original.strain_color).max() <= data_file.STRAIN_STEP / 2 + 1e-6
+    assert np.abs(found.strain_color - original.strain_color).max() <= data_file.STRAIN_COLOR_STEP / 2 + 1e-6
     selected = np.unpackbits(arrays["selection"].astype(np.uint8), axis=1)[:, : len(head.avatar.faces)]
     assert np.array_equal(selected.astype(bool), head.selection)
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+@pytest.mark.parametrize("strain", [False, True])
+def test_strain_moves_splats_by_less_than_their_own_step(convention, strain):
+    """Catches vectors stored in another unit or order, and a range of strain that is left out where no color needs it."""
+    head = make_head(convention, strain=strain, strain_position=True)
+    avatar = head.avatar
+    _, arrays = read_web_data(head.data())
+    assert ("strain_color" in arrays) == strain
+    assert np.abs(arrays["strain_range"].reshape(-1, 2, 3) - avatar.strain_range).max() <= 0.001 + 1e-6
+    unit = avatar.frames(avatar.neutral).scale.max()
+    found = arrays["strain_position"].reshape(-1, 3, 3)
+    assert np.abs(found - avatar.strain_position).max() * unit <= data_file.STRAIN_POSITION_STEP_M / 2 + 1e-9
+    stored = replace(avatar, strain_position=found)
+    for mesh in head.meshes:
+        expected = avatar.frames(mesh)
+        moved = np.linalg.norm(expected.origin - replace(avatar, strain_position=None).frames(mesh).origin, axis=1)
+        error = np.abs(stored.frames(mesh).origin - expected.origin).max(1) / np.maximum(expected.scale / unit, 1)
+        assert moved.max() > 100 * data_file.POSITION_STEP_M
+        assert error.max() < data_file.POSITION_STEP_M / 4
 
 
 def test_equal_avatars_give_equal_bytes(head):

@@ -60,10 +60,13 @@ def psnr(browser: Browser, head: Head, frame: int) -> float:
         ({}, True),
         ({}, False),
         ({"convention": "gaussian_avatars", "sh_degree": 1, "strain": False, "antialiased": False}, True),
+        ({"strain_position": True}, True),
+        ({"strain_position": True}, False),
+        ({"convention": "gaussian_avatars", "strain": False, "strain_position": True}, False),
     ],
 )
 def test_picture_is_the_renderers(options, exact, browser, tmp_path):
-    """Catches any difference of projection, color, blending or quantization, and any request that a page makes."""
+    """Catches any difference of projection, place, color, blending or quantization, and any request that a page makes."""
     head = make_head(**options)
     show(browser, tmp_path, head.data(exact=exact))
     for frame in (0, 2):

@@ -1,7 +1,7 @@
 // Local frames of the triangles, in which splats are stored.
 // The rules are those of STGA for Blender's embedding.py.
 
-import { Strain } from './strain.js';
+import { NearbyStrain, Strain } from './strain.js';
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 const MIN_DIVISOR = 1e-30;
@@ -10,7 +10,7 @@ const UPRIGHT_COSINE = 0.8;
 export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
 
 export class FaceFrames {
-  /** Arrays of the data file, and the convention of the embedding; strain is computed where colors follow it. */
+  /** Arrays of the data file, and the convention of the embedding; strain is computed where splats follow it. */
   constructor(arrays, convention) {
     const faces = arrays.faces.values;
     const neutral = arrays.neutral.values;
@@ -19,13 +19,19 @@ export class FaceFrames {
     this.isStga = convention === 'stga';
     this.world = new Float64Array(12 * this.count); // rotation · scale and origin, rows of a 3×4 matrix
     this.neutralArea = neutralAreas(faces, neutral);
-    this.strain = arrays.strain_color ? new Strain(faces, neutral, arrays.strain_range?.values) : null;
+    const { strain_color, strain_position, strain_range } = arrays;
+    this.strain = strain_color || strain_position ? new Strain(faces, neutral, strain_range?.values) : null;
+    this.nearby = strain_position ? new NearbyStrain(this.strain) : null;
+    this.strainPosition = strain_position?.values; // (9·F): for each component of strain a vector in the frame
   }
 
   /** Follow the posed vertices (3·V). */
   update(vertices) {
     this.placeFrames(vertices);
     this.strain?.update(vertices);
+    if (!this.nearby) return;
+    this.nearby.update();
+    this.moveOrigins();
   }
 
   /**
@@ -96,6 +102,24 @@ export class FaceFrames {
     }
   }
 
+  /** Move the origins with the nearby strain, in each triangle's own axes and unit. */
+  moveOrigins() {
+    const { count, strainPosition, world } = this;
+    const { values } = this.nearby;
+    for (let f = 0; f < count; f++) {
+      const from = 9 * f;
+      const a = values[3 * f];
+      const b = values[3 * f + 1];
+      const c = values[3 * f + 2];
+      const x = a * strainPosition[from] + b * strainPosition[from + 3] + c * strainPosition[from + 6];
+      const y = a * strainPosition[from + 1] + b * strainPosition[from + 4] + c * strainPosition[from + 7];
+      const z = a * strainPosition[from + 2] + b * strainPosition[from + 5] + c * strainPosition[from + 8];
+      for (let to = 12 * f; to < 12 * f + 12; to += 4) {
+        world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
+      }
+    }
+  }
+
   /** Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle. */
   compose(camera, out) {
     const { world, count } = this;
@@ -113,7 +137,7 @@ export class FaceFrames {
     }
   }
 
-  /** Write strain and the selection flags (bits, or null: all selected) of the triangles. */
+  /** Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all selected). */
   annotate(selection, out) {
     const strain = this.strain?.values;
     for (let f = 0; f < this.count; f++) {

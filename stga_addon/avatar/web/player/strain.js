@@ -1,10 +1,12 @@
-// Green's strain of the triangles against the neutral mesh, averaged over neighbors: three components, clipped.
+// Green's strain of the triangles against the neutral mesh, averaged over neighbors: three components, clipped; and
+// nearby strain, the same less that at rest, averaged over triangles that share an edge.
 // The rules are those of STGA for Blender's strain.py.
 
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 const STRAIN_GAIN = 5;
 const MAX_STRAIN = 2;
+const AVERAGING_ROUNDS = 3; // of nearby strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
 export class Strain {
@@ -103,6 +105,89 @@ export class Strain {
       values[f + 2] = Math.min(range[at + 5], Math.max(range[at + 2], STRAIN_GAIN * shear));
     }
   }
+}
+
+/** Strain around each triangle, which positions follow: 0 for a mesh at rest. */
+export class NearbyStrain {
+  /** Of `strain` (Strain), which is to be updated first. */
+  constructor(strain) {
+    const { faces, range } = strain;
+    const count = faces.length / 3;
+    this.strain = strain;
+    this.values = new Float64Array(3 * count);
+    this.rest = new Float64Array(3 * count);
+    for (let k = 0; k < 3 * count; k++) {
+      const lowest = k + 3 * Math.floor(k / 3);
+      this.rest[k] = Math.min(range[lowest + 3], Math.max(range[lowest], 0));
+    }
+    const [edges, edgeCount] = edgesOf(faces);
+    this.edges = edges; // (3·F), each three times its index
+    this.edgeSum = new Float64Array(3 * edgeCount); // over all triangles at an edge
+    this.ownFactor = new Float64Array(count);
+    this.share = new Float64Array(count); // one over how many neighbors a triangle has and itself
+    this.weigh(edgeCount);
+  }
+
+  /** The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor` leaves it once. */
+  weigh(edgeCount) {
+    const { edges, ownFactor, share } = this;
+    const touching = new Int32Array(edgeCount);
+    for (const edge of edges) touching[edge / 3]++;
+    for (let f = 0; f < share.length; f++) {
+      const own = edges.subarray(3 * f, 3 * f + 3);
+      let held = 0;
+      let itself = 0; // 3, or more where a degenerate triangle has one edge twice
+      for (const edge of own) {
+        held += touching[edge / 3];
+        for (const other of own) if (edge === other) itself++;
+      }
+      ownFactor[f] = 1 - itself;
+      share[f] = 1 / (1 + held - itself);
+    }
+  }
+
+  /** Follow the strain. */
+  update() {
+    const { rest, strain, values } = this;
+    for (let k = 0; k < values.length; k++) values[k] = strain.values[k] - rest[k];
+    for (let round = 0; round < AVERAGING_ROUNDS; round++) this.average();
+  }
+
+  /** Replace every value by the mean of the triangle and those that share an edge with it. */
+  average() {
+    const { edges, edgeSum, ownFactor, share, values } = this;
+    edgeSum.fill(0);
+    for (let at = 0; at < edges.length; at += 3) {
+      for (let c = at; c < at + 3; c++) {
+        const e = edges[c];
+        edgeSum[e] += values[at];
+        edgeSum[e + 1] += values[at + 1];
+        edgeSum[e + 2] += values[at + 2];
+      }
+    }
+    for (let f = 0, at = 0; f < share.length; f++, at += 3) {
+      const i = edges[at];
+      const j = edges[at + 1];
+      const k = edges[at + 2];
+      for (let n = 0; n < 3; n++) {
+        const around = edgeSum[i + n] + edgeSum[j + n] + edgeSum[k + n];
+        values[at + n] = share[f] * (ownFactor[f] * values[at + n] + around);
+      }
+    }
+  }
+}
+
+/** [three times the index of the edge from each corner to the next (3·F), number of edges], by the edges' ends. */
+function edgesOf(faces) {
+  const vertices = faces.reduce((most, vertex) => Math.max(most, vertex), 0) + 1;
+  const index = new Map();
+  const edges = Int32Array.from(faces, (vertex, c) => {
+    const next = faces[c % 3 < 2 ? c + 1 : c - 2];
+    const ends = Math.min(vertex, next) * vertices + Math.max(vertex, next);
+    if (!index.has(ends)) index.set(ends, 3 * index.size);
+    return index.get(ends);
+  });
+  return [edges, index.size];
 }
 
 /** Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx. */
