@@ -3,9 +3,10 @@
     python benchmarks/web_player.py [--splats 65536] [--repeats 40]
 
 A rig of FLAME's full size (5,143 vertices, 100 expressions, 5 joints, 36 pose correctives), all coefficients in motion,
-splats of SH degree 3 with strain color, in a headless Chromium with software WebGL 2. *Floor*: the bytes that the part
-must at least move, at the copy bandwidth of JavaScript measured in the same page. Upload and draw calls are what the
-calls take until they return; what the graphics card does afterwards is not in them. Run it on an idle machine.
+splats of SH degree 3 whose colors and positions follow strain, in a headless Chromium with software WebGL 2. *Floor*:
+the bytes that the part must at least move, at the copy bandwidth of JavaScript measured in the same page. Upload and
+draw calls are what the calls take until they return; what the graphics card does afterwards is not in them. Run it on
+an idle machine.
 """
 
 import argparse
@@ -86,7 +87,8 @@ MEASURE = """(async (repeats) => {
   const block = new Float32Array(1 << 21);
   const copy = new Float32Array(1 << 21);
   const bytes = (...arrays) => arrays.reduce((sum, array) => sum + array.byteLength, 0);
-  const strain = faceFrames.strain;
+  const { nearby, strain } = faceFrames;
+  const still = faceFrames.world.slice(); // moved again and again, triangles would leave the head
   const frame = () => {
     moment = (moment + 0.37) % (motion.frames - 1);
     player.frame = moment;
@@ -98,6 +100,10 @@ MEASURE = """(async (repeats) => {
       bytes(rig.vertices, faceFrames.faces, faceFrames.world)],
     ['strain', computed(() => strain.update(rig.vertices)),
       bytes(rig.vertices, strain.faces, strain.gram, strain.toTensor, strain.toPlane, strain.atVertex, strain.values)],
+    ['nearby strain', computed(() => nearby.update()),
+      bytes(strain.values, nearby.rest, ...Array(3).fill([nearby.values, nearby.edges, nearby.edgeSum]).flat())],
+    ['positions that follow strain', computed(() => (faceFrames.world.set(still), faceFrames.moveOrigins())),
+      bytes(faceFrames.world, still, faceFrames.strainPosition, nearby.values)],
     ['in camera space', computed(() => (faceFrames.compose(camera.matrix, values), faceFrames.annotate(null, values))),
       bytes(faceFrames.world, strain.values, values)],
     ['sort', computed(() => depthSort.sort(values)),
@@ -158,7 +164,8 @@ def head_page(count: int) -> str:
         unbound=np.zeros(count, bool),
         strain_color=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
     )
-    avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces, antialiased=True)
+    moves = rng.normal(0, 1e-3, (len(faces), 3, 3)).astype(np.float32)
+    avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces, antialiased=True, strain_position=moves)
     views = {"Front": look_at((0, 0, 1), (0, 0, 0), *WINDOW_PX, 2000.0)}
     return page("Benchmark", "", data_file(avatar, head_rig(vertices), Playback(views=views)))
 

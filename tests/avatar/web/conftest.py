@@ -77,7 +77,7 @@ def make_head(
     strain: bool = True,
     strain_position: bool = False,
 ) -> Head:
-    """strain: whether colors follow it; strain_position: whether splats move with it, by about as much as they spread."""
+    """strain: whether colors follow it; strain_position: whether splats move with it, as far as they spread."""
     model = synthetic_flame(0)
     rng = np.random.default_rng(3)
     frames = [

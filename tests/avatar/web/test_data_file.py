@@ -53,7 +53,7 @@ def test_splats_come_back_within_their_steps(head):
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 @pytest.mark.parametrize("strain", [False, True])
 def test_strain_moves_splats_by_less_than_their_own_step(convention, strain):
-    """Catches vectors stored in another unit or order, and a range of strain that is left out where no color needs it."""
+    """Catches vectors stored in another unit or order, and a range that is left out where no color needs it."""
     head = make_head(convention, strain=strain, strain_position=True)
     avatar = head.avatar
     _, arrays = read_web_data(head.data())

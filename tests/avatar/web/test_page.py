@@ -66,7 +66,7 @@ def psnr(browser: Browser, head: Head, frame: int) -> float:
     ],
 )
 def test_picture_is_the_renderers(options, exact, browser, tmp_path):
-    """Catches any difference of projection, place, color, blending or quantization, and any request that a page makes."""
+    """Catches a difference of projection, position, color, blending or quantization, and any request of the page."""
     head = make_head(**options)
     show(browser, tmp_path, head.data(exact=exact))
     for frame in (0, 2):

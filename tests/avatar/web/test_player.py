@@ -55,8 +55,8 @@ def test_pose_is_flames(head, baked, tmp_path):
     ],
 )
 def test_frames_and_strain_are_the_embedding(convention, strain, strain_position, tmp_path):
-    """Catches another axis, scale, sliver rule or strain than the one that the splats were trained with, and origins that
-    do not move with the nearby strain, or by that of the frame before."""
+    """Catches another axis, scale, sliver rule or strain than the one that the splats were trained with, and origins
+    that do not move with the nearby strain, or with that of the frame before."""
     head = make_head(convention, strain=strain, strain_position=strain_position)
     results = evaluated(head.data(exact=True), tmp_path)["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
