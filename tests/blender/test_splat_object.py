@@ -396,16 +396,25 @@ def test_trees_and_materials_are_built_once(tmp_path: Path):
     assert len(bpy.data.materials) == 2
 
 
-@pytest.mark.parametrize("kind", [("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False)])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        ("stga", 3, True),
+        ("gaussian_avatars", 2, False),
+        (None, 0, False),
+        ("stga", 0, False, True),
+        ("gaussian_avatars", 3, True, True),
+    ],
+)
 def test_trees_are_built_one_node_group_at_a_time(kind):
     """Catches what blocks the UI when a live preview first appears: several groups built in one call, a large tree
     (build time is quadratic), and groups that are built again."""
-    built = []
-    while splat_nodes.build_next_node_group(*kind):
+    built, options = [], splat_nodes.TreeOptions(*kind)
+    while splat_nodes.build_next_node_group(options):
         built.append(len(bpy.data.node_groups))
     assert built == list(range(1, len(built) + 1))
     assert max(len(tree.nodes) for tree in bpy.data.node_groups) <= 60
-    assert splat_nodes.splat_tree(*kind) == splat_nodes.find_splat_tree(*kind)
+    assert splat_nodes.splat_tree(options) == splat_nodes.find_splat_tree(options)
     assert len(bpy.data.node_groups) == len(built)
 
 

@@ -4,18 +4,14 @@ from math import pi, sqrt
 from typing import Any
 
 from ...avatar.splats import SH_C0
-from ...avatar.strain import STRAIN_COMPONENTS, STRAIN_GAIN
 from .node_builder import NodeGroup, Nodes
-from .splat_attributes import FACE, GRAM, PLANE, RANGE, SH, STRAIN_COLOR, TENSOR, TENSOR_HALVES
-
-# Temporary attributes on the faces of the deformed neutral mesh.
-_GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
+from .splat_attributes import SH, STRAIN_COLOR
 
 
 def constant_color(nodes: Nodes, strain: Any) -> Any:
     """The part of each splat's sRGB color, not clamped, that does not depend on the view direction.
 
-    strain: vector from STRAIN, None where colors do not follow it. Coefficients as in `Splats`.
+    strain: vector from SAMPLED_STRAIN, None where colors do not follow it. Coefficients as in `Splats`.
     """
     terms = [nodes.scale(_sh(nodes, 0), SH_C0), (0.5, 0.5, 0.5)]
     if strain is not None:
@@ -51,39 +47,6 @@ def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
         line = nodes.math("DIVIDE", value, 12.92)
         linear.append(nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.04045), line, power))
     return nodes.combine(*linear)
-
-
-def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
-    """The neutral mesh moved to the posed vertices, with each face's deformation tensor (`avatar.strain`) stored."""
-    position, index = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
-    moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
-    mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
-    p0, p1, p2 = nodes.triangle_corners()
-    e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    gram = nodes.combine(*(nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2))))
-    change = nodes.vector("SUBTRACT", gram, nodes.attribute(GRAM, "FLOAT_VECTOR"))
-    mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
-    changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
-    for half in TENSOR_HALVES:
-        columns = (nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR") for k in range(STRAIN_COMPONENTS))
-        tensor = nodes.sum(*(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True)))
-        mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
-    return mesh
-
-
-def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
-    """Strain of each splat's triangle (`avatar.strain.face_strain`) as a vector; mesh: from `_deformed`."""
-    # Faces to points and back: the mean over the triangles that touch a triangle.
-    means = [nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT") for half in TENSOR_HALVES]
-    strains = []
-    for index in range(STRAIN_COMPONENTS):
-        plane = (nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES)
-        products = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)]
-        strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
-    lowest, highest = (nodes.attribute(name, "FLOAT_VECTOR") for name in RANGE)
-    strain = nodes.vector("MAXIMUM", nodes.vector("MINIMUM", nodes.combine(*strains), highest), lowest)
-    mesh = nodes.store(mesh, _STRAIN, strain, "FLOAT_VECTOR", "FACE")
-    return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
 
 
 def _sh(nodes: Nodes, index: int) -> Any:
@@ -141,8 +104,6 @@ def _third_band(nodes: Nodes, direction: Any) -> Any:
 
 
 SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
-DEFORMED = NodeGroup("STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
-STRAIN = NodeGroup("STGA Strain in Range", {"Deformed": "Geometry"}, "Vector", _sampled_strain)
 SH_BANDS = tuple(
     NodeGroup(f"STGA Spherical Harmonics {degree}", {"Direction": "Vector"}, "Vector", build)
     for degree, build in enumerate((_first_band, _second_band, _third_band), 1)

@@ -9,7 +9,8 @@ import bpy
 from ...avatar.embedding import MIN_AREA_RATIO, UPRIGHT_COSINE
 from .display_modes import WORLD_ROTATION, WORLD_SCALE
 from .node_builder import NodeGroup, Nodes
-from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, XYZ
+from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, STRAIN_POSITION, XYZ
+from .strain_nodes import NEARBY, NEARBY_STRAIN
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = "stga_frame_origin", "stga_frame_rotation", "stga_frame_size"
@@ -22,6 +23,26 @@ def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
     mesh = nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
     mesh = nodes.store(mesh, _FRAME_ROTATION, rotation, "QUATERNION", "FACE")
     return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
+
+
+def _shifted_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
+    """The mesh with frames that are moved by the strain around them (`avatar.embedding.shifted_frames`).
+
+    mesh: from STRAIN, with the neutral mesh's attributes.
+    """
+    mesh = nodes.group(FRAMES[convention], nodes.group(NEARBY, mesh))
+    nearby = nodes.components(nodes.attribute(NEARBY_STRAIN, "FLOAT_VECTOR"))
+    shift = nodes.sum(
+        *(
+            nodes.scale(nodes.attribute(STRAIN_POSITION.format(index), "FLOAT_VECTOR"), factor)
+            for index, factor in enumerate(nearby)
+        )
+    )
+    shift = nodes.scale(shift, _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention))
+    rotation = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
+    moved = nodes.out("FunctionNodeRotateVector", {"Vector": shift, "Rotation": rotation})
+    origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN, "FLOAT_VECTOR"), moved)
+    return nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
 
 
 def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
@@ -48,13 +69,18 @@ def _sampled_frames(nodes: Nodes, mesh: Any, convention: str) -> tuple[Any, Any,
     def sample(name: str, data_type: str) -> Any:
         return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
 
-    size = sample(_FRAME_SIZE, "FLOAT")
-    if convention == "stga":
-        neutral = nodes.attribute(NEUTRAL_AREA, "FLOAT")
-        ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
-        # A neutral triangle without area gives no ratio: its splats keep their size.
-        size = nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
-    return sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION"), size
+    scale = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
+    return sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION"), scale
+
+
+def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
+    """A frame's scale by its size, where NEUTRAL_AREA is that of its triangle."""
+    if convention != "stga":
+        return size
+    neutral = nodes.attribute(NEUTRAL_AREA, "FLOAT")
+    ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
+    # A neutral triangle without area gives no ratio: its splats keep their size.
+    return nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
 
 
 def _stga_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
@@ -118,6 +144,13 @@ FRAMES = {
     for convention in _FRAMES
 }
 """Head mesh -> the mesh with frames, by convention."""
+SHIFTED = {
+    convention: NodeGroup(
+        f"STGA Shifted Frames ({convention})", {"Strain": "Geometry"}, "Geometry", partial(_shifted_frames, convention)
+    )
+    for convention in _FRAMES
+}
+"""Deformed neutral mesh with strain -> the same with frames that are moved by strain, by convention."""
 PLACED: dict[str | None, NodeGroup] = {
     convention: NodeGroup(
         f"STGA Place Splats ({convention or 'world'})",

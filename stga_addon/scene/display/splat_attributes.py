@@ -1,6 +1,6 @@
 """Splats as attributes of a Blender mesh: their names, how they are written, how they are read back."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 from uuid import uuid4
@@ -24,12 +24,13 @@ COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for spla
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
-NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²
+NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²; also on the faces that have STRAIN_POSITION
 
 # On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
 GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
 RANGE = ("stga_strain_lowest", "stga_strain_highest")
+STRAIN_POSITION = "stga_strain_position_{}"  # by component of strain, as in `Avatar`
 
 Attributes = dict[str, tuple[str, str, np.ndarray]]
 """Name -> (data type, name of the element's field, flat values)."""
@@ -45,17 +46,27 @@ class SplatAttributes:
 
 def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     """What displaying an avatar writes into Blender; uses no bpy, so that a thread can compute it."""
-    area = face_areas(avatar.neutral, avatar.faces)[avatar.splats.face]
+    areas = face_areas(avatar.neutral, avatar.faces)
     splats = {
         **splat_attributes(avatar.splats),
         FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
-        NEUTRAL_AREA: ("FLOAT", "value", flat_floats(area)),
+        NEUTRAL_AREA: ("FLOAT", "value", flat_floats(areas[avatar.splats.face])),
     }
-    neutral: Attributes = {}
-    if avatar.splats.strain_color.shape[1]:
-        vectors = _strain_vectors(strain_basis(avatar.neutral, avatar.faces, avatar.strain_range))
-        neutral = {name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors}
-    return SplatAttributes(splats, neutral)
+    return SplatAttributes(splats, _neutral_attributes(avatar, areas))
+
+
+def _neutral_attributes(avatar: Avatar, areas: np.ndarray) -> Attributes:
+    """What nodes need to have splats follow strain; areas (F,) of the neutral triangles, in m²."""
+    if not avatar.follows_strain:
+        return {}
+    vectors = dict(_strain_vectors(strain_basis(avatar.neutral, avatar.faces, avatar.strain_range)))
+    if avatar.strain_position is not None:
+        for index in range(STRAIN_COMPONENTS):
+            vectors[STRAIN_POSITION.format(index)] = avatar.strain_position[:, index]
+    attributes: Attributes = {name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors.items()}
+    if avatar.strain_position is not None:
+        attributes[NEUTRAL_AREA] = ("FLOAT", "value", flat_floats(areas))
+    return attributes
 
 
 def splat_attributes(splats: Splats) -> Attributes:
@@ -123,9 +134,19 @@ def read_splats(mesh: Any) -> Splats:
 
 def read_strain_range(neutral: Any) -> np.ndarray | None:
     """`Avatar.strain_range` as stored in a neutral mesh; None where it is not."""
-    if not all(name in neutral.attributes for name in RANGE):
+    return _read_vectors(neutral, RANGE)
+
+
+def read_strain_position(neutral: Any) -> np.ndarray | None:
+    """`Avatar.strain_position` as stored in a neutral mesh; None where it is not."""
+    return _read_vectors(neutral, [STRAIN_POSITION.format(index) for index in range(STRAIN_COMPONENTS)])
+
+
+def _read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
+    """(F, len(names), 3) of vector attributes; None where the mesh lacks one."""
+    if not all(name in mesh.attributes for name in names):
         return None
-    return np.stack([read_values(neutral.attributes[name].data, "vector", 3) for name in RANGE], 1)
+    return np.stack([read_values(mesh.attributes[name].data, "vector", 3) for name in names], 1)
 
 
 def _base_color(dc: np.ndarray) -> np.ndarray:
@@ -135,7 +156,7 @@ def _base_color(dc: np.ndarray) -> np.ndarray:
 
 
 def _strain_vectors(basis: StrainBasis) -> Iterator[tuple[str, np.ndarray]]:
-    """What the color nodes need to compute strain: name and vector (F, 3)."""
+    """What nodes need to compute strain: name and vector (F, 3)."""
     yield GRAM, basis.gram
     yield from zip(RANGE, basis.range.transpose(1, 0, 2), strict=True)
     for name, tensors in ((TENSOR, basis.to_tensor), (PLANE, basis.to_plane)):

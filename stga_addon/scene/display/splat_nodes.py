@@ -4,18 +4,19 @@ For splats that follow a head it computes each triangle's frame on the head's *e
 the splats' face index and composes position, rotation and scale.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 
 from .. import tags
 from ..layers import FROZEN_COLOR
-from .color_nodes import DEFORMED, SH_BANDS, SRGB_TO_LINEAR, STRAIN, constant_color, view_color, view_direction
+from .color_nodes import SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
 from .display_modes import AS_TRAINED, MODES, displayed
-from .frame_nodes import FRAMES, PLACED
+from .frame_nodes import FRAMES, PLACED, SHIFTED
 from .materials import DISPLAY_COLOR
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
 from .splat_attributes import COLOR, FACE, OPACITY
+from .strain_nodes import DEFORMED, NEARBY, SAMPLED_STRAIN, STRAIN
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"
@@ -31,53 +32,80 @@ SELECTED_ONLY = "Selected Only"
 _FROZEN = "stga_frozen"
 
 
-def splat_tree(convention: str | None, degree: int = 0, strained: bool = False) -> bpy.types.NodeTree:
-    """The node tree for splats embedded by `convention` ("stga", "gaussian_avatars"), or None for world space.
+class TreeOptions(NamedTuple):
+    """What the node tree depends on; there is one tree of each kind in a file.
 
-    degree: of their spherical harmonics; strained: whether their colors follow strain. Built once per file.
+    convention       of the splats' embedding ("stga", "gaussian_avatars"); None for world space
+    degree           of their spherical harmonics
+    strain_color, strain_position  whether colors, and positions, follow the strain of triangles
     """
-    existing = find_splat_tree(convention, degree, strained)
+
+    convention: str | None
+    degree: int = 0
+    strain_color: bool = False
+    strain_position: bool = False
+
+    @property
+    def tree_name(self) -> str:
+        """At most 59 characters: Blender before 5.0 has room for 63, and adds ".001" to a name that is taken."""
+        return f"STGA Splats ({self.convention or 'world'}, SH {self.degree}{_STRAIN_NAMES[self[2:]]})"
+
+
+_STRAIN_NAMES = {
+    (False, False): "",
+    (True, False): ", strain in range",
+    (False, True): ", strain position",
+    (True, True): ", strain color/position",
+}
+
+
+def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
+    """The node tree for splats of this kind. Built once per file."""
+    existing = find_splat_tree(options)
     if existing is not None:
         return existing
-    tree = new_tree(_name(convention, degree, strained))
+    tree = new_tree(options.tree_name)
     tree.is_modifier = True
-    _add_interface(tree, convention is not None, degree)
-    _build(Nodes(tree), convention, degree, strained)
+    _add_interface(tree, options.convention is not None, options.degree)
+    _build(Nodes(tree), options)
     return tree
 
 
-def find_splat_tree(convention: str | None, degree: int, strained: bool) -> bpy.types.NodeTree | None:
+def find_splat_tree(options: TreeOptions) -> bpy.types.NodeTree | None:
     """What `splat_tree` built before in this file, or None."""
-    return find_tree(_name(convention, degree, strained))
+    return find_tree(options.tree_name)
 
 
-def build_next_node_group(convention: str | None, degree: int, strained: bool) -> bool:
+def build_next_node_group(options: TreeOptions) -> bool:
     """Build one node group that `splat_tree` needs, the tree itself last; returns False if all exist.
 
     Calling it from a timer until it returns False keeps the UI responsive meanwhile.
     """
-    if find_splat_tree(convention, degree, strained) is not None:
+    if find_splat_tree(options) is not None:
         return False
-    missing = next((group for group in _node_groups(convention, degree, strained) if not group.exists()), None)
+    missing = next((group for group in _node_groups(options) if not group.exists()), None)
     if missing is not None:
         missing.tree()
     else:
-        splat_tree(convention, degree, strained)
+        splat_tree(options)
     return True
 
 
-def _node_groups(convention: str | None, degree: int, strained: bool) -> list[NodeGroup]:
-    """The groups that `_build` uses."""
+def _node_groups(options: TreeOptions) -> list[NodeGroup]:
+    """The groups that `_build` uses, each after those that it uses itself."""
+    convention, degree, strain_color, strain_position = options
     groups = [PLACED[convention], *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS]
-    if degree > 0 or strained:
+    if strain_color or strain_position:
+        groups += [DEFORMED, STRAIN]
+    if strain_color:
+        groups.append(SAMPLED_STRAIN)
+    if strain_position and convention is not None:
+        groups += [NEARBY, SHIFTED[convention]]
+    if degree > 0 or strain_color:
         groups.append(SRGB_TO_LINEAR)
-    return groups + ([DEFORMED, STRAIN] if strained else [])
-
-
-def _name(convention: str | None, degree: int, strained: bool) -> str:
-    return f"STGA Splats ({convention or 'world'}, SH {degree}{', strain in range' if strained else ''})"
+    return groups
 
 
 def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
@@ -107,16 +135,22 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
         add(SELECTED_ONLY, "Bool", "Hide splats that the current frame's selection freezes", default_value=False)
 
 
-def _build(nodes: Nodes, convention: str | None, degree: int, strained: bool) -> None:
+def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
     splats, visible = inputs["Geometry"], _visible(nodes, inputs)
-    if convention is None:
+    if options.convention is None:
         splats = nodes.group(PLACED[None], splats)
-        color = _color(nodes, inputs, None, degree)
+        color = _color(nodes, inputs, None, options.degree)
     else:
         head = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
-        splats = nodes.group(PLACED[convention], splats, nodes.group(FRAMES[convention], head))
-        color = _color(nodes, inputs, _strain(nodes, inputs, head) if strained else None, degree)
+        strained = _strained(nodes, inputs, head) if options.strain_color or options.strain_position else None
+        if options.strain_position:
+            frames = nodes.group(SHIFTED[options.convention], strained)
+        else:
+            frames = nodes.group(FRAMES[options.convention], head)
+        splats = nodes.group(PLACED[options.convention], splats, frames)
+        strain = nodes.group(SAMPLED_STRAIN, strained) if options.strain_color else None
+        color = _color(nodes, inputs, strain, options.degree)
         splats = nodes.store(splats, _FROZEN, nodes.group(_FROZEN_SPLATS, head), "BOOLEAN")
         frozen = nodes.attribute(_FROZEN, "BOOLEAN")
         color = nodes.switch("RGBA", nodes.logic("AND", frozen, inputs[SHOW_SELECTION]), color, FROZEN_COLOR)
@@ -127,7 +161,8 @@ def _build(nodes: Nodes, convention: str | None, degree: int, strained: bool) ->
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
 
 
-def _strain(nodes: Nodes, inputs: Any, head: Any) -> Any:
+def _strained(nodes: Nodes, inputs: Any, head: Any) -> Any:
+    """The neutral mesh, deformed as the head is, with strain on its triangles."""
     neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
     return nodes.group(STRAIN, nodes.group(DEFORMED, head, neutral))
 

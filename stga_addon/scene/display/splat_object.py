@@ -20,6 +20,7 @@ from .splat_attributes import (
     SplatAttributes,
     avatar_attributes,
     read_splats,
+    read_strain_position,
     read_strain_range,
     splat_attributes,
     write_attributes,
@@ -49,7 +50,7 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
     collection = next(own, bpy.context.scene.collection)
     splat_object = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
     splat_object[tags.CONVENTION], splat_object[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
-    _add_modifier(splat_object, avatar.convention, avatar.splats)
+    _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
     neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared.neutral)
@@ -64,19 +65,19 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
 def show_world_splats(splats: Splats, name: str) -> Any:
     """Make a splat object of a world-space set, for example a standard 3DGS PLY; returns it."""
     splat_object = _splat_object(name, splat_attributes(splats), bpy.context.scene.collection)
-    _add_modifier(splat_object, None, splats)
+    _add_modifier(splat_object, splat_nodes.TreeOptions(None, splats.sh_degree))
     return splat_object
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
-    """Whether `update_splats` can show the avatar in this object: same convention, color model and antialiasing."""
+    """Whether `update_splats` can show the avatar in this object: the same in all but its splats and its strain."""
     try:
-        tree = splat_modifier(splat_object).node_group
+        tree, neutral = splat_modifier(splat_object).node_group, get_input(splat_object, splat_nodes.NEUTRAL)
     except StgaError:
         return False
     stored = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
-    same = stored == (avatar.convention, avatar.antialiased)
-    return same and tree == splat_nodes.find_splat_tree(*_tree_options(avatar.convention, avatar.splats))
+    same = stored == (avatar.convention, avatar.antialiased) and neutral is not None
+    return same and tree == splat_nodes.find_splat_tree(_tree_options(avatar))
 
 
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
@@ -84,12 +85,13 @@ def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
 
     prepared: `avatar_attributes` of an avatar for which `can_update` is true.
     """
+    _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared.neutral)
     write_splats(splat_object.data, prepared.splats)
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
     """Build one of the node groups that `show_avatar` needs; returns False if all exist (see `splat_nodes`)."""
-    return splat_nodes.build_next_node_group(*_tree_options(avatar.convention, avatar.splats))
+    return splat_nodes.build_next_node_group(_tree_options(avatar))
 
 
 def check_head(avatar: Avatar, head: Any) -> None:
@@ -174,6 +176,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         faces=mesh_triangles(neutral.data),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
         strain_range=read_strain_range(neutral.data),
+        strain_position=read_strain_position(neutral.data),
     )
 
 
@@ -214,18 +217,25 @@ def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
 
 def _neutral_object(name: str, avatar: Avatar, attributes: Attributes) -> Any:
     mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
-    write_attributes(mesh, attributes, "FACE")
+    _write_neutral(mesh, attributes)
     return bpy.data.objects.new(name, mesh)
 
 
-def _add_modifier(splat_object: Any, convention: str | None, splats: Splats) -> None:
+def _write_neutral(mesh: Any, attributes: Attributes) -> None:
+    write_attributes(mesh, attributes, "FACE")
+    mesh.update()
+
+
+def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
     modifier = splat_object.modifiers.new("STGA Splats", "NODES")
-    modifier.node_group = splat_nodes.splat_tree(*_tree_options(convention, splats))
+    modifier.node_group = splat_nodes.splat_tree(options)
     set_input(
         splat_object, splat_nodes.DISPLAY, AS_TRAINED
     )  # a menu's default reaches the modifier in some versions only
 
 
-def _tree_options(convention: str | None, splats: Splats) -> tuple[str | None, int, bool]:
-    """The arguments of `splat_nodes.splat_tree`."""
-    return convention, splats.sh_degree, splats.strain_color.shape[1] > 0
+def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
+    splats = avatar.splats
+    return splat_nodes.TreeOptions(
+        avatar.convention, splats.sh_degree, splats.strain_color.shape[1] > 0, avatar.strain_position is not None
+    )
