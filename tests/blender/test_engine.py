@@ -376,16 +376,39 @@ def test_scaled_objects(tmp_path):
     np.testing.assert_allclose(large["R"], small["R"], atol=TOLERANCE)
 
 
-def test_strain_colors_and_antialiasing_are_rendered(tmp_path):
+def test_strain_and_antialiasing_are_rendered(tmp_path):
     """Catches parts of an avatar that are lost when it is stored in Blender and read back."""
-    avatar = textured(avatar_of("stga"), -8.5)
-    colors = np.random.default_rng(4).normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
-    avatar = replace(avatar, splats=replace(avatar.splats, strain_color=colors), antialiased=True)
+    avatar, rng = textured(avatar_of("stga"), -8.5), np.random.default_rng(4)
+    colors = rng.normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
+    positions = rng.normal(0, 0.004, (len(avatar.faces), 3, 3)).astype(np.float32)
+    splats = replace(avatar.splats, strain_color=colors)
+    avatar = replace(avatar, splats=splats, strain_position=positions, antialiased=True)
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
-    plain = replace(avatar, splats=replace(avatar.splats, strain_color=None), antialiased=False)
-    expected, without = (render_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3) for a in (avatar, plain))
-    assert np.abs(expected - without).max() > 0.05
+    expected = render_avatar(avatar, evaluated_vertices(head), camera, (1.0,) * 3)
+    for lost in (
+        replace(avatar, splats=replace(splats, strain_color=None)),
+        replace(avatar, strain_position=None),
+        replace(avatar, antialiased=False),
+    ):
+        assert (
+            np.abs(expected - render_avatar(lost, evaluated_vertices(head), camera, (1.0,) * 3)).max() > 2 * TOLERANCE
+        )
+    assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < TOLERANCE
+
+
+def test_positions_alone_follow_strain(tmp_path):
+    """Catches strain that is left out, or colors that are read where there are none, without strain colors."""
+    avatar = textured(avatar_of("gaussian_avatars"))
+    positions = np.random.default_rng(5).normal(0, 0.4, (len(avatar.faces), 3, 3)).astype(np.float32)
+    avatar = replace(avatar, strain_position=positions)
+    shown, head = show(avatar)
+    camera = expected_camera(camera_at(), shown)
+    expected, unmoved = (
+        render_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3)
+        for a in (avatar, replace(avatar, strain_position=None))
+    )
+    assert np.abs(expected - unmoved).max() > 0.05
     assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < TOLERANCE
 
 

@@ -51,6 +51,11 @@ def avatar(degree: int, strain: bool = False) -> Avatar:
     return Avatar(splats, "stga", vertices.astype(np.float32), faces)
 
 
+def with_strain_position(of: Avatar) -> Avatar:
+    shape = (len(of.faces), 3, 3)
+    return replace(of, strain_position=np.random.default_rng(9).normal(0, 5e-3, shape).astype(np.float32))
+
+
 def layer(of: Avatar, pose: np.ndarray | None = None, antialiased: bool = False, **more: Any) -> SceneLayer:
     mesh = of.neutral * [1.1, 0.9, 1.05]
     return SceneLayer(of.splats, of.frames(mesh), np.eye(4) if pose is None else pose, antialiased, **more)
@@ -72,6 +77,7 @@ def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
         "sh 0": ([layer(avatar(0))], near),
         "sh 3": ([layer(avatar(3))], near),
         "sh 1, strain": ([layer(avatar(1, strain=True))], near),
+        "strain position": ([layer(with_strain_position(avatar(1)))], near),
         "antialiased": ([layer(avatar(0), antialiased=True)], near),
         "rotated and scaled": ([layer(avatar(3), TURNED)], near),
         "orthographic": ([layer(avatar(3))], far),

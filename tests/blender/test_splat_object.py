@@ -11,19 +11,22 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
+from stga_addon.avatar.strain import edge_neighbors, rest_strain  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import ELLIPSOIDS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT  # noqa: E402
-from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH  # noqa: E402
+from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH, avatar_attributes  # noqa: E402
 from stga_addon.scene.display.splat_object import (  # noqa: E402
+    can_update,
     evaluated_splats,
     get_input,
     set_input,
     show_avatar,
     show_world_splats,
     stored_avatar,
+    update_splats,
 )
 
 FRAMES = (1, 5, 9)
@@ -97,8 +100,7 @@ def same_rotation(a: np.ndarray, b: np.ndarray) -> float:
 
 def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
     """The evaluated splats against `to_world` on the evaluated head's vertices; returns the positions."""
-    frames = face_frames(evaluated_vertices(head), avatar.faces, avatar.neutral, avatar.convention)
-    expected = to_world(avatar.splats, frames)
+    expected = to_world(avatar.splats, avatar.frames(evaluated_vertices(head)))
     xyz, rotation, scale = evaluated_splats(shown)
     assert np.abs(xyz - expected.xyz).max() < 1e-5
     assert same_rotation(rotation, expected.rotation) < 1e-3
@@ -265,6 +267,110 @@ def test_colors_follow_strain():
         expected = 0.5 + 0.28209479177387814 * to_world(splats, frames).sh[:, 0]
         np.testing.assert_allclose(seen[frame], linear(expected), atol=1e-3)
     assert np.abs(seen[1] - seen[9]).max() > 0.1
+
+
+def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Avatar:
+    """Splats that move with strain, on a mesh with boundaries, an edge of three triangles and a line for a triangle.
+
+    Within their ranges of strain, some triangles at rest have another strain than 0.
+    """
+    avatar = avatar_of(convention, count)
+    rng, neutral, faces = np.random.default_rng(seed), avatar.neutral.copy(), avatar.faces
+    neutral[faces[7, 2]] = neutral[faces[7, 1]]
+    fin = np.append(faces[100, :2], len(neutral))
+    neutral = np.append(neutral, [1.2 * neutral[faces[100, 0]] - 0.2 * neutral.mean(0)], axis=0)
+    faces = np.append(faces, [fin], axis=0).astype(np.int32)
+    ends = np.stack([rng.uniform(-2, -0.3, (len(faces), 3)), rng.uniform(-0.3, 2, (len(faces), 3))], 1)
+    unit = 0.004 if convention == "stga" else 0.3
+    splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
+    return replace(
+        avatar,
+        splats=splats,
+        neutral=neutral.astype(np.float32),
+        faces=faces,
+        strain_range=ends.astype(np.float32),
+        strain_position=rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("strain_color", [False, True])
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_positions_follow_strain(convention, strain_color, tmp_path):
+    """Catches strain averaged over other triangles or too few times, not relative to rest, and coefficients of another
+    triangle, in other axes or another unit: against numpy on the deformed mesh, also in a saved file."""
+    avatar = following_positions(convention)
+    colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3 if strain_color else 0, 3)).astype(np.float32)
+    avatar = replace(avatar, splats=replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors))
+    sharing = sum(column < len(avatar.faces) for column in edge_neighbors(avatar.faces))
+    assert {2, 3, 4} <= set(sharing.tolist()), "triangles at a boundary, inside, and at an edge of three"
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown = show_avatar(avatar, head)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    shown, head = bpy.data.objects[shown_name(convention)], bpy.data.objects["head"]
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
+    unmoved = replace(avatar, strain_position=None)
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        frames, plain = (each.frames(evaluated_vertices(head)) for each in (avatar, unmoved))
+        assert np.median(np.linalg.norm(frames.origin - plain.origin, axis=1)) > 3e-4
+        assert_follows(shown, head, avatar)
+        expected = 0.5 + 0.28209479177387814 * to_world(avatar.splats, frames).sh[:, 0]
+        np.testing.assert_allclose(displayed_colors(shown), linear(expected), atol=1e-3)
+    bpy.context.scene.frame_set(FRAMES[0])
+    head.shape_key_clear()
+    assert np.abs(rest_strain(avatar.strain_range)).max() > 0.2
+    assert_follows(shown, head, unmoved)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_an_avatar_that_follows_strain_is_read_back(convention):
+    """Catches coefficients that Blender's scene loses, transposes or gives to other triangles."""
+    avatar = following_positions(convention)
+    shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
+    stored = stored_avatar(shown)
+    np.testing.assert_array_equal(stored.strain_position, avatar.strain_position)
+    np.testing.assert_array_equal(stored.strain_range, avatar.strain_range)
+    posed = evaluated_vertices(bpy.data.objects["head"])
+    np.testing.assert_array_equal(stored.frames(posed).origin, avatar.frames(posed).origin)
+    other = show_avatar(replace(avatar, strain_position=None), bpy.data.objects["head"])
+    assert stored_avatar(other).strain_position is None
+
+
+def test_updated_splats_follow_strain_anew():
+    """Catches a live preview that shows new splats with the strain coefficients of the first ones."""
+    first, second = (following_positions("stga", seed) for seed in (6, 7))
+    second = replace(second, neutral=first.neutral, faces=first.faces)
+    head = animated_head(first.neutral, first.faces)
+    shown = show_avatar(first, head)
+    bpy.context.scene.frame_set(5)
+    assert_follows(shown, head, first)
+    assert can_update(shown, second)
+    update_splats(shown, avatar_attributes(second))
+    assert_follows(shown, head, second)
+    np.testing.assert_array_equal(stored_avatar(shown).strain_position, second.strain_position)
+    assert not can_update(shown, replace(second, strain_position=None))
+    colors = np.zeros((len(second.splats), 3, 3), np.float32)
+    assert not can_update(shown, replace(second, splats=replace(second.splats, strain_color=colors)))
+    set_input(shown, splat_nodes.NEUTRAL, None)
+    assert not can_update(shown, second)
+
+
+def test_names_of_trees_are_told_apart():
+    """Catches names that Blender shortens, and a tree or group that is found for another whose name begins likewise."""
+    kinds = [
+        splat_nodes.TreeOptions(convention, degree, *strain)
+        for convention in (*CONVENTIONS, None)
+        for degree in range(4)
+        for strain in ((False, False), (True, False), (False, True), (True, True))
+        if convention or not any(strain)
+    ]
+    trees = {kind: splat_nodes.splat_tree(kind) for kind in kinds}
+    assert len({tree.name for tree in trees.values()}) == len(kinds)
+    assert max(len(tree.name) for tree in trees.values()) <= 59
+    assert all(splat_nodes.find_splat_tree(kind) == tree for kind, tree in trees.items())
+    names = [tree.name for tree in bpy.data.node_groups]
+    assert not [(a, b) for a in names for b in names if a != b and b.startswith(a)]
 
 
 def test_no_strain_nodes_without_strain_colors():
