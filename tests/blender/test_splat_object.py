@@ -373,8 +373,8 @@ def test_names_of_trees_are_told_apart():
     assert not [(a, b) for a in names for b in names if a != b and b.startswith(a)]
 
 
-def test_no_strain_nodes_without_strain_colors():
-    """Catches strain nodes, which cost playback time, for avatars without strain colors."""
+def test_no_strain_nodes_without_strain():
+    """Catches strain nodes, which cost playback time, for avatars that do not follow strain."""
     avatar = avatar_of("stga", 10)
     show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     trees = bpy.data.node_groups

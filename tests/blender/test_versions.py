@@ -17,7 +17,7 @@ pytest.importorskip("bpy")
 
 from capture.factory import ball, write_flame_capture
 
-from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.ply import read_ply
@@ -59,9 +59,11 @@ def test_the_whole_workflow(version: str, zip_file: Path, tmp_path: Path) -> Non
     model.rename(tmp_path / "model.npz")
     capture = open_capture(folder, tmp_path / "model.npz")
     faces = ball()[1].astype(np.int32)
-    avatar = Avatar(lattice_splats(capture.neutral, faces, order=0), "stga", capture.neutral.astype(np.float32), faces)
-    write_avatar(tmp_path / "a.npz", avatar)
     rng = np.random.default_rng(2)
+    splats = lattice_splats(capture.neutral, faces, order=0)
+    positions = rng.normal(0, 0.003, (len(faces), 3, 3)).astype(np.float32)
+    avatar = Avatar(splats, "stga", capture.neutral.astype(np.float32), faces, strain_position=positions)
+    write_avatar(tmp_path / "a.npz", avatar)
     other = {"expr": rng.normal(size=(5, 2)), "pose": rng.normal(0, 0.3, (5, 15)), "shape": np.ones(4)}
     np.savez(tmp_path / "other.npz", **other)
 
@@ -79,7 +81,7 @@ def test_the_whole_workflow(version: str, zip_file: Path, tmp_path: Path) -> Non
         pose = other["pose"][row]
         frame = FlameFrame(other["expr"][row], pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:])
         mesh = flame_forward(own.model, own.shape, frame, own.static_offset)
-        expected = to_world(avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral)).xyz
+        expected = to_world(avatar.splats, avatar.frames(mesh)).xyz
         np.testing.assert_allclose(read_ply(tmp_path / f"plys/{1 + row:05d}.ply").xyz, expected, atol=1e-5)
         np.testing.assert_allclose(pair.frame(row).pose, frame.pose, atol=1e-5)
         if 1 + row == result["frame"]:
