@@ -88,7 +88,8 @@ def face_frames(
 
 def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
     """The frames with their origins moved by shift (F, 3), in each triangle's own axes and unit."""
-    moved = frames.scale[:, None] * np.einsum("fij,fj->fi", frames.rotation, shift)
+    # In one type: einsum takes several times as long where it has to convert.
+    moved = frames.scale[:, None] * np.einsum("fij,fj->fi", frames.rotation, shift.astype(np.float64))
     return replace(frames, origin=frames.origin + moved)
 
 

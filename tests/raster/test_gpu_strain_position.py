@@ -76,7 +76,8 @@ def test_a_step_is_the_cpus(device: Device) -> None:
         before = deepcopy(state)
         state = stepped(device, state, face, wanted, gradients, nearby, 0.02)
         with np.errstate(invalid="ignore", over="ignore"):
-            on_cpu.step(expected, face[wanted], gradients[wanted, :3], nearby, 0.02, NEWEST, EPSILON)
+            rows, xyz = np.flatnonzero(wanted).astype(np.int32), gradients[:, :3].copy()
+            on_cpu.step(expected, rows, face, xyz, nearby, 0.02, NEWEST, EPSILON)
         np.testing.assert_array_equal(state.steps, expected.steps, err_msg=str(number))
         for name in ("value", "first", "second", "average"):
             got, want = getattr(state, name), getattr(expected, name)

@@ -75,6 +75,17 @@ def _adam_block(
 
 
 @jit
+def sum_by_triangle(rows, face, gradient, total, trained):
+    """Add gradient (N, 3) of the listed rows (M,) to the total (F, 3) of their triangles, marked in trained (F,)."""
+    for n in range(len(rows)):
+        i = rows[n]
+        f = face[i]
+        trained[f] = True
+        for c in range(3):
+            total[f, c] += gradient[i, c]
+
+
+@jit
 def scale_limit(rows, log_scale, face, unbound, limits, weight, gradient):
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
 

@@ -39,7 +39,11 @@ fn main(
       is_wanted = true;
     }
   }
-  if !is_wanted || !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z)) {
+  if !is_wanted {
+    return;
+  }
+  steps[f] += 1u;
+  if !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z)) {
     return;
   }
   var gradient: array<f32, COEFFICIENTS>;
@@ -51,7 +55,6 @@ fn main(
   if broken {
     return;
   }
-  steps[f] += 1u;
   let correct = corrections_at(step, steps[f]);
   for (var c = 0u; c < COEFFICIENTS; c++) {
     let n = f * COEFFICIENTS + c;

@@ -121,7 +121,7 @@ class CpuBackend:
         following, state = self.state.strain_position, self.state
         if following is not None:
             strain_position.step(
-                following, state.face.numpy()[rows], state.gradients.xyz.numpy()[rows],
+                following, rows, state.face.numpy(), state.gradients.xyz.numpy(),
                 self._frames.nearby(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
             )  # fmt: skip
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import WORLD
 from ...avatar.splats import Splats
+from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.camera import Camera
 from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
@@ -18,9 +19,9 @@ from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
 from ...raster.device import adapter_name
 from ...worker.launch import same_interpreter_environment
-from . import adam
+from . import adam, strain_position
 from .losses import image_gradient, whole_image
-from .state import TrainState, new_state
+from .state import TrainState, new_state, new_strain_position
 
 PACKAGE = "stga_addon"
 HELPER_TIMEOUT_S = 120.0
@@ -98,7 +99,13 @@ def _second_half() -> None:
     target.setflags(write=False)  # like the loader's arrays: read-only arrays are a type of their own
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
     rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
-    adam.step(_pair(), np.arange(2, dtype=np.int32), rates)
+    state, rows = _pair(), np.arange(2, dtype=np.int32)
+    adam.step(state, rows, rates)
+    following = new_strain_position(np.zeros((2, STRAIN_COMPONENTS, 3)))
+    strain_position.step(
+        following, rows, state.face.numpy(), state.gradients.xyz.numpy(), np.zeros((2, STRAIN_COMPONENTS), np.float32),
+        1e-3, 1.0, adam.EPSILON,
+    )  # fmt: skip
 
 
 def _project_backward() -> None:
