@@ -242,3 +242,21 @@ def test_positions_follow_strain(convention: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(to_world(found.splats, found.frames(neutral)).xyz, still.xyz, atol=1e-7)
     with pytest.raises(StgaError, match="strain_position is float32 \\(3, 3, 3\\), expected float32 \\(4, 3, 3\\)"):
         write_avatar(tmp_path / "b.npz", replace(avatar, strain_position=avatar.strain_position[1:]))
+
+
+def test_positions_stay_near_where_the_mesh_is_torn() -> None:
+    """Catches positions that leave with strain beyond its range, and NaN of triangles without area."""
+    neutral = sheet()
+    avatar = following(neutral)
+    assert avatar.strain_position is not None
+    farthest = MAX_STRAIN * np.abs(avatar.strain_position).sum((1, 2))
+    torn, flat, far = 1000 * sheet(2), neutral * [1, 0, 0], neutral + 100.0
+    torn[1] = torn[0]
+    for posed in (torn, flat, far, np.zeros_like(neutral)):
+        plain, moved = face_frames(posed, FACES, neutral), avatar.frames(posed)
+        away = np.linalg.norm(moved.origin - plain.origin, axis=1)
+        assert np.isfinite(moved.origin).all()
+        assert (away <= farthest * plain.scale + 1e-9).all()
+    assert (
+        np.linalg.norm(avatar.frames(far).origin - face_frames(far, FACES, neutral).origin, axis=1).max() < 1e-7
+    )  # strain of float32
