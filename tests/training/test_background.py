@@ -33,7 +33,8 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
         trainer.step(view, np.full_like(read_image(view), 255), n / 150, read_mask(view))
     errors = []
     for view in capture.views["val"]:
-        rendering = trainer._backend._forward(trainer.state.arrays(), view, np.zeros(3, np.float32), 0)
+        splats, frames = trainer.state.arrays(), trainer.frames.of(view.timestep)
+        rendering = trainer._backend._forward(splats, frames, view, np.zeros(3, np.float32), 0)
         mask = read_mask(view)
         assert mask is not None
         errors.append(np.mean((1 - rendering.transmittance - mask / 255) ** 2))
