@@ -39,9 +39,9 @@ class CpuBackend:
         target = self._target(batch)
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
+        self._step_strain_position(batch, rows, epsilon)
         if batch.refinement_rate:
             self._refine_tracking(batch, rows)
-        self._step_strain_position(batch, rows, epsilon)
         self._add_limit_gradients(rows)
         adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
@@ -117,7 +117,10 @@ class CpuBackend:
         store.clear()
 
     def _step_strain_position(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
-        """Step how the triangles' splats move with strain; before limits, which are no part of the image's gradient."""
+        """Step how the triangles' splats move with strain.
+
+        Before the mesh is refined, whose strain the gradient is of, and before the limits' gradients are added.
+        """
         following, state = self.state.strain_position, self.state
         if following is not None:
             strain_position.step(
