@@ -142,19 +142,21 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
-def test_strain_color_can_begin_with_a_further_take(takes: tuple[Path, Path], tmp_path: Path) -> None:
+def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Path], tmp_path: Path) -> None:
     """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they change at once."""
     capture = open_capture(takes[0])
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
     train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
     prepared = prepare_extension(Extension(tmp_path / "run", (takes[1],), iterations=6), "cpu")
-    run = replace(prepared.run, settings=replace(prepared.run.settings, strain_color=True))
+    run = replace(prepared.run, settings=replace(prepared.run.settings, strain_color=True, strain_position=True))
     train(prepared.capture, tmp_path / "new", run, prepared.selection)
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
     assert first["psnr_take_1"] == pytest.approx(before["psnr"], abs=0.01)
     avatar = read_avatar(tmp_path / "new" / "avatar.npz")
     assert avatar.splats.strain_color.shape[1:] == (3, 3)
     assert avatar.splats.strain_color.any()
+    assert avatar.strain_position is not None
+    assert avatar.strain_position.any()
     assert avatar.strain_range is not None
     assert (avatar.strain_range[:, 0] > COLOR_RANGE[0]).all()  # what the takes show, not any strain
 
