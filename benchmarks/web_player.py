@@ -198,7 +198,7 @@ def main() -> None:
     executable = find_browser()
     if executable is None:
         parser.error("no Chromium on this machine (apt-get install chromium)")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # the browser may still write
         browser = Browser(executable, Path(folder) / "profile", WINDOW_PX)
         try:
             browser.send("Page.addScriptToEvaluateOnNewDocument", source=ON_LOAD)

@@ -52,7 +52,7 @@ def face_frames(
     """Local frame of every triangle of a posed mesh.
 
     vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
-    basis where colors follow strain. neutral_areas (F,): `face_areas` of the neutral mesh, where they are known.
+    basis where splats follow strain. neutral_areas (F,): `face_areas` of the neutral mesh, where they are known.
     "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit meters of the neutral mesh
     (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
     unit the triangle (GaussianAvatars' released code).

@@ -15,11 +15,11 @@ MIN_COMPRESSION = 0.2
 COLOR_RANGE = np.array(
     [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN]], np.float32
 )
-"""Lowest and highest strain that colors are trained to follow. Folds and their shadows come with compression and shear;
-a color fitted to compression is not to be continued into stretch. Within this range, a mesh at rest has
-−MIN_COMPRESSION, not 0: a constant share of the colors, which the splats' `sh` are trained beside."""
+"""Lowest and highest strain that colors and positions are trained to follow. Folds and their shadows come with
+compression and shear; what is fitted to compression is not to be continued into stretch. Within this range, a mesh at
+rest has −MIN_COMPRESSION, not 0: a constant share of the colors, which the splats' `sh` are trained beside."""
 RANGE_MARGIN = 1.2
-"""How far from rest colors follow a triangle's strain, as a multiple of what was seen: training may have seen a few
+"""How far from rest splats follow a triangle's strain, as a multiple of what was seen: training may have seen a few
 timesteps more than were measured, and refined tracking moves them."""
 AVERAGING_ROUNDS = 3
 """How often `nearby_strain` averages over triangles that share an edge: a bulge moves more than one triangle."""
@@ -163,7 +163,7 @@ def rest_strain(limits: np.ndarray) -> np.ndarray:
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
     """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), with a margin.
 
-    It includes the neutral mesh, and stays within that of the basis. Colors fitted to a few expressions are not
+    It includes the neutral mesh, and stays within that of the basis. What is fitted to a few expressions is not
     extrapolated to stronger ones.
     """
     seen = range_with_margin(rest_strain(basis.range), (face_strain(basis, mesh) for mesh in meshes))

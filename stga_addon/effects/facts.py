@@ -73,9 +73,9 @@ class CaptureFacts:
         return self._strain_evidence(self.samples.timestep)
 
     @cached_property
-    def strain_dependence_known(self) -> Evidence:
-        """In cameras that are left out, as in other views of known expressions."""
-        return self._strain_evidence(self.samples.camera)
+    def strain_dependence_known(self) -> Evidence | None:
+        """In cameras that are left out, as in other views of known expressions; None with a single one."""
+        return self._strain_evidence(self.samples.camera) if self.cameras > 1 else None
 
     @cached_property
     def nearby_dependence(self) -> Evidence:
@@ -83,9 +83,9 @@ class CaptureFacts:
         return self._nearby_evidence(self.samples.timestep)
 
     @cached_property
-    def nearby_dependence_known(self) -> Evidence:
+    def nearby_dependence_known(self) -> Evidence | None:
         """As `strain_dependence_known`, on the strain around a triangle."""
-        return self._nearby_evidence(self.samples.camera)
+        return self._nearby_evidence(self.samples.camera) if self.cameras > 1 else None
 
     def _strain_evidence(self, group: np.ndarray) -> Evidence:
         """Within the range of strain that a training on the views that are not left out would write."""

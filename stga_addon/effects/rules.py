@@ -153,15 +153,14 @@ def selection(facts: CaptureFacts) -> Verdict:
 
 def strain_color(facts: CaptureFacts) -> Verdict:
     return _undeformed(facts, "color follows") or _dependent(
-        facts, "colors depend on deformation", facts.strain_dependence, facts.strain_dependence_known
+        "colors depend on deformation", facts.strain_dependence, facts.strain_dependence_known
     )
 
 
 def strain_position(facts: CaptureFacts) -> Verdict:
     return _undeformed(facts, "positions follow") or _dependent(
-        facts, "triangles' colors depend on deformation around them", facts.nearby_dependence,
-        facts.nearby_dependence_known,
-    )  # fmt: skip
+        "triangles' colors depend on deformation around them", facts.nearby_dependence, facts.nearby_dependence_known
+    )
 
 
 def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
@@ -173,10 +172,10 @@ def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
     return None
 
 
-def _dependent(facts: CaptureFacts, what: str, unseen: Evidence, known: Evidence) -> Verdict:
-    """On where the evidence in frames that are left out is enough, and that in cameras that are, if there are two."""
+def _dependent(what: str, unseen: Evidence, known: Evidence | None) -> Verdict:
+    """On where the evidence in frames that were left out is enough, and that in cameras that were, if there is any."""
     reason, gain = f"{what} by {unseen.gain:.1f} of 255 levels ({unseen.share:.1%} of the variance)", unseen.gain
-    if facts.cameras > 1:
+    if known is not None:
         reason += f" in frames that were left out, and by {known.gain:.1f} in cameras that were"
         gain = min(gain, known.gain)
     return Verdict(gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)

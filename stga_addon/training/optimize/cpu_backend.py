@@ -52,8 +52,7 @@ class CpuBackend:
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
         """The view with the splats' running average: a new (3, H, W) float32 image."""
         average = Parameters(*(tensor.numpy() for tensor in self.state.average))
-        following = self.state.strain_position
-        frames = self._moved_frames(view.timestep, None if following is None else following.average)
+        frames = self._moved_frames(view.timestep, averaged=True)
         return self._forward(average, frames, view, background, sh_degree).image.copy()
 
     def _target(self, batch: Batch) -> np.ndarray:
@@ -72,8 +71,7 @@ class CpuBackend:
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
-        following = self.state.strain_position
-        frames = self._moved_frames(view.timestep, None if following is None else following.value)
+        frames = self._moved_frames(view.timestep)
         rendering = self._forward(self.state.arrays(), frames, view, background, sh_degree, focus)
         rectangles = whole_image(height, width) if focus is None else tile_rectangles(rendering.touched, height, width)
         v_image = self._buffers.get("v_image", (3, height, width))
@@ -85,11 +83,12 @@ class CpuBackend:
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
 
-    def _moved_frames(self, timestep: int, coefficients: np.ndarray | None) -> FaceFrames:
-        """The timestep's frames, moved by strain with these coefficients of `StrainPosition`."""
-        frames = self._frames.of(timestep)
-        if coefficients is None:
+    def _moved_frames(self, timestep: int, averaged: bool = False) -> FaceFrames:
+        """The timestep's frames, moved by strain where positions follow it; averaged: by the running average."""
+        frames, following = self._frames.of(timestep), self.state.strain_position
+        if following is None:
             return frames
+        coefficients = following.average if averaged else following.value
         return shifted_frames(frames, position_shift(coefficients, self._frames.nearby(timestep)))
 
     def _forward(
@@ -121,10 +120,10 @@ class CpuBackend:
 
         Before the mesh is refined, whose strain the gradient is of, and before the limits' gradients are added.
         """
-        following, state = self.state.strain_position, self.state
-        if following is not None:
+        state = self.state
+        if state.strain_position is not None:
             strain_position.step(
-                following, rows, state.face.numpy(), state.gradients.xyz.numpy(),
+                state.strain_position, rows, state.face.numpy(), state.gradients.xyz.numpy(),
                 self._frames.nearby(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
             )  # fmt: skip
 
