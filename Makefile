@@ -28,7 +28,7 @@ lint: .venv/ready
 
 # Node.js: format of the web page's player
 lint-web:
-	npx --yes prettier@3.6.2 --check 'stga_addon/avatar/web/player/*.js' 'stga_addon/avatar/web/player/*.css'
+	npx --yes prettier@3.6.2 --check 'stga_addon/export/web/player/*.js' 'stga_addon/export/web/player/*.css'
 
 fuzz: .venv/ready
 	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} STGA_FUZZ_CASES=$${STGA_FUZZ_CASES:-5000} \

@@ -30,11 +30,11 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.development.benchmark.statistics import Spread, spread_of
-from stga_addon.effects.facts import CaptureFacts
-from stga_addon.effects.plan import plan_effects
-from stga_addon.effects.rules import EFFECTS
+from stga_addon.training.effects.facts import CaptureFacts
+from stga_addon.training.effects.plan import plan_effects
+from stga_addon.training.effects.rules import EFFECTS
 from stga_addon.training.evaluate.metrics import evaluate_avatar
-from stga_addon.training.optimize.tracking import with_refined_tracking
+from stga_addon.training.optimize.flame_refinement import with_refined_tracking
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics

@@ -28,8 +28,8 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
-from stga_addon.effects.plan import with_effect_plan, with_effects_of_takes
 from stga_addon.selection import SelectionOptions, select_capture
+from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.optimize.precompile import precompile_kernels

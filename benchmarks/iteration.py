@@ -33,7 +33,7 @@ from stga_addon.raster.cpu.project import project_backward, project_forward
 from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_forward, tile_grid, with_strain_color
 from stga_addon.raster.cpu.threads import threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
-from stga_addon.raster.device import choose_device
+from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch, make_backend
 from stga_addon.training.optimize.frames import FrameStore

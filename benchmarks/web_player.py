@@ -18,13 +18,13 @@ import numpy as np
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.playback import Playback
 from stga_addon.avatar.splats import Splats
-from stga_addon.avatar.web.data_file import data_file
-from stga_addon.avatar.web.page import page
-from stga_addon.avatar.web.rig import WebRig
 from stga_addon.capture.camera import look_at
 from stga_addon.development.browser import Browser, find_browser
+from stga_addon.export.playback import Playback
+from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.page import page
+from stga_addon.export.web.rig import WebRig
 from stga_addon.flame.model import JOINTS
 
 RINGS, AROUND = 37, 139

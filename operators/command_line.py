@@ -17,7 +17,7 @@ from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effect_plan import TRACKING
+from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids
@@ -28,7 +28,7 @@ IN_BLENDER = ("select", "export", "demo", "environment")
 """Commands that need none of the packages that Blender's Python may lack, or need Blender itself."""
 
 if TYPE_CHECKING:
-    from ..stga_addon.jobs.delegate import OpenHead
+    from ..stga_addon.requests.open_head import OpenHead
 
 _commands: list[Any] = []
 
@@ -66,7 +66,7 @@ def _prepare_environment_command(options: Any) -> None:
 
 
 def _open_head() -> "OpenHead | None":
-    from ..stga_addon.jobs.delegate import OpenHead
+    from ..stga_addon.requests.open_head import OpenHead
 
     head = scene_settings(bpy.context).head
     if not is_head(head):
@@ -85,7 +85,7 @@ def _open_head() -> "OpenHead | None":
 
 def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
     """Run the command in the training environment; returns its exit code. Raises StgaError where there is none."""
-    from ..stga_addon.jobs.delegate import FOLDER, write_head
+    from ..stga_addon.requests.open_head import FOLDER, write_head
 
     python = training_python(bpy.context)
     with TemporaryDirectory() as folder:

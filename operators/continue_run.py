@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.training_job import REGION, TrainingJob, job_folder, write_job
+from ..stga_addon.requests.training_job import REGION, TrainingJob, job_folder, write_job
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_triangles

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.avatar.export import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.errors import StgaError
+from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
 from ..stga_addon.format import format_bytes
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.compat import PATH_OPTIONS

@@ -6,7 +6,7 @@ from queue import Empty, Queue
 from threading import Thread
 from typing import Any
 
-from ..stga_addon.avatar.export import Meshes
+from ..stga_addon.export.formats import Meshes
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.timeline import iterate_frames
 

@@ -5,9 +5,9 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..stga_addon.avatar.playback import Playback
 from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.errors import StgaError
+from ..stga_addon.export.playback import Playback
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene.objects import Warn
 from ..stga_addon.scene.render.camera_path import scene_camera

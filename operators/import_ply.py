@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.avatar.ply import read_ply
+from ..stga_addon.export.ply import read_ply
 from ..stga_addon.scene.display.splat_object import show_world_splats
 from . import ids
 from .common import FileImport, file_path, reporting, scene_settings

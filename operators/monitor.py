@@ -1,6 +1,7 @@
 """Training monitor: a timer that reads the status of workers and shows their splats in the scene.
 
-What is to be done is decided by `jobs.monitor_state`; this module reads files, carries out effects and owns the timer.
+What is to be done is decided by `requests.monitor_state`; this module reads files, carries out effects and owns the
+timer.
 """
 
 import traceback
@@ -17,15 +18,15 @@ from bpy.app.handlers import persistent
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs import monitor_state as states
-from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
-from ..stga_addon.jobs.training_job import PREVIEW, job_folder
 from ..stga_addon.report.curve_image import curve_image
+from ..stga_addon.requests import monitor_state as states
+from ..stga_addon.requests.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
+from ..stga_addon.requests.training_job import PREVIEW, job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
 from ..stga_addon.scene.viewports import open_sidebar
-from ..stga_addon.training.effect_plan import TRACKING
+from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker
 from . import ids

@@ -15,9 +15,9 @@ from bpy_extras.io_utils import ExportHelper
 from ..stga_addon.capture.camera import Camera
 from ..stga_addon.capture.camera_path import TURNTABLE_S, to_and_fro
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.training_job import worker_arguments
-from ..stga_addon.jobs.video_job import Recorder, VideoJob, remove_video_job
 from ..stga_addon.raster.posed_splats import PosedSplats
+from ..stga_addon.requests.training_job import worker_arguments
+from ..stga_addon.requests.video_job import Recorder, VideoJob, remove_video_job
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
 from ..stga_addon.scene.render.engine import srgb_background

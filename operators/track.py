@@ -10,8 +10,8 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.tracking_job import TrackingJob, remove_tracking_job, write_tracking_job
-from ..stga_addon.jobs.training_job import job_folder, worker_arguments
+from ..stga_addon.requests.tracking_job import TrackingJob, remove_tracking_job, write_tracking_job
+from ..stga_addon.requests.training_job import job_folder, worker_arguments
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.worker.launch import start_worker

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.tracking_job import TrackingJob
+from ..stga_addon.requests.tracking_job import TrackingJob
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.flame_rig import rig_of

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.training_job import (
+from ..stga_addon.requests.training_job import (
     TrainingJob,
     job_folder,
     remove_job,
@@ -19,7 +19,7 @@ from ..stga_addon.jobs.training_job import (
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effect_plan import parse_choices
+from ..stga_addon.training.effects.decisions import parse_choices
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker.environment import missing_packages, stored_adapters
 from ..stga_addon.worker.launch import start_worker

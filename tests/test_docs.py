@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stga_addon.avatar.ply import write_ply
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.cli.main import make_parser
+from stga_addon.export.ply import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

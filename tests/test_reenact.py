@@ -12,7 +12,7 @@ from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.raster.render import render_avatar, to_uint8
+from stga_addon.render.render import render_avatar, to_uint8
 
 
 @pytest.fixture

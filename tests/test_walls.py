@@ -18,17 +18,18 @@ HEAVY = {"torch", "numba", "wgpu"}
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
-    {"files", "format"},
+    {"files", "format", "schema"},
     {"worker"},
     {"flame"},
     {"capture"},
     {"avatar", "selection"},
+    {"export"},
     {"raster"},
+    {"render"},
     {"tracking"},
     {"training"},
-    {"effects"},
     {"report"},
-    {"jobs"},
+    {"requests"},
     {"scene"},
     {"cli"},
     {"development"},
@@ -42,9 +43,9 @@ LIGHT = (
     "capture.open",
     "avatar",
     "avatar.file",
-    "avatar.ply",
+    "export.ply",
     "selection",
-    "jobs.training_job",
+    "requests.training_job",
 )
 
 

@@ -10,7 +10,7 @@ from ..operators.common import is_head, scene_settings
 from ..operators.environment import has_training_python
 from ..operators.track import tracked_folder, tracking_snapshot
 from ..operators.track_correct import tracking_keys
-from ..stga_addon.jobs.training_job import job_folder
+from ..stga_addon.requests.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.shape_keys import has_shape_keys
 from ..stga_addon.tracking.folder import SHEET_FILE

@@ -10,10 +10,10 @@ from ..operators.analyze import chosen_effects
 from ..operators.common import is_head, package, scene_settings
 from ..operators.environment import has_training_python
 from ..stga_addon.format import format_duration
-from ..stga_addon.jobs.monitor_state import MonitorState
-from ..stga_addon.jobs.training_job import job_folder
+from ..stga_addon.requests.monitor_state import MonitorState
+from ..stga_addon.requests.training_job import job_folder
 from ..stga_addon.scene import tags
-from ..stga_addon.training.effect_plan import TRACKING
+from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
 from .curve import draw_curve

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..jobs.delegate import OpenHead
-from ..raster.device import is_device
+from ..render.device import is_device
+from ..requests.open_head import OpenHead
 
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""

@@ -15,7 +15,7 @@ from ..capture.model import Capture
 from ..errors import StgaError, shorten
 from ..files import read_json, write_json
 from ..format import format_duration
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import usable_path
 from .track import add_footage, track_footage
 from .train import add_training, prepare, train_with_bar
@@ -131,7 +131,7 @@ def _write_blend(out: Path) -> Path | None:
     if find_spec("bpy") is None:
         print("warning: no .blend file: this Python has no bpy (pip install bpy, or run the command in Blender)")
         return None
-    from ..training.optimize.tracking import with_refined_tracking
+    from ..training.optimize.flame_refinement import with_refined_tracking
 
     return write_blend(out, lambda capture: with_refined_tracking(capture, out / RUN))
 

@@ -11,7 +11,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from ..errors import StgaError
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from ..worker.environment import (
     PYTHON_VARIABLE,
     check_python,

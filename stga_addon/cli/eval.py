@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import StgaError
 from ..files import write_json
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import usable_path
 from .inputs import open_avatar
 

@@ -2,12 +2,12 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..avatar.export import FORMATS, Meshes, check_suffix, export_avatar
 from ..avatar.file import Avatar
-from ..avatar.playback import DEFAULT_FPS
 from ..capture.model import Capture
 from ..errors import StgaError
-from ..jobs.delegate import OpenHead
+from ..export.formats import FORMATS, Meshes, check_suffix, export_avatar
+from ..export.playback import DEFAULT_FPS
+from ..requests.open_head import OpenHead
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
 from .export_web import export_web
 from .inputs import open_avatar, required_capture, timesteps_between

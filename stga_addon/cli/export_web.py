@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..avatar.export import export_avatar
 from ..avatar.file import Avatar
-from ..avatar.playback import MAX_VIEWS, Playback
-from ..avatar.web.write import RIG_NOTICE
 from ..capture.camera import Camera
 from ..capture.model import Capture
+from ..export.formats import export_avatar
+from ..export.playback import MAX_VIEWS, Playback
+from ..export.web.write import RIG_NOTICE
 from ..selection import SelectionOptions, select_capture
 from .inputs import required_capture, timesteps_between
 from .outputs import announce_size

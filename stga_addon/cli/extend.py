@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import write_npz
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import real_number, usable_path
 from .continuing import add_continued_run, budget_of, continuation_folder, resume_continuation
 from .train import train_run
@@ -39,7 +39,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..effects.plan import with_effects_of_takes
+    from ..training.effects.plan import with_effects_of_takes
     from ..training.run.continuation import prepare_extension
     from ..training.run.request import Extension
 

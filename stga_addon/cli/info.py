@@ -5,8 +5,8 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from ..errors import StgaError
-from ..jobs.delegate import OpenHead
-from ..training.effect_plan import effect_plan_to_json, parse_choices
+from ..requests.open_head import OpenHead
+from ..training.effects.decisions import effect_plan_to_json, parse_choices
 from ..training.settings import make_settings
 from .arguments import add_capture, add_device, add_effects
 from .inputs import open_named_capture
@@ -25,8 +25,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     from ..capture.summary import summarize_capture
-    from ..effects.plan import describe_effects, plan_effects
-    from ..raster.device import choose_device
+    from ..render.device import choose_device
+    from ..training.effects.plan import describe_effects, plan_effects
 
     if options.presets and not options.json:
         raise StgaError("--presets: has no effect without --json; `stga presets` prints them")

@@ -61,7 +61,7 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None) -> tuple[i
 
 def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
     """The capture of a run, or another one whose meshes are to drive its avatar; with the run's refined tracking."""
-    from ..training.optimize.tracking import with_refined_tracking
+    from ..training.optimize.flame_refinement import with_refined_tracking
     from ..training.run.folder import read_run
     from ..training.run.open_run import open_run
 

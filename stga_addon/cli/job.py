@@ -3,7 +3,7 @@
 import sys
 from argparse import ArgumentParser, Namespace
 
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import usable_path
 
 NAME, HELP = "job", "carry out the job that Blender's panel wrote: a tracking, a training, or a video"
@@ -14,9 +14,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..jobs.tracking_job import is_tracking_job, run_tracking_job
-    from ..jobs.training_job import run_training_job
-    from ..jobs.video_job import is_video_job, run_video_job
+    from ..requests.tracking_job import is_tracking_job, run_tracking_job
+    from ..requests.training_job import run_training_job
+    from ..requests.video_job import is_video_job, run_video_job
 
     if is_video_job(options.run_folder):
         run_video_job(options.run_folder)

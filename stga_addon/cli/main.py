@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from .. import __version__
 from ..errors import StgaError, one_line
-from ..jobs.delegate import FOLDER, OpenHead, read_head
+from ..requests.open_head import FOLDER, OpenHead, read_head
 from .streams import safe_streams
 
 COMMANDS = (

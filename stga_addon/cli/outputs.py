@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ..avatar.export import check_free_space, range_bytes
 from ..avatar.file import Avatar
+from ..export.formats import check_free_space, range_bytes
 from ..format import format_bytes
 
 

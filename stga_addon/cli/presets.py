@@ -2,7 +2,7 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import add_capture, add_device
 from .inputs import open_named_capture
 
@@ -16,7 +16,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     from ..format import format_duration
-    from ..raster.device import choose_device
+    from ..render.device import choose_device
     from ..report.preset_timing import time_presets
 
     capture = open_named_capture(options)

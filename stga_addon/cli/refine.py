@@ -3,7 +3,7 @@
 from argparse import ArgumentParser, Namespace
 
 from ..errors import StgaError
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import frame_span, real_number
 from .continuing import add_continued_run, budget_of, continuation_folder, resume_continuation
 from .train import train_run

@@ -9,18 +9,18 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..avatar.file import read_avatar
-from ..avatar.playback import DEFAULT_FPS
-from ..avatar.ply import read_ply
 from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import TURNTABLE_S, covered_angles, to_and_fro, turntable
 from ..capture.model import View
 from ..capture.open import open_capture
 from ..capture.transforms import read_transforms
 from ..errors import StgaError
+from ..export.playback import DEFAULT_FPS
+from ..export.ply import read_ply
 from ..files import replacing
 from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import (
     add_avatar,
     add_device,
@@ -76,7 +76,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..raster.compose import Composer
+    from ..render.compose import Composer
 
     if options.video is not None and options.video.suffix.lower() != ".mp4":
         raise StgaError(f"{options.video}: a video's name ends in .mp4")
@@ -132,7 +132,7 @@ def _write_pictures(folder: Path, subject: _Subject, views: list[View]) -> None:
     from PIL import Image
     from tqdm import tqdm
 
-    from ..raster.render import to_uint8
+    from ..render.render import to_uint8
 
     names = unique_names([view.name for view in views])
     captured, target = {view.image for view in views}, folder.resolve()
@@ -148,8 +148,8 @@ def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
     """Write the subject's motion as one camera sees it, which stands still or orbits."""
     from tqdm import tqdm
 
-    from ..raster.render import to_uint8
-    from ..raster.video import sequence_writer, video_writer
+    from ..render.render import to_uint8
+    from ..render.video import sequence_writer, video_writer
 
     start = _chosen_camera(options, views)
     timesteps: Sequence[int] = subject.timesteps or (0,)
@@ -195,7 +195,7 @@ def _principal_point(source: Path) -> str:
 
 def _subject(options: Namespace) -> _Subject:
     """An avatar with its capture, or a plain world-space PLY."""
-    from ..raster.render import render, render_avatar
+    from ..render.render import render, render_avatar
 
     if options.source.suffix.lower() == ".ply":
         splats = read_ply(options.source)
@@ -223,7 +223,7 @@ def _subject(options: Namespace) -> _Subject:
 
 def _reenacted(options: Namespace) -> _Subject:
     """An avatar moved by another person's FLAME motion."""
-    from ..raster.render import render_avatar
+    from ..render.render import render_avatar
     from ..training.run.folder import read_run
 
     if options.source.suffix.lower() == ".ply":

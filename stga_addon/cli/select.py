@@ -3,7 +3,7 @@
 from argparse import ArgumentParser, Namespace
 
 from ..files import write_npz
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from ..selection import SelectionOptions, select_capture
 from .arguments import add_capture, real_number, usable_path
 from .inputs import open_named_capture

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import StgaError
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from .arguments import real_number, usable_path, whole_number
 
 if TYPE_CHECKING:

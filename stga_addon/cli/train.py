@@ -9,9 +9,9 @@ import numpy as np
 
 from ..capture.model import Capture
 from ..errors import StgaError
-from ..jobs.delegate import OpenHead
+from ..requests.open_head import OpenHead
 from ..selection import SelectionOptions
-from ..training.effect_plan import parse_choices
+from ..training.effects.decisions import parse_choices
 from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, make_settings
 from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number
 from .inputs import open_named_capture
@@ -70,8 +70,8 @@ def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] |
 
     Raises StgaError.
     """
-    from ..effects.plan import with_effect_plan
-    from ..raster.device import choose_device
+    from ..render.device import choose_device
+    from ..training.effects.plan import with_effect_plan
     from ..training.run.open_run import device_of, open_run
 
     if not options.capture.is_dir():
@@ -126,8 +126,8 @@ def train_with_bar(
 
     Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
     """
-    from ..effects.plan import describe_effects
     from ..report.run_summary import CurveUpdater
+    from ..training.effects.plan import describe_effects
     from ..training.run.loop import train
     from ..training.run.progress import Progress
     from ..training.run.progress_bar import ProgressBar

@@ -10,9 +10,9 @@ import numpy as np
 from ..capture.images import read_view
 from ..capture.loader import LoadedView
 from ..capture.model import Capture, View
-from ..effects.plan import plan_effects
 from ..errors import StgaError
 from ..selection import select_capture
+from ..training.effects.plan import plan_effects
 from ..training.optimize.precompile import precompile_kernels
 from ..training.optimize.trainer import Trainer
 from ..training.schedule import image_scale, view_order

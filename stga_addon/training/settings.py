@@ -9,9 +9,9 @@ from typing import Any
 from ..avatar.embedding import CONVENTIONS
 from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
+from ..schema import MAX_COUNT, build, complaint, setting, validate_fields
 from ..selection import SelectionOptions
-from .effect_plan import CHOICES, EFFECTS
-from .schema import MAX_COUNT, build, complaint, setting, validate_fields
+from .effects.decisions import CHOICES, EFFECTS
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
 CONTINUATIONS = ("refine", "extend")

@@ -34,7 +34,7 @@ def random_mesh(seed: int, vertices: int = 20, faces: int = 30) -> tuple[np.ndar
 
 def rendered(world: Splats) -> np.ndarray:
     """(3, 48, 64) picture of world-space splats."""
-    from stga_addon.raster.render import render
+    from stga_addon.render.render import render
 
     return np.asarray(render(world, look_at((0.3, 0.2, 1), (0, 0, 0), width=64, height=48, focal_length=90)))
 

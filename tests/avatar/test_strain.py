@@ -24,7 +24,7 @@ from stga_addon.avatar.strain import (
 )
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
-from stga_addon.raster.render import render, render_avatar
+from stga_addon.render.render import render, render_avatar
 
 FACES = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]], np.int32)
 

@@ -13,14 +13,14 @@ from capture.factory import ball, flame_parameters, write_flame_capture, write_m
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
+from stga_addon.export.ply import read_ply  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.sequence import read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
-from stga_addon.training.optimize.tracking import Tracking, with_refined_tracking, write_tracking  # noqa: E402
+from stga_addon.training.optimize.flame_refinement import Tracking, with_refined_tracking, write_tracking  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6

@@ -15,9 +15,9 @@ from tracking.test_track import record  # noqa: E402
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.avatar.ply import read_ply  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
+from stga_addon.export.ply import read_ply  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 from stga_addon.tracking.head_model import HeadModel  # noqa: E402

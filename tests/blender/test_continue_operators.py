@@ -37,7 +37,7 @@ def jobs(extension, monkeypatch):
     train = extension.operators.train
     monkeypatch.setattr(train, "_train_here", lambda context, run: run / "avatar.npz")
     monkeypatch.setattr(train, "missing_packages", list)
-    return extension.stga_addon.jobs.training_job
+    return extension.stga_addon.requests.training_job
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import DeviceError, StgaError  # noqa: E402
 from stga_addon.raster.cpu.project import _basis  # noqa: E402
-from stga_addon.raster.render import render as render_splats  # noqa: E402
-from stga_addon.raster.render import render_avatar  # noqa: E402
+from stga_addon.render.render import render as render_splats  # noqa: E402
+from stga_addon.render.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.compat import choose_image_file, enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402

@@ -7,8 +7,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from avatar.web.web_data import posed_mesh, read_web_data  # noqa: E402
 from capture.factory import write_flame_capture  # noqa: E402
+from export.web.web_data import posed_mesh, read_web_data  # noqa: E402
 
 from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402

@@ -11,17 +11,17 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from avatar.web.web_data import read_web_data  # noqa: E402
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
+from export.web.web_data import read_web_data  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
-from stga_addon.avatar.export import export_avatar  # noqa: E402
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.avatar.ply import read_ply, read_vertices, write_ply  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.export.formats import export_avatar  # noqa: E402
+from stga_addon.export.ply import read_ply, read_vertices, write_ply  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import POINTS  # noqa: E402

@@ -63,7 +63,7 @@ def trained(extension, tmp_path, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.select(threshold=0.0005)
-    run, job, monitor = tmp_path / "run", extension.stga_addon.jobs.training_job, extension.operators.monitor
+    run, job, monitor = tmp_path / "run", extension.stga_addon.requests.training_job, extension.operators.monitor
     settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
     job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
     with extension.stga_addon.worker.status.status_writer(job.job_folder(run)) as writer:

@@ -152,7 +152,7 @@ def test_a_capture_of_another_tracker_is_not_solved_again(extension, tmp_path):
 
 def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
     """Catches a result that never arrives where Blender was closed, or its file saved, while the worker ran."""
-    job = extension.stga_addon.jobs.tracking_job
+    job = extension.stga_addon.requests.tracking_job
     out, settings = tmp_path / "capture", bpy.context.scene.stga
     job.write_tracking_job(out, job.TrackingJob(take / "footage", take / "head.npz", landmarks=take / "points"))
     settings.tracking_capture, settings.tracking_model = str(out), str(take / "head.npz")
@@ -167,7 +167,7 @@ def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monke
 
 def test_cancelled_tracking_writes_no_capture(extension, take, tmp_path):
     """Catches a cancelled job that goes on, or is reported as finished."""
-    job, status = extension.stga_addon.jobs.tracking_job, extension.stga_addon.worker.status
+    job, status = extension.stga_addon.requests.tracking_job, extension.stga_addon.worker.status
     out = tmp_path / "capture"
     job.write_tracking_job(out, job.TrackingJob(take / "footage", take / "head.npz", landmarks=take / "points"))
     status.request_cancel(out / "job")

@@ -33,7 +33,7 @@ def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's job: the test says what it does."""
     from contextlib import ExitStack
 
-    job, monitor = extension.stga_addon.jobs.training_job, extension.operators.monitor
+    job, monitor = extension.stga_addon.requests.training_job, extension.operators.monitor
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
@@ -117,7 +117,7 @@ def test_device_reaches_the_job(head, tmp_path, monkeypatch, extension):
     monkeypatch.setattr(extension.operators.train, "run_training_job", lambda run, also: run / "avatar.npz")
     monkeypatch.setattr(extension.operators.train, "missing_packages", list)
     assert bpy.ops.stga.train(directory=str(tmp_path / "run"), device="cpu") == {"FINISHED"}
-    assert extension.stga_addon.jobs.training_job.read_job(tmp_path / "run").device == "cpu"
+    assert extension.stga_addon.requests.training_job.read_job(tmp_path / "run").device == "cpu"
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_named_gpu_reaches_the_job(device, adapter, wanted, head, tmp_path, monk
     monkeypatch.setattr(extension.operators.train, "missing_packages", list)
     folder = str(tmp_path / "run")
     assert bpy.ops.stga.train(directory=folder, device=device, adapter=adapter) == {"FINISHED"}
-    assert extension.stga_addon.jobs.training_job.read_job(tmp_path / "run").device == wanted
+    assert extension.stga_addon.requests.training_job.read_job(tmp_path / "run").device == wanted
 
 
 def test_gpus_are_those_of_the_last_test(tmp_path, monkeypatch, extension):

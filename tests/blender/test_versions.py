@@ -20,10 +20,10 @@ from capture.factory import ball, write_flame_capture
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.ply import read_ply
 from stga_addon.capture.open import open_capture
 from stga_addon.development.package import ROOT, build_zip, fetch_wheels
 from stga_addon.errors import StgaError
+from stga_addon.export.ply import read_ply
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import read_motion
 from stga_addon.worker.environment import missing_packages

@@ -12,8 +12,8 @@ from PIL import Image
 from stga_addon.capture.images import image_size
 from stga_addon.capture.open import open_capture
 from stga_addon.capture.transforms import read_splits
-from stga_addon.effects.samples import take_samples
 from stga_addon.errors import MAX_MESSAGE_CHARACTERS, StgaError
+from stga_addon.training.effects.samples import take_samples
 
 from . import factory
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from avatar.web.web_data import read_web_data
 from capture.factory import write_mesh_capture
+from export.web.web_data import read_web_data
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats

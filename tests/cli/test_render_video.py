@@ -10,11 +10,11 @@ from PIL import Image
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.ply import write_ply
 from stga_addon.capture.camera import orbited
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.raster.render import render_avatar, to_uint8
+from stga_addon.export.ply import write_ply
+from stga_addon.render.render import render_avatar, to_uint8
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -26,8 +26,8 @@ from capture import factory
 from PIL import Image
 
 from stga_addon.cli.main import main
-from stga_addon.jobs.training_job import TrainingJob, write_job
 from stga_addon.report import preset_timing
+from stga_addon.requests.training_job import TrainingJob, write_job
 from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")

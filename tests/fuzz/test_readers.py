@@ -27,7 +27,6 @@ from PIL import Image
 from training.test_folder import make_checkpoint, make_run
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.ply import PROPERTIES, read_ply, splat_columns, write_ply
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.meshes import read_mesh, read_regions
@@ -35,6 +34,7 @@ from stga_addon.capture.model import View
 from stga_addon.capture.release import read_face_ids, read_soup
 from stga_addon.capture.transforms import read_transforms
 from stga_addon.errors import StgaError
+from stga_addon.export.ply import PROPERTIES, read_ply, splat_columns, write_ply
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays

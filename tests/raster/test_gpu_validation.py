@@ -17,7 +17,7 @@ MANIFESTS = [
 SCRIPT = """
 import sys
 from pathlib import Path
-from raster.test_compose import CAMERA, scene
+from render.test_compose import CAMERA, scene
 from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
 from training.test_gpu_backend import batch_of

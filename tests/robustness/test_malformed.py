@@ -24,7 +24,6 @@ from PIL import Image
 from training.test_folder import make_checkpoint, make_run
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.avatar.ply import read_ply
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
 from stga_addon.capture.meshes import read_mesh, read_regions
@@ -33,6 +32,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.capture.release import read_face_ids, read_soup
 from stga_addon.capture.summary import summarize_capture
 from stga_addon.capture.transforms import read_transforms
+from stga_addon.export.ply import read_ply
 from stga_addon.files import read_json, read_npz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_motion

@@ -12,7 +12,7 @@ from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.raster.render import render, to_uint8
+from stga_addon.render.render import render, to_uint8
 
 TIMESTEPS, CAMERAS = (0, 2, 3, 5, 6), range(5)
 """The last timestep is `test`, the last camera `val`."""

@@ -18,8 +18,8 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
-from stga_addon.jobs.training_job import TrainingJob, run_training_job, write_job
-from stga_addon.raster import device as device_choice
+from stga_addon.render import device as device_choice
+from stga_addon.requests.training_job import TrainingJob, run_training_job, write_job
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import open_run as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint

@@ -9,7 +9,7 @@ from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture
-from stga_addon.raster.render import render_avatar
+from stga_addon.render.render import render_avatar
 from stga_addon.training.evaluate.residuals import MIN_WEIGHT_PX, Residuals, triangle_residuals
 
 

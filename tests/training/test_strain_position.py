@@ -11,7 +11,7 @@ from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
-from stga_addon.raster.render import render_avatar
+from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize import adam, strain_position
 from stga_addon.training.optimize.state import new_strain_position
 from stga_addon.training.optimize.trainer import Trainer

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.model import Capture
-from ...effects.plan import with_effect_plan
 from ...files import replacing, write_json
 from ...format import format_duration
 from ...report.run_summary import evaluation_share
+from ...training.effects.plan import with_effect_plan
 from ...training.run.folder import Run
 from ...training.settings import TrainingSettings
 from .chart import benchmark_chart

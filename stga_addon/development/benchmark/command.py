@@ -7,7 +7,7 @@ from pathlib import Path
 from ...cli.arguments import add_capture, duration, usable_path, whole_number
 from ...cli.inputs import open_named_capture
 from ...errors import StgaError
-from ...jobs.delegate import OpenHead
+from ...requests.open_head import OpenHead
 from ...training.settings import make_settings
 from .variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 

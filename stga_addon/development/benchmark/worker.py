@@ -57,7 +57,7 @@ def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
     from ...avatar.file import read_avatar
     from ...report.preset_timing import seconds_per_iteration
     from ...training.evaluate.metrics import evaluate_avatar
-    from ...training.optimize.tracking import with_refined_tracking
+    from ...training.optimize.flame_refinement import with_refined_tracking
     from ...training.run.loop import train
     from ...training.run.open_run import open_run
 

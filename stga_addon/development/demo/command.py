@@ -4,7 +4,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from ...cli.arguments import add_device, duration, usable_path, whole_number
-from ...jobs.delegate import OpenHead
+from ...requests.open_head import OpenHead
 
 NAME, HELP = "demo", "make a synthetic capture, train an avatar on it and show it in Blender"
 
@@ -21,7 +21,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ...raster.device import choose_device
+    from ...render.device import choose_device
     from .run import avatar_from_footage, run_demo
 
     device, why = choose_device(options.device)

@@ -7,7 +7,7 @@ import numpy as np
 from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0
 from ...capture.camera import Camera
-from ...raster.render import render_avatar
+from ...render.render import render_avatar
 
 
 def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected: np.ndarray) -> np.ndarray:

@@ -10,18 +10,18 @@ from PIL import Image
 from tqdm import tqdm
 
 from ...avatar.embedding import to_world
-from ...avatar.export import export_avatar
 from ...avatar.file import Avatar, read_avatar
-from ...avatar.playback import Playback
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
 from ...cli.export_web import capture_views
-from ...effects.plan import with_effect_plan
 from ...errors import StgaError
+from ...export.formats import export_avatar
+from ...export.playback import Playback
 from ...files import replacing, write_json
-from ...raster.render import render_avatar, to_uint8
+from ...render.render import render_avatar, to_uint8
 from ...selection import SelectionOptions, select_capture
+from ...training.effects.plan import with_effect_plan
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import Run
 from ...training.run.loop import train

@@ -18,7 +18,7 @@ from bpy.app.handlers import persistent
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage, PosedSplats
-from ...raster.render_client import RenderClient, missing_packages
+from ...render.client import RenderClient, missing_packages
 from ..display.colors import linear_to_srgb, srgb_to_linear
 from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
@@ -44,7 +44,7 @@ class RenderEnvironment:
     """The Python that renders where Blender's own cannot, and the device: looked up by the main thread, used by render
     threads.
 
-    device  as `raster.compose.Composer` takes it
+    device  as `render.compose.Composer` takes it
     """
 
     def __init__(self, find: Callable[[], str], find_device: Callable[[], str]) -> None:
@@ -311,7 +311,7 @@ def _before_render(*_: Any) -> None:
 
 
 def register(find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
-    """find_python, find_device: as in `raster.render_client.RenderClient`."""
+    """find_python, find_device: as in `render.client.RenderClient`."""
     global _environment, _client
     _environment = RenderEnvironment(find_python, find_device)
     _client = RenderClient(_environment.path, lambda: _environment.device)

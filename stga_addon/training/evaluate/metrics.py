@@ -11,7 +11,7 @@ import numpy as np
 
 from ...avatar.file import Avatar
 from ...capture.model import Capture, View
-from ...raster.render import render_avatar
+from ...render.render import render_avatar
 from ..optimize.losses import similarity
 from . import lpips
 from .detail_difference import detail_difference

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...capture.model import View
 from ...errors import StgaError
-from ...raster.device import adapter_name
+from ...render.device import adapter_name
 from ..settings import TrainingSettings
 from .frames import FrameStore
 from .state import TrainState

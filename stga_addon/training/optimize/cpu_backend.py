@@ -11,10 +11,10 @@ from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, 
 from ..settings import TrainingSettings
 from . import adam, strain_position
 from .backend import Batch
+from .flame_refinement import frame_gradient
 from .frames import FrameStore
 from .losses import image_gradient, scale_limits, tile_rectangles, whole_image
 from .state import TrainState
-from .tracking import frame_gradient
 
 
 class CpuBackend:

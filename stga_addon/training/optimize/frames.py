@@ -7,7 +7,7 @@ import numpy as np
 from ...avatar.embedding import FaceFrames, face_frames
 from ...avatar.strain import color_range, nearby_strain, strain_basis
 from ...capture.model import Capture
-from .tracking import Tracking
+from .flame_refinement import Tracking
 
 CACHED_TIMESTEPS = 12
 """Timesteps kept in memory: about 1 MB each for 10,000 triangles."""

@@ -17,7 +17,7 @@ from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
 from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
-from ...raster.device import adapter_name
+from ...render.device import adapter_name
 from ...worker.launch import same_interpreter_environment
 from . import adam, strain_position
 from .losses import image_gradient, whole_image

@@ -8,12 +8,12 @@ from ...capture.model import Capture, View
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .backend import Batch, make_backend
+from .flame_refinement import RefinementState, refinable_tracking, refinement_rate
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .losses import limit_units
 from .state import TrainState, new_state, with_strain_position
 from .strategies import DensityControl, PostStep, StrayReset, make_strategy
-from .tracking import RefinementState, refinable_tracking, refinement_rate
 
 
 class Trainer:

@@ -15,8 +15,8 @@ from ...avatar.file import SH_SIZES
 from ...avatar.strain import STRAIN_COMPONENTS
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
+from ..optimize.flame_refinement import RefinementState
 from ..optimize.state import StrainPosition, TrainState, state_of, tensors_of
-from ..optimize.tracking import RefinementState
 from .folder import CHECKPOINT, SELECTION
 
 VERSION = 3

@@ -23,6 +23,7 @@ from ..evaluate.evaluation_views import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
+from ..optimize.flame_refinement import with_refined_tracking
 from ..optimize.state import (
     TrainState,
     new_state,
@@ -30,7 +31,6 @@ from ..optimize.state import (
     with_strain_coefficients,
     with_strain_position,
 )
-from ..optimize.tracking import with_refined_tracking
 from ..settings import Rates, TrainingSettings, validate
 from .checkpoint import read_checkpoint
 from .folder import CHECKPOINT, Continuation, Run, Take

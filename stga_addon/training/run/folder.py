@@ -19,9 +19,9 @@ from typing import Any
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
 from ...files import read_json, remove_leftovers, write_json
-from ...raster.device import is_device
+from ...render.device import is_device
 from ...worker.lock import hold_lock, lock_owner
-from ..effect_plan import EffectDecision, effect_plan_from_json, effect_plan_to_json
+from ..effects.decisions import EffectDecision, effect_plan_from_json, effect_plan_to_json
 from ..settings import TrainingSettings, from_json, to_json
 from .identity import Identity, identity_from_json
 

@@ -21,16 +21,16 @@ from ...errors import DeviceError, StgaError
 from ...files import replacing
 from ...format import format_duration
 from ...selection import select_capture
-from ..effect_plan import TRACKING
+from ..effects.decisions import TRACKING
 from ..evaluate import lpips
 from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
 from ..evaluate.forecast import DETAIL, curve_of, flat_since, forecast, forecast_horizon, forecast_text
 from ..evaluate.metrics import evaluate, peak_memory_mb
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
+from ..optimize.flame_refinement import with_refined_tracking, write_tracking
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
-from ..optimize.tracking import with_refined_tracking, write_tracking
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import to_json

@@ -7,7 +7,7 @@ from ...capture.model import Capture
 from ...capture.open import open_capture
 from ...capture.takes import join_takes
 from ...errors import StgaError
-from ...raster.device import GPU, adapter_names, choose_device
+from ...render.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, read_run
 from .identity import Identity, difference, identity_of
 
@@ -42,7 +42,7 @@ def open_run(
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
-        from ..optimize.tracking import with_refined_tracking  # imports torch, which Blender's own Python lacks
+        from ..optimize.flame_refinement import with_refined_tracking  # imports torch, which Blender's own Python lacks
 
         opened = with_refined_tracking(opened, folder)
     return OpenedRun(run, opened, takes)

@@ -1,0 +1,76 @@
+"""GaussianAvatars' pair of files: splats bound to triangles, and the FLAME motion that drives them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..avatar.embedding import face_frames, strained_sh, to_local, to_world
+from ..avatar.file import Avatar
+from ..avatar.splats import Splats, no_strain_color
+from ..errors import StgaError
+from ..files import write_npz
+from ..flame.sequence import FlameSequence
+from .ply import PROPERTIES, splat_columns, write_columns
+
+PLY_NAME = "point_cloud.ply"
+MOTION_NAME = "flame_param.npz"
+BINDING = "binding_0"
+
+
+def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence) -> None:
+    """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, each atomically.
+
+    Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the triangle as the
+    float property binding_0. The motion holds every timestep of `sequence`, its static offset, and the dynamic
+    offset that the viewer requires. Raises StgaError where the sequence's mesh is not the avatar's.
+    """
+    if not np.array_equal(sequence.model.faces, avatar.faces):
+        raise StgaError(
+            f"{folder}: the avatar's mesh ({len(avatar.faces)} triangles) is not the FLAME model's "
+            f"({len(sequence.model.faces)}), expected an avatar trained on this model's meshes"
+        )
+    splats = in_convention(avatar, "gaussian_avatars")
+    columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
+    write_columns(folder / PLY_NAME, [*PROPERTIES, BINDING], columns)
+    write_npz(folder / MOTION_NAME, motion_arrays(sequence), compressed=True)
+
+
+def in_convention(avatar: Avatar, convention: str) -> Splats:
+    """The avatar's splats in the frames of another convention, at the same places on the neutral mesh.
+
+    Both conventions have their origin at the centroid, which is left out for precision. On deformed triangles the
+    conventions scale differently, and so do the splats. What follows strain is that of the neutral mesh.
+    """
+    splats = avatar.splats
+    if splats.strain_color.shape[1]:
+        sh = strained_sh(splats, avatar.frames(avatar.neutral))
+        splats = replace(splats, sh=sh, strain_color=no_strain_color(len(sh)))
+    if convention == avatar.convention:
+        return splats
+    here, there = (
+        replace(frames, origin=np.zeros_like(frames.origin))
+        for frames in (
+            face_frames(avatar.neutral, avatar.faces, avatar.neutral, name) for name in (avatar.convention, convention)
+        )
+    )
+    return to_local(to_world(splats, here), there, splats.face)
+
+
+def motion_arrays(sequence: FlameSequence) -> dict[str, np.ndarray]:
+    """flame_param.npz of a GaussianAvatars avatar, float32.
+
+    shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation (T, 3), eyes_pose (T, 6),
+    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100 for I and E with a
+    published FLAME.
+    """
+    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    no_offset = np.zeros_like(sequence.model.v_template)
+    names = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
+    arrays = {name: np.stack([getattr(frame, name) for frame in frames]) for name in names}
+    arrays["shape"] = sequence.shape
+    arrays["static_offset"] = no_offset if sequence.static_offset is None else sequence.static_offset
+    arrays["dynamic_offset"] = np.stack(
+        [no_offset if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames], dtype=np.float32
+    )
+    return {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -1,0 +1,210 @@
+"""Reading and writing of world-space splats in 3D Gaussian Splatting's PLY layout."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from ..avatar.splats import MAX_SH_DEGREE, Splats
+from ..errors import StgaError
+from ..files import file_size, replacing
+
+MAX_HEADER_BYTES = 1 << 16
+REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
+PROPERTIES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{i}" for i in range(REST_COEFFICIENTS)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+_DTYPES = {
+    name: code
+    for code, names in {
+        "i1": ("char", "int8"),
+        "u1": ("uchar", "uint8"),
+        "i2": ("short", "int16"),
+        "u2": ("ushort", "uint16"),
+        "i4": ("int", "int32"),
+        "u4": ("uint", "uint32"),
+        "f4": ("float", "float32"),
+        "f8": ("double", "float64"),
+    }.items()
+    for name in names
+}
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_Elements = dict[str, tuple[int, dict[str, str]]]  # name -> (count, property -> NumPy type)
+
+
+def write_ply(path: Path, world: Splats) -> None:
+    """Write world-space splats in 3D Gaussian Splatting's PLY layout, binary, atomically.
+
+    All float32 and before activation; normals zero; f_rest channel by channel, zero-padded to degree 3.
+    """
+    write_columns(path, PROPERTIES, splat_columns(world))
+
+
+def read_ply(path: Path) -> Splats:
+    """Read world-space splats from a 3D Gaussian Splatting PLY of SH degree 0 to 3.
+
+    Properties may stand in any order; those that are not the layout's are ignored.
+    Raises StgaError naming the file and the property that is missing, not finite or truncated.
+    """
+    return splats_from_columns(path, read_vertices(path))
+
+
+def splat_columns(splats: Splats) -> np.ndarray:
+    """(N, 62) float32 in the order of PROPERTIES."""
+    count = len(splats)
+    columns = np.zeros((count, len(PROPERTIES)), "<f4")
+    columns[:, 0:3] = splats.xyz
+    columns[:, 6:9] = splats.sh[:, 0]
+    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
+    rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
+    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
+    columns[:, 54] = splats.opacity
+    columns[:, 55:58] = splats.log_scale
+    columns[:, 58:62] = splats.rotation
+    return columns
+
+
+def splats_from_columns(path: Path, vertices: np.ndarray) -> Splats:
+    """Splats (face 0) from the structured array of `read_vertices`. Raises StgaError as `read_ply`."""
+    rest = sum(1 for name in vertices.dtype.names or () if name.startswith("f_rest_"))
+    if rest not in [3 * (size**2 - 1) for size in range(1, MAX_SH_DEGREE + 2)]:
+        raise StgaError(f"{path}: has {rest} f_rest properties, expected 0, 9, 24 or 45")
+    count = len(vertices)
+    sh = np.empty((count, 1 + rest // 3, 3), np.float32)
+    sh[:, 0] = stack_columns(path, vertices, [f"f_dc_{i}" for i in range(3)])
+    channels = stack_columns(path, vertices, [f"f_rest_{i}" for i in range(rest)])
+    sh[:, 1:] = channels.reshape(count, 3, rest // 3).transpose(0, 2, 1)
+    return Splats(
+        xyz=stack_columns(path, vertices, ["x", "y", "z"]),
+        rotation=stack_columns(path, vertices, [f"rot_{i}" for i in range(4)]),
+        log_scale=stack_columns(path, vertices, [f"scale_{i}" for i in range(3)]),
+        opacity=stack_columns(path, vertices, ["opacity"])[:, 0],
+        sh=sh,
+        face=np.zeros(count, np.int32),
+        unbound=np.zeros(count, bool),
+    )
+
+
+def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """(N, len(names)) float32 of the named properties. Raises StgaError where one is missing or not finite."""
+    columns = np.empty((len(vertices), len(names)), np.float32)
+    for i, name in enumerate(names):
+        if name not in (vertices.dtype.names or ()):
+            raise StgaError(f"{path}: has no property {name!r}, which a 3D Gaussian Splatting PLY must have")
+        columns[:, i] = vertices[name]
+    if not np.isfinite(columns).all():
+        bad = names[int(np.argmin(np.isfinite(columns).all(axis=0)))]
+        raise StgaError(f"{path}: property {bad!r} holds a value that is not finite")
+    return columns
+
+
+def write_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
+    """Write (N, len(names)) float32 as the vertices of a binary little-endian PLY, atomically."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]
+    lines += [f"property float {name}" for name in names]
+    with replacing(path) as partial, partial.open("wb") as out:
+        out.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+        np.ascontiguousarray(columns, "<f4").tofile(out)
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """Structured array (N,) of a PLY file's vertices, binary or ASCII, one field a property.
+
+    Raises StgaError where the file is missing, malformed or shorter than its header says. Nothing is allocated
+    before the file is known to hold it.
+    """
+    size = file_size(path)
+    try:
+        with path.open("rb") as file:
+            header = _read_header(path, file)
+            file.seek(header.offset)
+            return _read_ascii(path, file, header, size) if header.ascii else _read_binary(path, file, header, size)
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+@dataclass(frozen=True)
+class _Header:
+    """offset: where the data starts; skipped: bytes (rows if ASCII) of the elements before the vertices."""
+
+    ascii: bool
+    offset: int
+    skipped: int
+    count: int
+    dtype: np.dtype
+
+
+def _read_header(path: Path, file: BinaryIO) -> _Header:
+    start = file.read(MAX_HEADER_BYTES)
+    end = start.find(b"\nend_header")
+    newline = start.find(b"\n", end + 1)
+    if not start.startswith(b"ply") or end < 0 or newline < 0:
+        raise StgaError(f"{path}: is not a PLY file (no complete header)")
+    order = ""
+    elements: _Elements = {}
+    properties: dict[str, str] = {}
+    try:
+        for line in start[:end].decode("latin-1").split("\n"):
+            match line.split():
+                case ["format", name, _]:
+                    order = _BYTE_ORDERS[name]
+                case ["element", name, count]:
+                    properties = {}
+                    elements[name] = (int(count), properties)
+                case ["property", kind, name] if name not in properties:
+                    properties[name] = order + _DTYPES[kind]
+                case ["property", "list", _, _, name]:
+                    properties[name] = "list"
+                case ["ply"] | ["comment" | "obj_info", *_] | []:
+                    pass
+                case _:
+                    raise ValueError(line)
+    except (ValueError, KeyError) as error:
+        raise StgaError(f"{path}: PLY header cannot be understood ({error})") from error
+    return _locate_vertices(path, elements, order, newline + 1)
+
+
+def _locate_vertices(path: Path, elements: _Elements, order: str, offset: int) -> _Header:
+    is_ascii, skipped = order == "=", 0
+    for name, (count, properties) in elements.items():
+        if count < 0 or not order or not properties:
+            break
+        if "list" in properties.values():
+            raise StgaError(f"{path}: PLY element {name!r} has a list property before the vertices end, not supported")
+        dtype = np.dtype(list(properties.items()))
+        if name == "vertex":
+            return _Header(is_ascii, offset, skipped, count, dtype)
+        skipped += count if is_ascii else count * dtype.itemsize
+    raise StgaError(f"{path}: PLY header describes no vertices")
+
+
+def _read_binary(path: Path, file: BinaryIO, header: _Header, size: int) -> np.ndarray:
+    need = header.offset + header.skipped + header.count * header.dtype.itemsize
+    if size < need:
+        raise StgaError(f"{path}: is truncated: it has {size} bytes, its header announces {need}")
+    file.seek(header.offset + header.skipped)
+    return np.fromfile(file, header.dtype, header.count)
+
+
+def _read_ascii(path: Path, file: BinaryIO, header: _Header, size: int) -> np.ndarray:
+    names = header.dtype.names or ()
+    # A number takes at least two bytes with its separator: check before allocating the rows.
+    if size < header.offset + 2 * (header.count * len(names) + header.skipped) - 1:
+        raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {header.count} vertices")
+    if not header.count:
+        return np.empty(0, header.dtype)
+    try:
+        table = np.loadtxt(file, np.float64, skiprows=header.skipped, max_rows=header.count, ndmin=2, comments=None)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
+    expected = (header.count, len(names))
+    if table.shape != expected:
+        raise StgaError(f"{path}: has vertices of shape {table.shape}, its header announces {expected}")
+    vertices = np.empty(header.count, header.dtype)
+    for i, name in enumerate(names):
+        vertices[name] = table[:, i]
+    return vertices

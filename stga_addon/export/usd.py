@@ -1,0 +1,119 @@
+"""Writing of an avatar as an animated OpenUSD particle field of Gaussian splats."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..avatar.splats import Splats
+from ..errors import StgaError
+from ..files import replacing
+
+PRIM_TYPE = "ParticleField3DGaussianSplat"
+EXTENT_DEVIATIONS = 3.0
+"""Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
+
+
+def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool = False) -> None:
+    """Write numbered world-space splats as the time samples of one prim, atomically.
+
+    path          .usdc, or .usdz, a package of the same
+    frames        at least one pair of a time code and splats, time codes ascending
+    fps           time codes per second
+    moving_color  whether the spherical harmonics differ between frames: written for each of them, in half precision
+    Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. Splats and opacities stay
+    the same. A frame is in the file before the next is taken, so memory does not grow with their number.
+    Raises StgaError where USD is not installed, or a file cannot be written.
+    """
+    usd = _import_usd(path)
+    with replacing(path) as partial:
+        if path.suffix.lower() != ".usdz":
+            _write_layer(usd, partial, frames, fps, moving_color)
+            return
+        layer = partial.with_name(f".layer{partial.name}")
+        try:
+            _write_layer(usd, layer, frames, fps, moving_color)
+            writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter  # there before USD 26
+            with writer.CreateNew(str(partial)) as archive:
+                archive.AddFile(str(layer), f"{path.stem}.usdc")
+        finally:
+            layer.unlink(missing_ok=True)
+
+
+def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
+    """Size of the binary file: positions, rotations and scales per frame, opacities and constant colors once."""
+    coefficients = 3 * splats.sh.shape[1]
+    once, each = (4, 40 + 2 * coefficients) if moving_color else (4 + 4 * coefficients, 40)
+    return len(splats) * (once + each * frames)
+
+
+def _import_usd(path: Path) -> Any:
+    try:
+        import pxr.Sdf
+        import pxr.Usd
+        import pxr.UsdGeom
+        import pxr.Vt
+    except ImportError as error:
+        raise StgaError(f"{path}: USD files need the package usd-core, which this Python lacks") from error
+    return pxr
+
+
+def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool) -> None:
+    layer = usd.Sdf.Layer.New(usd.Sdf.FileFormat.FindById("usdc"), str(file))
+    stage = usd.Usd.Stage.Open(layer)
+    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    prim = None
+    for number, world in frames:
+        if prim is None:
+            prim = _define(usd, stage, world, moving_color)
+            stage.SetStartTimeCode(number)
+        _write_sample(usd, prim, number, world, moving_color)
+        stage.SetEndTimeCode(number)
+        layer.Save()
+
+
+def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
+    """The prim with what does not change. By names, not by USD's class of it, which older versions lack."""
+    types, uniform = usd.Sdf.ValueTypeNames, usd.Sdf.VariabilityUniform
+    root = stage.DefinePrim("/Avatar", "Xform")
+    stage.SetDefaultPrim(root)
+    prim = stage.DefinePrim("/Avatar/Splats", PRIM_TYPE)
+    for name, kind, value in (
+        ("projectionModeHint", types.Token, "perspective"),
+        ("sortingModeHint", types.Token, "zDepth"),
+        ("radiance:sphericalHarmonicsDegree", types.Int, first.sh_degree),
+    ):
+        prim.CreateAttribute(name, kind, False, uniform).Set(value)
+    prim.CreateAttribute("opacities", types.FloatArray, False).Set(usd.Vt.FloatArray.FromNumpy(first.opacities()))
+    if not moving_color:
+        coefficients = usd.Vt.Vec3fArray.FromNumpy(_rows(first.sh))
+        prim.CreateAttribute("radiance:sphericalHarmonicsCoefficients", types.Float3Array, False).Set(coefficients)
+    return prim
+
+
+def _write_sample(usd: Any, prim: Any, time: int, world: Splats, moving_color: bool) -> None:
+    types, vt = usd.Sdf.ValueTypeNames, usd.Vt
+    scales = world.scales()
+    reach = EXTENT_DEVIATIONS * scales.max(axis=1, keepdims=True)
+    extent = np.stack([(world.xyz - reach).min(axis=0), (world.xyz + reach).max(axis=0)])
+    values = [
+        ("extent", types.Float3Array, vt.Vec3fArray.FromNumpy(extent)),
+        ("positions", types.Point3fArray, vt.Vec3fArray.FromNumpy(_rows(world.xyz))),
+        ("scales", types.Float3Array, vt.Vec3fArray.FromNumpy(_rows(scales))),
+        # FromNumpy takes xyzw
+        ("orientations", types.QuatfArray, vt.QuatfArray.FromNumpy(_rows(world.unit_rotations()[:, [1, 2, 3, 0]]))),
+    ]
+    if moving_color:
+        half = vt.Vec3hArray.FromNumpy(_rows(world.sh).astype(np.float16))
+        values.append(("radiance:sphericalHarmonicsCoefficientsh", types.Half3Array, half))
+    for name, kind, value in values:
+        prim.CreateAttribute(name, kind, False).Set(value, time)
+
+
+def _rows(array: np.ndarray) -> np.ndarray:
+    """As (..., last axis) contiguous rows, as USD's arrays are."""
+    return np.ascontiguousarray(array.reshape(-1, array.shape[-1]))

@@ -1,0 +1,160 @@
+"""Web data files: an avatar, what moves it and the cameras it is seen from, quantized (docs/formats.md)."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ...avatar.embedding import face_frames
+from ...avatar.file import Avatar
+from ...avatar.splats import Splats, unit_quaternions
+from ...capture.camera import Camera
+from ..playback import Playback
+from .container import FixedPoint, pack
+from .rig import WebRig
+
+Arrays = dict[str, np.ndarray | FixedPoint]
+
+# Steps of fixed-point values: half of one is the largest error. Together they leave a picture of large
+# random splats 55 dB PSNR at least (tests/export/web/test_page.py).
+POSITION_STEP_M = 4e-6
+ROTATION_STEP = 1 / 724
+"""The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each."""
+LOG_SCALE_STEP = 0.015
+OPACITY_STEP = 1 / 255
+COLOR_STEP = 0.004
+"""Of the constant SH coefficient, which a color has 0.28 times."""
+SH_STEP = 0.005
+STRAIN_COLOR_STEP = 0.008
+STRAIN_RANGE_STEP = 0.002
+"""Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a unit err by 2 µm."""
+STRAIN_POSITION_STEP_M = POSITION_STEP_M / 16
+"""Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
+along an axis at most, where half of POSITION_STEP_M is 2 µm."""
+VERTEX_STEP_M = 2.0**-24
+"""Of base and neutral mesh: so fine that no thin triangle becomes a line, or the reverse."""
+BASIS_STEP_M = 2e-6
+WEIGHT_STEP = 1 / 65535
+
+MIN_SLIDER_RANGE, SLIDER_HEADROOM = 1.0, 1.5
+"""Sliders reach beyond the motion by this factor, and to ±1 at least."""
+
+
+def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = False) -> bytes:
+    """The data file of an avatar that `rig` moves; `exact`: float32 instead of fixed point.
+
+    Raises ValueError where a value is not finite.
+    """
+    order = np.argsort(avatar.splats.face, kind="stable")
+    splats = avatar.splats.rows(order)
+    unit = _local_unit(avatar)
+    arrays = _splat_arrays(splats, unit) | _strain_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
+    arrays |= _rig_arrays(rig)
+    if playback.selection is not None:
+        arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
+    if exact:
+        arrays = {name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a for name, a in arrays.items()}
+    return pack(_header(avatar, rig, playback), arrays)
+
+
+def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
+    return {
+        "title": playback.title,
+        "convention": avatar.convention,
+        "antialiased": avatar.antialiased,
+        "background": [float(value) for value in avatar.background],
+        "fps": playback.fps,
+        "up": [float(value) for value in playback.up],
+        "joints": list(rig.joint_names),
+        "parents": list(rig.parents),
+        "sliders": _sliders(rig),
+        "views": [_view(name, camera) for name, camera in playback.views.items()],
+    }
+
+
+def _sliders(rig: WebRig) -> list[dict[str, Any]]:
+    """Name, component and range of every expression, those that the motion uses most first."""
+    used = rig.coefficients[:, : rig.expressions]
+    reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
+    order = np.argsort(-used.std(0), kind="stable") if len(used) else np.arange(rig.expressions)
+    return [{"name": f"expr_{k:03d}", "component": k, "reach": round(float(reach[k]), 2)} for k in order.tolist()]
+
+
+def _view(name: str, camera: Camera) -> dict[str, Any]:
+    return {
+        "name": name,
+        "size": [camera.width, camera.height],
+        "focal": [camera.fl_x, camera.fl_y],
+        "center": [camera.cx, camera.cy],
+        "world_to_camera": camera.world_to_camera.ravel().tolist(),
+    }
+
+
+def _local_unit(avatar: Avatar) -> float:
+    """Meters of a unit of the splats' local frames, where it is largest."""
+    scale = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention).scale
+    return float(scale.max(initial=1e-6))
+
+
+def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
+    largest, smaller = _smallest_three(splats.rotation)
+    arrays: Arrays = {
+        "xyz": FixedPoint(splats.xyz, POSITION_STEP_M / local_unit),
+        "rotation": FixedPoint(smaller, ROTATION_STEP),
+        "rotation_largest": largest,
+        "log_scale": FixedPoint(splats.log_scale, LOG_SCALE_STEP),
+        "opacity": FixedPoint(splats.opacities(), OPACITY_STEP),
+        "color": FixedPoint(splats.sh[:, 0], COLOR_STEP),
+    }
+    if splats.sh.shape[1] > 1:
+        arrays["sh"] = FixedPoint(splats.sh[:, 1:].reshape(len(splats), -1), SH_STEP)
+    if splats.strain_color.shape[1]:
+        arrays["strain_color"] = FixedPoint(splats.strain_color.reshape(len(splats), -1), STRAIN_COLOR_STEP)
+    return arrays
+
+
+def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in order, of the unit
+    quaternion whose largest part is positive. A zero quaternion counts as the identity."""
+    q = unit_quaternions(rotation)
+    largest = np.abs(q).argmax(1)
+    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
+    others = np.array([[k for k in range(4) if k != left_out] for left_out in range(4)])[largest]
+    return largest.astype(np.uint8), np.take_along_axis(q, others, 1)
+
+
+def _strain_arrays(avatar: Avatar, local_unit: float) -> Arrays:
+    """What the triangles hold for colors and positions that follow strain."""
+    arrays: Arrays = {}
+    rows = (len(avatar.faces), -1)
+    if avatar.follows_strain and avatar.strain_range is not None:
+        arrays["strain_range"] = FixedPoint(avatar.strain_range.reshape(rows), STRAIN_RANGE_STEP)
+    if avatar.strain_position is not None:
+        step = STRAIN_POSITION_STEP_M / local_unit
+        arrays["strain_position"] = FixedPoint(avatar.strain_position.reshape(rows), step)
+    return arrays
+
+
+def _mesh_arrays(avatar: Avatar, splats: Splats) -> Arrays:
+    return {
+        "faces": avatar.faces,
+        "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
+        "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),
+    }
+
+
+def _rig_arrays(rig: WebRig) -> Arrays:
+    exact: Mapping[str, np.ndarray] = {
+        "joint_rest": rig.joints,
+        "joint_basis": rig.joint_basis,
+        "coefficients": rig.coefficients,
+        "pose": rig.pose,
+        "translation": rig.translation,
+    }
+    return {
+        "base": FixedPoint(rig.base, VERTEX_STEP_M),
+        "basis": FixedPoint(rig.basis, BASIS_STEP_M),
+        "correctives": FixedPoint(rig.correctives, BASIS_STEP_M),
+        "weights": FixedPoint(rig.weights, WEIGHT_STEP),
+        **{name: array.astype(np.float32) for name, array in exact.items()},
+    }

@@ -1,0 +1,70 @@
+"""Writing of an avatar as a web page, or as data and player for a server."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from ...avatar.file import Avatar
+from ...errors import StgaError
+from ...files import replacing
+from ...flame.sequence import FlameSequence
+from ..playback import Playback
+from .data_file import data_file
+from .page import element_script, page
+from .rig import WebRig, baked_rig, flame_rig
+
+SCRIPT_NAME = "stga-avatar.js"
+BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
+"""About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
+RIG_NOTICE = (
+    "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
+    "who may receive them."
+)
+
+
+def write_web(
+    path: Path,
+    avatar: Avatar,
+    playback: Playback,
+    meshes: Iterable[np.ndarray] = (),
+    sequence: FlameSequence | None = None,
+) -> list[Path]:
+    """Write a page that plays the avatar, or an .stga data file with the player beside it; returns the files.
+
+    sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else the posed `meshes`
+              (V, 3) meters are baked, of which there is one at least
+    Raises StgaError where there is no pose, or a file cannot be written.
+    """
+    with_flame = sequence is not None and not playback.motion_only
+    rig = _rig(path, None if playback.motion_only else sequence, meshes)
+    try:
+        data = data_file(avatar, rig, playback)
+    except ValueError as error:
+        raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
+    if path.suffix.lower() == ".stga":
+        _write(path.with_name(SCRIPT_NAME), element_script().encode("utf-8"))
+        _write(path, data)  # last: where the player cannot be written, no data without one
+        return [path, path.with_name(SCRIPT_NAME)]
+    _write(path, page(playback.title, RIG_NOTICE if with_flame else "", data).encode("utf-8"))
+    return [path]
+
+
+def web_bytes(avatar: Avatar) -> int:
+    """About the size of a page of the avatar."""
+    colors = avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
+    return round((BYTES_PER_SPLAT + BYTES_PER_COEFFICIENT * colors) * len(avatar.splats))
+
+
+def _rig(path: Path, sequence: FlameSequence | None, meshes: Iterable[np.ndarray]) -> WebRig:
+    if sequence is not None:
+        return flame_rig(sequence)
+    posed = list(meshes)
+    if not posed:
+        raise StgaError(f"{path}: there is no posed mesh to export")
+    return baked_rig(posed)
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replacing(path) as partial:
+        partial.write_bytes(data)

@@ -1,0 +1,44 @@
+"""Several sets of splats in one picture, on a GPU where one is right and faster than the CPU."""
+
+import logging
+from collections.abc import Sequence
+
+from ..capture.camera import Camera
+from ..errors import DeviceError, one_line
+from ..raster.posed_splats import ComposedImage, PosedSplats
+from .device import GPU, choose_device, first_line
+
+
+class Composer:
+    """Renders layers on a device, which is chosen with the first image.
+
+    wanted   see `choose_device`; with "auto", the CPU renders from a GPU's first failure on
+    device   the one that was chosen; "" before
+    failure  why the CPU took over; "" where it did not
+    """
+
+    def __init__(self, wanted: str = "auto") -> None:
+        self.wanted, self.device, self.failure = wanted, "", ""
+
+    def choose(self) -> str:
+        """The device of the next image. Raises StgaError where the one that is asked for by name does not work."""
+        if not self.device:
+            self.device, _ = choose_device(self.wanted, "Rendering")
+        return self.device
+
+    def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
+        """See `cpu.compose.compose`. Raises StgaError where a device that is asked for by name cannot render."""
+        if self.choose() != "cpu":
+            from ..raster.gpu import compose as gpu
+
+            try:
+                return gpu.compose(self.device.removeprefix(GPU), layers, camera, with_depth)
+            except Exception as error:  # a driver raises what it likes
+                if self.wanted != "auto":
+                    raise
+                cause = error.cause if isinstance(error, DeviceError) else f"{self.device}: {first_line(error)}"
+                self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")
+                logging.getLogger(__name__).warning(self.failure)
+        from ..raster.cpu import compose as cpu
+
+        return cpu.compose(layers, camera, with_depth)

@@ -1,0 +1,110 @@
+"""Choice of the device that trains or renders: the GPU where it is right and faster, else the CPU."""
+
+from functools import cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from ..errors import StgaError
+
+if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
+    from ..raster.gpu.trial import Trial
+
+GPU = "gpu:"
+"""Before the adapter's name in a device."""
+DEVICES = ("auto", "cpu", "gpu")
+"""Choices of `choose_device`, beside "gpu:NAME"."""
+MAX_DEVICE_LENGTH = 255
+
+
+def is_device(value: Any) -> bool:
+    """Whether a value is one of DEVICES or "gpu:" and a name."""
+    if not isinstance(value, str):
+        return False
+    return value in DEVICES or (value.startswith(GPU) and len(GPU) < len(value) <= MAX_DEVICE_LENGTH)
+
+
+def choose_device(wanted: str, task: str = "Training") -> tuple[str, str]:
+    """The device, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
+
+    wanted: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with this
+    part in its name). "auto" takes the first adapter that is not software, right and faster than the CPU. task: what is
+    done there. Raises StgaError if a GPU is wanted and none works.
+    """
+    if wanted == "cpu":
+        return "cpu", f"{task} on the CPU (--device cpu)"
+    if wanted == "auto":
+        return _fastest(task)
+    adapter = adapter_name(wanted)
+    trial = _trial(adapter)
+    if not trial.is_right:
+        raise StgaError(f"--device {wanted}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu")
+    return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
+
+
+def adapter_names(software: bool = True) -> list[str]:
+    """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is none."""
+    if find_spec("wgpu") is None:
+        raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
+    from ..raster.gpu.device import adapters, is_software
+
+    names = [name for name, adapter in adapters().items() if software or not is_software(adapter)]
+    if not names:
+        found = "no GPU" if adapters() else "no graphics driver with Vulkan, Metal or Direct3D 12"
+        raise StgaError(f"--device gpu: {found} was found")
+    return names
+
+
+def adapter_name(device: str) -> str:
+    """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError where there is none, or several."""
+    names, wanted = adapter_names(), device.removeprefix(GPU)
+    if device == "gpu" or wanted in names:
+        return names[0] if device == "gpu" else wanted
+    found = [name for name in names if wanted.lower() in name.lower()]
+    if len(found) == 1:
+        return found[0]
+    which = "several adapters" if found else "no adapter"
+    raise StgaError(f"--device {device}: {which} of that name; there are: {', '.join(names)}")
+
+
+def _fastest(task: str) -> tuple[str, str]:
+    """The first real GPU that is right and faster than the CPU, or the CPU and why."""
+    try:
+        names = adapter_names(software=False)
+    except Exception as error:  # whatever a driver raises, the CPU still works
+        return "cpu", f"{task} on the CPU: {first_line(error)}"
+    reasons = []
+    for adapter in names:
+        try:
+            trial = _trial(adapter)
+        except Exception as error:
+            reasons.append(f"{adapter} fails ({first_line(error)})")
+            continue
+        if trial.is_right and trial.device_s < trial.cpu_s:
+            return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
+        reasons.append(f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial))
+    return "cpu", f"{task} on the CPU: {'; '.join(reasons)}"
+
+
+def first_line(error: Exception) -> str:
+    """What a driver's error says, without its details."""
+    return (str(error).strip() or repr(error)).splitlines()[0].removeprefix("--device gpu: ")
+
+
+@cache
+def _trial(adapter: str) -> "Trial":
+    from ..raster.gpu.device import Device
+    from ..raster.gpu.trial import try_device
+
+    return try_device(Device(adapter))
+
+
+def _comparison(trial: "Trial") -> str:
+    """How fast a device is compared with the CPU, and the time of an image on each."""
+    times = f"{1e3 * trial.device_s:.1f} and {1e3 * trial.cpu_s:.1f} ms an image"
+    faster, slower = trial.cpu_s / trial.device_s, trial.device_s / trial.cpu_s
+    share = f"{faster:.1f} times as fast as" if faster > 1 else f"{slower:.1f} times slower than"
+    return f"{share} the CPU in a trial ({times})"
+
+
+def _wrong(adapter: str, trial: "Trial") -> str:
+    return f"{adapter} computes gradients that differ from the CPU's by {100 * trial.error:.2g} %"

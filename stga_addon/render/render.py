@@ -1,0 +1,73 @@
+"""Render splats or an avatar with a camera.
+
+From a PLY file to a picture:
+
+    >>> from pathlib import Path
+    >>> from PIL import Image
+    >>> from stga_addon.export.ply import read_ply
+    >>> from stga_addon.capture.camera import look_at
+    >>> from stga_addon.render.render import render, to_uint8
+    >>> splats = read_ply(Path("splats.ply"))
+    >>> camera = look_at(eye=(0, 0, 1), target=(0, 0, 0), width=640, height=480, focal_length=800)
+    >>> image = render(splats, camera, background=(1, 1, 1))
+    >>> Image.fromarray(to_uint8(image)).save("splats.png")
+
+`cpu.autograd.render_differentiable` renders torch tensors that require gradients.
+"""
+
+import numpy as np
+
+from ..avatar.embedding import WORLD, FaceFrames
+from ..avatar.file import Avatar
+from ..avatar.splats import Splats
+from ..capture.camera import Camera
+from ..raster.cpu.layout import Parameters
+from ..raster.cpu.rasterize import frames_in_camera, render_forward
+from ..raster.posed_splats import PosedSplats
+from .compose import Composer
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    background: tuple[float, float, float] = WHITE,
+    frames: FaceFrames = WORLD,
+    antialiased: bool = False,
+    composer: Composer | None = None,
+) -> np.ndarray:
+    """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
+
+    splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH coefficients);
+    positions in the frames of their triangles (`avatar.embedding.face_frames`), or in world meters with `WORLD`.
+    camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether splats narrower than a
+    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained. composer: chooses the device; the
+    CPU without one.
+    """
+    if composer is not None and composer.choose() != "cpu":
+        composed = composer.compose([PosedSplats(splats, frames, np.eye(4), antialiased)], camera)
+        behind = (1 - composed.alpha) * np.array(background, np.float32)[:, None, None]
+        return np.clip(composed.rgb + behind, 0, 1)
+    parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
+    output = render_forward(
+        parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
+        np.array(background, np.float32), antialiased=antialiased,
+    )  # fmt: skip
+    return np.clip(output.image, 0, 1)
+
+
+def render_avatar(
+    avatar: Avatar,
+    mesh: np.ndarray,
+    camera: Camera,
+    background: tuple[float, float, float] = WHITE,
+    composer: Composer | None = None,
+) -> np.ndarray:
+    """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of `render`."""
+    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer)
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Rendered image (3, H, W) in 0…1 as pixels (H, W, 3) uint8, as image files hold them."""
+    return np.asarray(np.rint(np.clip(image, 0, 1).transpose(1, 2, 0) * 255), np.uint8)

@@ -1,0 +1,83 @@
+"""Effect plan of a run: what was decided about each effect, and why (`effects.rules` decides)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ...errors import StgaError
+
+CHOICES = ("auto", "on", "off")
+EFFECTS = (
+    "view-color",
+    "exposure",
+    "antialiasing",
+    "background",
+    "hull-points",
+    "depth-limits",
+    "density",
+    "selection",
+    "strain-color",
+    "strain-position",
+    "teeth",
+    "neck",
+    "jaw",
+    "eyes",
+    "dynamic-offsets",
+    "tracking",
+)
+"""Names of all effects."""
+TRACKING = "tracking.npz"
+"""File of a run folder with refined FLAME parameters."""
+
+
+@dataclass(frozen=True)
+class EffectDecision:
+    """The decision about one effect.
+
+    effect  name, as in `--effect NAME=on`
+    choice  the user's: one of CHOICES
+    on      the decision
+    reason  with the figure that it rests on
+    cost    of the effect while it is on
+    """
+
+    effect: str
+    choice: str
+    on: bool
+    reason: str
+    cost: str
+
+    def __str__(self) -> str:
+        asked = "" if self.choice == "auto" else ", as asked"
+        return f"{'on' if self.on else 'off'}{asked}: {self.reason}" + (f" [{self.cost}]" if self.on else "")
+
+
+def parse_choices(texts: Sequence[str]) -> dict[str, str]:
+    """Effect -> choice, from texts such as "jaw=off". Raises StgaError for anything else."""
+    choices = {}
+    for text in texts:
+        name, _, choice = text.partition("=")
+        if name not in EFFECTS or choice not in CHOICES:
+            raise StgaError(
+                f"--effect: '{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}"
+            )
+        choices[name] = choice
+    return choices
+
+
+def effect_plan_to_json(plan: Sequence[EffectDecision]) -> list[dict[str, Any]]:
+    return [dict(vars(decision)) for decision in plan]
+
+
+def effect_plan_from_json(values: Any) -> tuple[EffectDecision, ...]:
+    """Raises TypeError or ValueError for anything but what `effect_plan_to_json` gave."""
+    if not isinstance(values, list):
+        raise TypeError("plan is no list")
+    plan = tuple(EffectDecision(**value) for value in values)
+    for decision in plan:
+        texts = (decision.effect, decision.choice, decision.reason, decision.cost)
+        if not all(isinstance(text, str) for text in texts) or not isinstance(decision.on, bool):
+            raise TypeError(f"plan holds {decision!r}")
+        if decision.choice not in CHOICES:
+            raise ValueError(f"plan: choice is {decision.choice!r}")
+    return plan

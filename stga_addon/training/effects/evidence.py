@@ -1,0 +1,173 @@
+"""Statistics of sampled colors: how much of their variation an effect could explain."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...avatar.strain import range_with_margin
+from .samples import Samples
+
+FOLDS = 4
+MIN_SAMPLES_PER_TRIANGLE = 6
+CAMERA_FIT_ITERATIONS = 30
+"""Alternations between cameras and triangles; cameras on opposite sides share few triangles, so it converges slowly."""
+CAMERA_PRIOR_SAMPLES = 5.0
+"""Weight, in samples, of the prior that a camera is like the others."""
+TYPICAL_LEVEL = 100.0
+"""Of a color, in levels of 255; scales the prior of a gain."""
+OFFSET_PENALTY = 0.05
+"""Favors gains over offsets: cameras differ in exposure and white balance more than in their black level, and where
+all colors are alike, nothing else separates the two."""
+RELATIVE_CHANGE_BIAS_LEVELS = 32.0
+"""Added to a color before its change is taken relative to it."""
+RIDGE_WEIGHT = 1.0
+"""Of a triangle's coefficients, in units of a feature's variance over all triangles."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a model explains of colors that it was not fitted to.
+
+    gain   root mean square, in levels of 255, of the error that the model removes; 0 where it adds error
+    error  root mean square error without the model
+    """
+
+    gain: float
+    error: float
+
+    @property
+    def share(self) -> float:
+        """Explained share of the error's variance."""
+        return (self.gain / max(self.error, 1e-9)) ** 2
+
+
+def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
+    """Evidence from the errors (…) on the same samples without and with a model; zero without samples."""
+    if not before.size:
+        return Evidence(0.0, 0.0)
+    least, most = float(np.mean(before**2)), float(np.mean(after**2))
+    return Evidence(float(np.sqrt(max(0.0, least - most))), float(np.sqrt(least)))
+
+
+@dataclass(frozen=True)
+class CameraColors:
+    """Cameras (C,), and per camera and channel the gain (C, 3) and offset (C, 3), in levels, of its images against
+    the mean of all cameras, for which they are 1 and 0."""
+
+    camera: np.ndarray
+    gain: np.ndarray
+    offset: np.ndarray
+
+    def undo(self, color: np.ndarray, camera: np.ndarray) -> np.ndarray:
+        """color (S, K, 3) of the cameras (S,), as the mean camera would have seen it."""
+        row = np.searchsorted(self.camera, camera)
+        return np.asarray((color - self.offset[row][:, None]) / self.gain[row][:, None])
+
+
+def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
+    """Gains and offsets from color (S, K, 3), NaN where not seen: least squares, cameras and triangles in turn."""
+    camera, row = np.unique(samples.camera, return_inverse=True)
+    fitted = CameraColors(camera, np.ones((len(camera), 3)), np.zeros((len(camera), 3)))
+    for _ in range(CAMERA_FIT_ITERATIONS):
+        mean = _mean(fitted.undo(color, samples.camera))
+        fits = [_line(np.broadcast_to(mean, color[row == c].shape), color[row == c]) for c in range(len(camera))]
+        gain, offset = np.array([fit[0] for fit in fits]), np.array([fit[1] for fit in fits])
+        gain /= gain.mean(0)
+        fitted = CameraColors(camera, gain, offset - offset.mean(0))
+    return fitted
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gain (3,) and offset (3,) of y ≈ gain·x + offset over the samples (…, 3) that are not NaN."""
+    x, y = x.reshape(-1, 3), y.reshape(-1, 3)
+    known = ~np.isnan(y[:, 0]) & ~np.isnan(x[:, 0])
+    x, difference = x[known], (y - x)[known]
+    xx, xo, oo = (
+        (x**2).sum(0) + CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2,
+        x.sum(0),
+        len(x) * (1 + OFFSET_PENALTY) + CAMERA_PRIOR_SAMPLES,
+    )
+    dx, do = (x * difference).sum(0), difference.sum(0)
+    determinant = xx * oo - xo**2
+    return 1 + (oo * dx - xo * do) / determinant, (xx * do - xo * dx) / determinant
+
+
+def camera_evidence(samples: Samples, color: np.ndarray) -> Evidence:
+    """Whether cameras fitted to one half of the triangles make the images of the other half agree."""
+    half = np.arange(len(samples.faces)) % 2 == 0
+    fitted = fit_cameras(samples, np.where(half[:, None], color, np.nan))
+    other = color[:, ~half]
+    return compare(_scatter(other), _scatter(fitted.undo(other, samples.camera)))
+
+
+def stable_colors(color: np.ndarray) -> np.ndarray:
+    """color (S, K, 3) of the half of the triangles with the least relative change of color, NaN for the others.
+
+    Lids, lips and whatever the mesh does not follow change ten times as much as cameras differ.
+    """
+    mean = _mean(color)
+    change = ((color - mean) / (mean + RELATIVE_CHANGE_BIAS_LEVELS)) ** 2
+    seen = ~np.isnan(color[..., 0])
+    count = seen.sum(0)
+    scatter = np.where(seen[..., None], change, 0).sum((0, 2)) / (3 * np.maximum(count, 1))
+    judged = count >= MIN_SAMPLES_PER_TRIANGLE
+    limit = np.median(scatter[judged]) if judged.any() else -1.0
+    return np.where((judged & (scatter <= limit))[:, None], color, np.nan)
+
+
+def _scatter(color: np.ndarray) -> np.ndarray:
+    """Deviations from each triangle's mean of color (S, K, 3), where known."""
+    away = color - _mean(color)
+    return np.asarray(away[~np.isnan(away)])
+
+
+def linear_evidence(
+    color: np.ndarray,
+    features: np.ndarray,
+    group: np.ndarray,
+    max_error: float = np.inf,
+    rest: np.ndarray | None = None,
+) -> Evidence:
+    """Whether each triangle's color follows its features linearly, by cross-validation over groups of views.
+
+    color (S, K, 3), NaN where not seen; features (S, K, D); group (S,): views that are held out together; errors of
+    more than `max_error` times the median are clipped to that; rest (K, D): features of views that are held out are
+    clipped to the range, with its margin, of those that the model was fitted to, as an avatar's strain is.
+    """
+    before, after = [], []
+    fold = np.searchsorted(np.unique(group), group) % min(FOLDS, len(np.unique(group)))
+    for number in np.unique(fold):
+        held = fold == number
+        mean, center, slope = _ridge(color[~held], features[~held])
+        error, given = color[held] - mean, features[held]
+        if rest is not None:
+            lowest, highest = range_with_margin(rest, features[~held]).swapaxes(0, 1)
+            given = np.clip(given, lowest, highest)
+        predicted = np.einsum("skd,kdc->skc", given - center, slope)
+        known = ~np.isnan(error)
+        before.append(error[known])
+        after.append((error - predicted)[known])
+    errors = np.abs(np.concatenate(before)), np.abs(np.concatenate(after))
+    limit = max_error * float(np.median(errors[0])) if np.isfinite(max_error) and errors[0].size else np.inf
+    return compare(np.minimum(errors[0], limit), np.minimum(errors[1], limit))
+
+
+def _ridge(color: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Per triangle mean color (K, 3), mean features (K, D) and slopes (K, D, 3); NaN mean where there is no sample."""
+    seen = ~np.isnan(color[..., :1])
+    count = seen.sum(0)
+    with np.errstate(invalid="ignore"):
+        mean = np.where(seen, color, 0).sum(0) / np.where(count, count, np.nan)
+        center = np.where(seen, features, 0).sum(0) / np.maximum(count, 1)
+    x, y = np.where(seen, features - center, 0), np.where(seen, color - mean, 0)
+    inner = np.einsum("skd,ske->kde", x, x)
+    weight = RIDGE_WEIGHT * np.einsum("kdd->", inner) / max(float(count.sum()) * x.shape[2], 1.0)
+    inner += max(weight, 1e-12) * np.eye(x.shape[2])
+    return mean, center, np.linalg.solve(inner, np.einsum("skd,skc->kdc", x, y))
+
+
+def _mean(color: np.ndarray) -> np.ndarray:
+    """Mean (K, 3) over the samples (S, K, 3) that are known; NaN where none is."""
+    known = ~np.isnan(color)
+    count = known.sum(0)
+    return np.asarray(np.where(known, color, 0).sum(0) / np.where(count > 0, count, np.nan))

@@ -1,0 +1,171 @@
+"""Measurements of a capture that the rules of effects ask for, each made once and only if asked."""
+
+from dataclasses import replace
+from functools import cache, cached_property
+
+import numpy as np
+
+from ...avatar.strain import STRAIN_GAIN, color_range, rest_strain
+from ...capture.model import Capture, evenly_spread
+from ...flame.forward import FlameFrame
+from ...flame.sequence import joint_angles
+from ...flame.teeth import LOWER_LIP, TEETH_VERTICES, TEMPLATE_VERTICES, UPPER_LIP
+from ...selection import select_capture
+from ..settings import TrainingSettings
+from .evidence import CameraColors, Evidence, camera_evidence, fit_cameras, linear_evidence, stable_colors
+from .samples import Samples, take_samples
+
+MAX_TIMESTEPS = 64
+"""Timesteps that are posed to measure motion, evenly spread."""
+MAX_VIEW_ERROR_RATIO = 4.0
+"""Errors above this multiple of the median come from lids, lips and teeth, not from the direction of view."""
+
+
+class CaptureFacts:
+    """A capture with training views, and the settings it is to be trained with."""
+
+    def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:
+        """device: one of `choose_device`."""
+        self.capture, self.settings, self.device = capture, settings, device
+        self.views = capture.views["train"]
+
+    @cached_property
+    def samples(self) -> Samples:
+        return take_samples(self.capture)
+
+    @cached_property
+    def cameras(self) -> int:
+        """How many cameras there are to train on."""
+        return len({view.camera_index for view in self.views})
+
+    @cached_property
+    def timesteps(self) -> int:
+        """How many timesteps there are to train on."""
+        return len({view.timestep for view in self.views})
+
+    @cached_property
+    def stable_colors(self) -> np.ndarray:
+        """(S, K, 3) sampled colors of the triangles that change little."""
+        return stable_colors(self.samples.color.astype(np.float64))
+
+    @cached_property
+    def camera_colors(self) -> CameraColors:
+        return fit_cameras(self.samples, self.stable_colors)
+
+    @cached_property
+    def matched_colors(self) -> np.ndarray:
+        """(S, K, 3) sampled colors without the differences between cameras."""
+        return self.camera_colors.undo(self.samples.color.astype(np.float64), self.samples.camera)
+
+    @cached_property
+    def camera_difference(self) -> Evidence:
+        return camera_evidence(self.samples, self.stable_colors)
+
+    @cached_property
+    def view_dependence(self) -> Evidence:
+        """Errors are clipped, so that motion that the mesh does not follow counts little."""
+        each = np.arange(len(self.samples.camera))
+        return linear_evidence(self.matched_colors, self.samples.direction, each, MAX_VIEW_ERROR_RATIO)
+
+    @cached_property
+    def strain_dependence(self) -> Evidence:
+        """In timesteps that are left out, as in unseen expressions."""
+        return self._strain_evidence(self.samples.timestep)
+
+    @cached_property
+    def strain_dependence_known(self) -> Evidence | None:
+        """In cameras that are left out, as in other views of known expressions; None with a single one."""
+        return self._strain_evidence(self.samples.camera) if self.cameras > 1 else None
+
+    @cached_property
+    def nearby_dependence(self) -> Evidence:
+        """As `strain_dependence`, on the strain around a triangle: what moves over it changes its color as well."""
+        return self._nearby_evidence(self.samples.timestep)
+
+    @cached_property
+    def nearby_dependence_known(self) -> Evidence | None:
+        """As `strain_dependence_known`, on the strain around a triangle."""
+        return self._nearby_evidence(self.samples.camera) if self.cameras > 1 else None
+
+    def _strain_evidence(self, group: np.ndarray) -> Evidence:
+        """Within the range of strain that a training on the views that are not left out would write."""
+        rest = rest_strain(color_range(len(self.samples.faces)))
+        return linear_evidence(self.matched_colors, self.samples.strain, group, rest=rest)
+
+    def _nearby_evidence(self, group: np.ndarray) -> Evidence:
+        nearby = self.samples.nearby
+        return linear_evidence(self.matched_colors, nearby, group, rest=np.zeros_like(nearby[0]))
+
+    @cached_property
+    def pixel_range(self) -> float:
+        """Width of the widest pixel at the head over that of the narrowest, among the sampled views that show it."""
+        widths = self.samples.pixel_width[~np.isnan(self.samples.pixel_width)]
+        return float(widths.max() / widths.min()) if len(widths) else 1.0
+
+    def pixels_per_splat(self, percentile: float) -> float:
+        """Percentile over the visible triangles, at the trained image size; 0 where none is visible."""
+        lattice = self.settings.lattice
+        pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
+        return float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2) if len(pixels) else 0.0
+
+    @cached_property
+    def uncovered(self) -> float:
+        """Share of the foreground that the mesh does not cover; NaN without masks."""
+        return float(self.samples.uncovered.sum() / max(self.samples.foreground.sum(), 1))
+
+    @cached_property
+    def outside(self) -> float:
+        """Share of the mesh outside of the foreground by two pixels or more; NaN without masks."""
+        return float(self.samples.outside.sum() / max(self.samples.mesh.sum(), 1))
+
+    @cached_property
+    def sampled_timesteps(self) -> tuple[int, ...]:
+        """At most MAX_TIMESTEPS of the tracked timesteps, evenly spread."""
+        return tuple(evenly_spread(self.capture.timesteps, MAX_TIMESTEPS))
+
+    @cached_property
+    def sampled(self) -> Capture:
+        """The capture at the sampled timesteps only; meshes of a head with teeth are kept, for its lips."""
+        pose = self.capture.expression_mesh
+        return replace(
+            self.capture,
+            timesteps=self.sampled_timesteps,
+            expression_mesh=cache(pose) if self.has_teeth else pose,
+        )
+
+    @cached_property
+    def selected_share(self) -> float:
+        """Mean share of the triangles that the settings' rule selects in a sampled timestep."""
+        chosen = select_capture(self.sampled, self.settings.selection)
+        return float(np.mean([faces.mean() for faces in chosen.values()]))
+
+    @cached_property
+    def strain(self) -> float:
+        """Root mean square change of the triangles' stretch over time, as a share of their size."""
+        strain = self.samples.strain
+        return float(np.sqrt(((strain - strain.mean(0)) ** 2).mean())) / STRAIN_GAIN
+
+    @cached_property
+    def frames(self) -> list[FlameFrame]:
+        """FLAME's parameters in the sampled timesteps; none for other captures."""
+        sequence = self.capture.flame
+        return [] if sequence is None else [sequence.frame(timestep) for timestep in self.sampled_timesteps]
+
+    def joint_angle(self, *joints: int) -> float:
+        """Largest angle in degrees by which one of these FLAME joints turns."""
+        return float(joint_angles(self.frames)[list(joints)].max())
+
+    @cached_property
+    def lip_gap_mm(self) -> float:
+        """How far the lips part at most, beyond their distance in the neutral mesh."""
+        upper, lower, zero_pose = list(UPPER_LIP), list(LOWER_LIP), self.settings.selection.zero_pose
+        posed = (self.sampled.expression_mesh(timestep, zero_pose) for timestep in self.sampled_timesteps)
+        meshes = [self.capture.neutral, *posed]
+        gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
+        return 1000 * (max(gaps) - gaps[0])
+
+    @property
+    def has_teeth(self) -> bool:
+        """Whether the mesh has the rows of teeth that are added to FLAME's."""
+        flame = self.capture.flame
+        return flame is not None and len(flame.model.v_template) == TEMPLATE_VERTICES + TEETH_VERTICES

@@ -1,0 +1,291 @@
+"""Rules that decide a run's effects from measurements of its capture."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...flame.sequence import MIN_JOINT_ANGLE_DEG
+from ...tracking.folder import is_tracked
+from .evidence import Evidence
+from .facts import CaptureFacts
+
+MIN_CAMERAS_FOR_VIEW_COLOR = 4
+"""With fewer, view-dependent color is not constrained between the cameras."""
+MIN_VIEW_DEPENDENCE_LEVELS = 1.0
+"""Gain in levels of 255 from which color depends on the direction of view."""
+MIN_CAMERA_DIFFERENCE_LEVELS = 1.5
+"""Gain in levels of 255 from which differences between cameras are corrected."""
+MIN_STRAIN_DEPENDENCE_LEVELS = 1.0
+"""Gain in levels of 255, in frames and in cameras that are left out, from which splats follow deformation."""
+MIN_STRETCH = 1e-6
+"""Share of a triangle's size; less is rounding."""
+MAX_PIXEL_WIDTH_RATIO = 1.25
+"""Widest pixel at the head over the narrowest; above it, splats narrower than a pixel look different to each camera."""
+FINE_SPLAT_PIXELS = 4.0
+"""Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
+MAX_BACKGROUND_SPREAD_LEVELS = 6.0
+"""Root mean square deviation of a uniform background, in levels of 255."""
+BACKGROUND_TOLERANCE_LEVELS = 3.0
+"""Largest difference, in levels of 255, between the background and the color in the settings."""
+MIN_UNCOVERED_SHARE = 0.003
+"""Share of the foreground that the mesh does not cover, from which splats are added for it."""
+MIN_PIXELS_PER_SPLAT = 0.5
+"""90th percentile over triangles, below which further splats have no detail to show."""
+MIN_LIP_GAP_MM, MIN_JAW_ANGLE_DEG = 1.5, 3.0
+"""Teeth are visible when the lips part, or the jaw opens, by more than this."""
+MAX_OUTSIDE_SHARE = 0.001
+"""Share of the mesh outside of the masks above which the tracking is inaccurate."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a rule decided.
+
+    on       whether the capture calls for the effect
+    reason   a clause with the figure that decided
+    only     no other choice can work: an override is refused with the reason
+    changes  further settings for when the effect is on
+    """
+
+    on: bool
+    reason: str
+    only: bool = False
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect: its name, its cost while it is on, its rule, and the settings that switch it.
+
+    rule     returns None where the effect does not apply to the capture
+    on, off  changes to `TrainingSettings`
+    """
+
+    name: str
+    cost: str
+    rule: Callable[[CaptureFacts], Verdict | None]
+    on: Mapping[str, Any] = field(default_factory=dict)
+    off: Mapping[str, Any] = field(default_factory=dict)
+
+
+def view_color(facts: CaptureFacts) -> Verdict:
+    if facts.cameras == 1:
+        return Verdict(False, "a single camera sees everything from one direction", only=True)
+    if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
+        return Verdict(False, f"{facts.cameras} cameras are too few to tell how color depends on the view")
+    found = facts.view_dependence
+    reason = f"colors depend on the view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
+    return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
+
+
+def exposure(facts: CaptureFacts) -> Verdict:
+    if facts.cameras == 1:
+        return Verdict(False, "a single camera has no other to differ from", only=True)
+    found, colors = facts.camera_difference, facts.camera_colors
+    rows = tuple(
+        (float(camera), *gain, *offset)
+        for camera, gain, offset in zip(colors.camera, colors.gain.tolist(), colors.offset.tolist(), strict=True)
+    )
+    reason = f"{facts.cameras} cameras show the same colors {found.gain:.1f} of 255 levels apart"
+    return Verdict(found.gain >= MIN_CAMERA_DIFFERENCE_LEVELS, reason, changes={"exposure": rows})
+
+
+def antialiasing(facts: CaptureFacts) -> Verdict:
+    settings, widest = facts.settings, facts.pixel_range
+    if settings.scale < 1 or settings.coarse_share > 0:
+        return Verdict(True, "images are trained at a smaller size than they are rendered at")
+    if widest > MAX_PIXEL_WIDTH_RATIO:
+        return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
+    pixels = facts.pixels_per_splat(50)
+    reason = f"pixels have the same width at the head, and half of the splats cover less than {pixels:.1f}"
+    return Verdict(pixels < FINE_SPLAT_PIXELS, reason)
+
+
+def background(facts: CaptureFacts) -> Verdict:
+    samples = facts.samples
+    backgrounds = samples.background
+    if np.isnan(backgrounds).any():
+        return Verdict(False, "not every image has a mask or transparency that shows where the head ends", only=True)
+    color, spread = backgrounds.mean(0), float(samples.background_spread.max())
+    spread = max(spread, float(abs(backgrounds - color).max()))
+    if spread > MAX_BACKGROUND_SPREAD_LEVELS:
+        return Verdict(False, f"behind the head the images vary by {spread:.0f} of 255 levels", only=True)
+    named = bool(abs(color - 255 * np.array(facts.settings.background)).max() < BACKGROUND_TOLERANCE_LEVELS)
+    changes = {} if named else {"background": tuple((color / 255).round(4).tolist())}
+    red, green, blue = color.round().astype(int).tolist()
+    return Verdict(
+        True, f"every image has a mask, and one color behind the head ({red}, {green}, {blue})", changes=changes
+    )
+
+
+def hull_points(facts: CaptureFacts) -> Verdict:
+    if np.isnan(facts.uncovered):
+        return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
+    reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
+    if facts.cameras == 1:
+        reason += "; a single camera does not show how far away, so that it becomes a flat layer"
+    return Verdict(facts.uncovered > MIN_UNCOVERED_SHARE, reason)
+
+
+def depth_limits(facts: CaptureFacts) -> Verdict:
+    if facts.cameras > 1:
+        return Verdict(False, f"{facts.cameras} cameras show how far away a splat is")
+    return Verdict(True, "a single camera does not show how far in front of or behind the mesh a splat is")
+
+
+def density(facts: CaptureFacts) -> Verdict:
+    pixels = facts.pixels_per_splat(90)
+    return Verdict(pixels > MIN_PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
+
+
+def selection(facts: CaptureFacts) -> Verdict:
+    threshold = 1000 * facts.settings.selection.threshold
+    if facts.selected_share == 0:
+        count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
+        reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
+        return Verdict(False, reason, only=count == total)
+    reason = f"a frame moves {facts.selected_share:.0%} of the triangles by more than {threshold:g} mm"
+    asked = facts.settings.strategy == "selective"
+    return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
+
+
+def strain_color(facts: CaptureFacts) -> Verdict:
+    return _undeformed(facts, "color follows") or _dependent(
+        "colors depend on deformation", facts.strain_dependence, facts.strain_dependence_known
+    )
+
+
+def strain_position(facts: CaptureFacts) -> Verdict:
+    return _undeformed(facts, "positions follow") or _dependent(
+        "triangles' colors depend on deformation around them", facts.nearby_dependence, facts.nearby_dependence_known
+    )
+
+
+def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
+    """The verdict where nothing can be learned from how the mesh deforms."""
+    if facts.strain < MIN_STRETCH:
+        return Verdict(False, "the mesh has the same shape in every training frame", only=True)
+    if facts.timesteps < 3:
+        return Verdict(False, f"{facts.timesteps} frames are too few to tell how {follows} deformation")
+    return None
+
+
+def _dependent(what: str, unseen: Evidence, known: Evidence | None) -> Verdict:
+    """On where the evidence in frames that were left out is enough, and that in cameras that were, if there is any."""
+    reason, gain = f"{what} by {unseen.gain:.1f} of 255 levels ({unseen.share:.1%} of the variance)", unseen.gain
+    if known is not None:
+        reason += f" in frames that were left out, and by {known.gain:.1f} in cameras that were"
+        gain = min(gain, known.gain)
+    return Verdict(gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
+
+
+def teeth(facts: CaptureFacts) -> Verdict | None:
+    if not facts.has_teeth:
+        return None
+    jaw, lips = facts.joint_angle(2), facts.lip_gap_mm
+    reason = f"the jaw opens by {jaw:.0f}°, the lips by {lips:.1f} mm"
+    return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
+
+
+def joint(name: str, *joints: int) -> Effect:
+    """Bones of Blender's rig that move, and the shape keys that correct the mesh where they do."""
+
+    def rule(facts: CaptureFacts) -> Verdict | None:
+        if not facts.frames:
+            return None
+        turn = facts.joint_angle(*joints)
+        return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
+
+    return Effect(name, f"{9 * len(joints)} shape keys and drivers in Blender", rule)
+
+
+def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    count = sum(frame.dynamic_offset is not None for frame in facts.frames)
+    if not count:
+        return Verdict(False, "no frame has any", only=True)
+    return Verdict(True, f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them", only=True)
+
+
+def tracking(facts: CaptureFacts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    if facts.device != "cpu":
+        return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", only=True)
+    if facts.timesteps == 1:
+        return Verdict(False, "the splats of a single frame follow its images without it", only=True)
+    if is_tracked(facts.capture.root):
+        return Verdict(True, "the capture is from `stga track`: splats see motion more sharply than landmarks do")
+    if np.isnan(facts.outside):
+        return Verdict(False, "without masks, the mesh cannot be compared with the images")
+    return Verdict(facts.outside > MAX_OUTSIDE_SHARE, f"{facts.outside:.2%} of the mesh sticks out of the masks")
+
+
+EFFECTS = (
+    Effect(
+        "view-color",
+        "3, 8 or 15 coefficients more a splat and channel",
+        view_color,
+        off={"sh_degree": 0, "sh_steps": ()},
+    ),
+    Effect("exposure", "a pass over each image when it is read", exposure),
+    Effect("antialiasing", "a root a splat", antialiasing, on={"antialiased": True}, off={"antialiased": False}),
+    Effect(
+        "background",
+        "a pass over the image in every iteration",
+        background,
+        on={"random_background": True},
+        off={"random_background": False},
+    ),
+    Effect(
+        "hull-points",
+        "a splat for every 4 mm beside the mesh",
+        hull_points,
+        on={"hull_points": True},
+        off={"hull_points": False},
+    ),
+    Effect(
+        "depth-limits",
+        "none: splats are smaller and nearer to their triangles",
+        depth_limits,
+        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03},
+    ),
+    Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
+    Effect(
+        "selection",
+        "none: local iterations are cheaper than global ones",
+        selection,
+        on={"strategy": "selective"},
+        off={"strategy": "global"},
+    ),
+    Effect(
+        "strain-color",
+        "3 coefficients more a splat and channel, and the strain of every frame",
+        strain_color,
+        on={"strain_color": True},
+        off={"strain_color": False},
+    ),
+    Effect(
+        "strain-position",
+        "9 coefficients a triangle, and the strain of every frame",
+        strain_position,
+        on={"strain_position": True},
+        off={"strain_position": False},
+    ),
+    Effect("teeth", "splats on 168 triangles", teeth, on={"teeth": True}, off={"teeth": False}),
+    joint("neck", 1),
+    joint("jaw", 2),
+    joint("eyes", 3, 4),
+    Effect("dynamic-offsets", "a mesh a frame beside the parameters", dynamic_offsets),
+    Effect(
+        "tracking",
+        "a pass through FLAME and back in every global iteration; the run's tracking.npz is then the head's motion",
+        tracking,
+        on={"tracking": True},
+        off={"tracking": False},
+    ),
+)
+"""In display order."""

@@ -1,0 +1,211 @@
+"""Refinement of the tracked FLAME parameters while the splats are trained."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...avatar.embedding import FaceFrames
+from ...capture.flame_capture import with_sequence
+from ...capture.model import Capture
+from ...errors import StgaError
+from ...files import read_npz, write_npz
+from ...flame.forward import FlameFrame
+from ...flame.forward_torch import flame_forward, flame_tensors
+from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion, sequence_mesh, with_identity
+from ...raster.cpu.layout import Parameters
+from ..effects.decisions import TRACKING
+
+REFINEMENT_START_SHARE = 0.15
+"""Share of the budget before the first step: gradients of untrained splats carry no information."""
+FINAL_RATE_FACTOR = 0.1
+"""Learning rates at the end of the budget, as a share of those at the start."""
+EXPRESSION_RATE, JOINT_RATE_RAD, TRANSLATION_RATE_M = 1e-2, 2e-3, 2e-4
+"""Adam's initial learning rates. GaussianAvatars' 1e-3, 1e-5 and 1e-6 are meant for 600,000 iterations; here, a
+timestep is visited a few dozen times."""
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+DECAY_PER_STEP = 0.03
+"""Decay towards the tracked values with each step at full rate, for parameters that no image determines."""
+POSE_SIZE, TRANSLATION_SIZE = 15, 3
+"""The last numbers of a timestep: axis-angles of five joints, and the translation. Expression comes first."""
+CACHED_TIMESTEPS = 12
+"""FLAME frames kept in memory, with their dynamic offsets."""
+
+
+@dataclass
+class RefinementState:
+    """State of T timesteps with P parameters each, in FLAME's units, float64; part of a checkpoint.
+
+    change  (T, P) added to the tracked parameters
+    first   (T, P) Adam's first moment
+    second  (P,) Adam's second moment, shared because most timesteps are visited too rarely to estimate their own
+    steps   (T,) int64
+    """
+
+    change: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    steps: np.ndarray
+
+
+class Tracking:
+    """The FLAME parameters of a sequence, of which some timesteps are refined.
+
+    tracked  (T, P) the tracker's parameters
+    trained  (T,) bool timesteps that are refined
+    """
+
+    def __init__(self, sequence: FlameSequence, timesteps: Collection[int]) -> None:
+        """timesteps: which ones to refine."""
+        self.sequence = sequence
+        self.tracked = np.stack([parameters_of(sequence.frame(timestep)) for timestep in sequence.timesteps])
+        self.trained = np.isin(sequence.timesteps, list(timesteps))
+        zero = np.zeros_like(self.tracked)
+        self.state = RefinementState(zero, zero.copy(), zero[0].copy(), np.zeros(len(zero), np.int64))
+        expressions = self.tracked.shape[1] - POSE_SIZE - TRANSLATION_SIZE
+        self._rates = np.repeat(
+            (EXPRESSION_RATE, JOINT_RATE_RAD, TRANSLATION_RATE_M), (expressions, POSE_SIZE, TRANSLATION_SIZE)
+        )
+        self._row = {timestep: row for row, timestep in enumerate(sequence.timesteps)}
+        self._source = lru_cache(CACHED_TIMESTEPS)(sequence.frame)
+        self._person = replace(with_identity(sequence), frame=self.frame)
+        self._flame = flame_tensors(self._person.model)
+
+    def refines(self, timestep: int) -> bool:
+        return timestep in self._row and bool(self.trained[self._row[timestep]])
+
+    def parameters(self) -> np.ndarray:
+        """(T, P) refined parameters.
+
+        The mean change of all refined timesteps is removed: the splats' local positions can express it as well, and
+        timesteps that are not refined would not follow it.
+        """
+        mean = self.state.change[self.trained].mean(0)
+        return np.asarray(self.tracked + np.where(self.trained[:, None], self.state.change - mean, 0.0))
+
+    def frame(self, timestep: int) -> FlameFrame:
+        return with_parameters(self._source(timestep), self.parameters()[self._row[timestep]])
+
+    def mesh(self, timestep: int) -> np.ndarray:
+        """Refined mesh (V, 3) of the timestep, in meters."""
+        return sequence_mesh(self._person, timestep)
+
+    def step(self, timestep: int, vertex_gradient: np.ndarray, share: float) -> None:
+        """Adam step of the timestep's parameters, at a share of the learning rates.
+
+        vertex_gradient (V, 3): of the loss, with respect to the timestep's vertices.
+        """
+        row, state = self._row[timestep], self.state
+        gradient = self.gradient(timestep, vertex_gradient)
+        state.steps[row] += 1
+        state.first[row] += (1 - BETA1) * (gradient - state.first[row])
+        state.second += (1 - BETA2) * (gradient**2 - state.second)
+        first = state.first[row] / (1 - BETA1 ** int(state.steps[row]))
+        second = state.second / (1 - BETA2 ** int(state.steps.sum()))
+        step = self._rates * first / (np.sqrt(second) + EPSILON)
+        state.change[row] -= share * (step + DECAY_PER_STEP * state.change[row])
+
+    def gradient(self, timestep: int, vertex_gradient: np.ndarray) -> np.ndarray:
+        """(P,) gradient with respect to the timestep's parameters, from that with respect to its vertices (V, 3)."""
+        frame = self.frame(timestep)
+        parameters = torch.tensor(parameters_of(frame)[None], dtype=torch.float32, requires_grad=True)
+        expr, pose, translation = parameters.tensor_split([-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE], dim=1)
+        offset = None if frame.dynamic_offset is None else torch.tensor(frame.dynamic_offset, dtype=torch.float32)
+        no_shape = parameters.new_zeros(0)
+        vertices = flame_forward(self._flame, no_shape, expr, pose.reshape(1, -1, 3), translation, offset)
+        outer = torch.tensor(vertex_gradient[None], dtype=torch.float32)
+        (gradient,) = torch.autograd.grad(vertices, parameters, outer)
+        return gradient[0].numpy().astype(np.float64)
+
+
+def refinable_tracking(capture: Capture, convention: str) -> Tracking:
+    """The capture's FLAME parameters, refinable at the timesteps of its training views.
+
+    Raises StgaError if it has none, or for an embedding convention that `frame_backward` does not support.
+    """
+    if convention != "stga":
+        raise StgaError(f"--effect tracking=on: needs the embedding convention 'stga', got '{convention}'")
+    if capture.flame is None:
+        raise StgaError(
+            f"{capture.root}: is not tracked with FLAME, so --effect tracking=on cannot refine its parameters"
+        )
+    return Tracking(capture.flame, {view.timestep for view in capture.views["train"]})
+
+
+def refinement_rate(progress: float) -> float:
+    """Share of the learning rates at a share of the budget; 0 before REFINEMENT_START_SHARE."""
+    start = REFINEMENT_START_SHARE
+    return 0.0 if progress < start else FINAL_RATE_FACTOR ** min(1.0, (progress - start) / (1 - start))
+
+
+def frame_gradient(
+    splats: Parameters, face: np.ndarray, gradients: Parameters, rows: np.ndarray, frames: FaceFrames
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients of the face frames from those of their splats `rows` (M,), as `frame_backward` takes them.
+
+    Returns those of translation (F, 3), rotation (F, 3) and scale (F,). A frame translates, rotates and scales all its
+    splats alike, so each is a sum over its splats.
+    """
+    (x, y, z), (fx, fy, fz) = splats.xyz[rows].T, gradients.xyz[rows].T
+    (q0, q1, q2, q3), (v0, v1, v2, v3) = splats.rotation[rows].T, gradients.rotation[rows].T
+    rotation = (  # of position (cross product), plus of orientation (half of the quaternion's gradient)
+        y * fz - z * fy + (q0 * v1 - q1 * v0 + q2 * v3 - q3 * v2) / 2,
+        z * fx - x * fz + (q0 * v2 - q2 * v0 + q3 * v1 - q1 * v3) / 2,
+        x * fy - y * fx + (q0 * v3 - q3 * v0 + q1 * v2 - q2 * v1) / 2,
+    )
+    scale = x * fx + y * fy + z * fz + gradients.log_scale[rows].sum(1)
+    on, count = face[rows], len(frames.origin)
+    sums = [np.bincount(on, column, count) for column in (fx, fy, fz, *rotation, scale)]
+    return np.stack(sums[:3], -1) / frames.scale[:, None], np.stack(sums[3:6], -1), sums[6]
+
+
+def parameters_of(frame: FlameFrame) -> np.ndarray:
+    """(P,) parameters of a frame: expression, joints, translation."""
+    return np.concatenate([frame.expr, frame.pose.ravel(), frame.translation])
+
+
+def with_parameters(frame: FlameFrame, parameters: np.ndarray) -> FlameFrame:
+    """The frame with these parameters, laid out as by `parameters_of`."""
+    expr, pose, translation = np.split(parameters, [-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE])
+    rotation, neck, jaw, eyes = np.split(pose, [3, 6, 9])
+    return replace(
+        frame, expr=expr, rotation=rotation, neck_pose=neck, jaw_pose=jaw, eyes_pose=eyes, translation=translation
+    )
+
+
+def write_tracking(folder: Path, tracking: Tracking) -> None:
+    """Write a run folder's tracking.npz: the refined motion, for `read_motion`, and the tracked parameters."""
+    sequence = tracking.sequence
+    frame = with_parameters(sequence.frame(sequence.timesteps[0]), tracking.parameters().T)
+    arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
+    arrays["shape"] = sequence.shape
+    if sequence.static_offset is not None:
+        arrays["static_offset"] = sequence.static_offset
+    arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracking.tracked
+    write_npz(folder / TRACKING, arrays, compressed=True)
+
+
+def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
+    """The capture with the parameters that the run in `folder` refined; unchanged if it refined none.
+
+    A timestep is replaced only if the capture's tracked parameters are those that the run started from, so that
+    another capture stays unchanged. Raises StgaError if the run's file is damaged.
+    """
+    path, sequence = folder / TRACKING, capture.flame
+    if sequence is None or not path.exists():
+        return capture
+    motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
+    if len(tracked) != len(motion.timesteps):
+        raise StgaError(f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first")
+    before = dict(zip(motion.timesteps, tracked, strict=True))
+
+    def frame(timestep: int) -> FlameFrame:
+        found = sequence.frame(timestep)
+        if timestep not in before or not np.array_equal(parameters_of(found), before[timestep]):
+            return found
+        return replace(motion.frame(timestep), dynamic_offset=found.dynamic_offset)
+
+    return with_sequence(capture, replace(sequence, frame=frame))

@@ -1,0 +1,3 @@
+"""The small mesh with splats of `tests/avatar`."""
+
+from avatar.conftest import *  # noqa: F403

@@ -1,0 +1,196 @@
+"""The GaussianAvatars pair: its exact layout, the change of convention, and the way back."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from avatar.conftest import random_mesh, random_splats
+from scipy.spatial.transform import Rotation
+
+from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.splats import Splats
+from stga_addon.errors import StgaError
+from stga_addon.export.gaussian_avatars import in_convention, write_gaussian_avatars
+from stga_addon.export.ply import read_ply, read_vertices
+from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.model import FlameModel
+from stga_addon.flame.sequence import FlameSequence, neutral_mesh, read_motion, sequence_mesh
+
+VERTICES, IDENTITY, EXPRESSION = 20, 6, 4
+PLY_HEADER = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex 50\n"
+    + "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"))
+    + "".join(f"property float f_rest_{i}\n" for i in range(45))
+    + "property float opacity\n"
+    + "".join(f"property float scale_{i}\n" for i in range(3))
+    + "".join(f"property float rot_{i}\n" for i in range(4))
+    + "property float binding_0\nend_header\n"
+)
+
+
+@pytest.fixture
+def sequence() -> FlameSequence:
+    """A model of twenty vertices that moves; timesteps with a gap, a dynamic offset in one of them."""
+    rng = np.random.default_rng(5)
+    template, faces = random_mesh(5, VERTICES)
+    model = FlameModel(
+        v_template=template,
+        shapedirs=rng.normal(size=(VERTICES, 3, IDENTITY + EXPRESSION)) * 0.01,
+        n_identity=IDENTITY,
+        posedirs=rng.normal(size=(VERTICES, 3, 36)) * 0.001,
+        j_regressor=np.full((5, VERTICES), 1 / VERTICES),
+        parents=np.array([-1, 0, 1, 1, 1]),
+        weights=rng.dirichlet(np.ones(5), VERTICES),
+        faces=faces,
+    )
+
+    def float32(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape).astype(np.float32).astype(np.float64) * 0.25
+
+    frames = {
+        timestep: FlameFrame(float32(EXPRESSION), float32(3), float32(3), float32(3), float32(3), float32(6))
+        for timestep in (0, 2, 5)
+    }
+    frames[2] = replace(frames[2], dynamic_offset=float32(VERTICES, 3))
+    return FlameSequence(model, float32(IDENTITY), float32(VERTICES, 3), (0, 2, 5), frames.__getitem__)
+
+
+def avatar_on(sequence: FlameSequence, convention: str) -> Avatar:
+    neutral, faces = neutral_mesh(sequence).astype(np.float32), sequence.model.faces
+    splats = random_splats(6, 50, len(faces), sh_degree=3)
+    return Avatar(replace(splats, unbound=np.zeros(50, bool)), convention, neutral, faces)
+
+
+def test_ply_has_exactly_the_layouts_properties(tmp_path, sequence):
+    """Catches an extra or misplaced property: the viewer counts them by prefix."""
+    avatar = avatar_on(sequence, "gaussian_avatars")
+    write_gaussian_avatars(tmp_path / "out", avatar, sequence)
+    content = (tmp_path / "out" / "point_cloud.ply").read_bytes()
+    assert content.startswith(PLY_HEADER.encode())
+    rows = np.frombuffer(content[len(PLY_HEADER) :], "<f4").reshape(50, 63)
+    np.testing.assert_array_equal(rows[:, 62], avatar.splats.face)
+    np.testing.assert_array_equal(rows[:, :3], avatar.splats.xyz)
+    np.testing.assert_array_equal(rows[:, 9 + 15 + 2], avatar.splats.sh[:, 3, 1])
+    np.testing.assert_array_equal(rows[:, 58:62], avatar.splats.rotation)
+
+
+def test_motion_holds_every_array_the_viewer_asks_for(tmp_path, sequence):
+    """Catches a missing dynamic offset, float64, or timesteps out of order."""
+    write_gaussian_avatars(tmp_path, avatar_on(sequence, "stga"), sequence)
+    with np.load(tmp_path / "flame_param.npz", allow_pickle=False) as data:
+        arrays = dict(data)
+    assert {name: array.shape for name, array in arrays.items()} == {
+        "shape": (IDENTITY,),
+        "expr": (3, EXPRESSION),
+        **dict.fromkeys(("rotation", "neck_pose", "jaw_pose", "translation"), (3, 3)),
+        "eyes_pose": (3, 6),
+        "static_offset": (VERTICES, 3),
+        "dynamic_offset": (3, VERTICES, 3),
+    }
+    assert {array.dtype for array in arrays.values()} == {np.dtype("float32")}
+    np.testing.assert_array_equal(arrays["jaw_pose"][2], sequence.frame(5).jaw_pose)
+    np.testing.assert_array_equal(arrays["dynamic_offset"][1], sequence.frame(2).dynamic_offset)
+    assert not arrays["dynamic_offset"][[0, 2]].any()
+
+
+def test_sequence_without_offsets_writes_zeros(tmp_path, sequence):
+    """Catches None turned into an object array."""
+    bare = replace(sequence, static_offset=None)
+    write_gaussian_avatars(tmp_path, avatar_on(bare, "stga"), bare)
+    with np.load(tmp_path / "flame_param.npz", allow_pickle=False) as data:
+        assert data["static_offset"].shape == (VERTICES, 3)
+        assert not data["static_offset"].any()
+
+
+def bound_splats(path: Path) -> Splats:
+    """Splats in the "gaussian_avatars" convention, with the triangles that the property binding_0 names."""
+    return replace(read_ply(path), face=read_vertices(path)["binding_0"].astype(np.int32))
+
+
+def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
+    """Catches a motion or binding that has changed on the way: every frame's world splats must be the same."""
+    avatar = avatar_on(sequence, "gaussian_avatars")
+    write_gaussian_avatars(tmp_path, avatar, sequence)
+    splats = bound_splats(tmp_path / "point_cloud.ply")
+    motion = read_motion(tmp_path / "flame_param.npz", sequence.model)
+    for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
+        np.testing.assert_array_equal(getattr(splats, name), getattr(avatar.splats, name), err_msg=name)
+        assert getattr(splats, name).dtype == getattr(avatar.splats, name).dtype
+    for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):
+        np.testing.assert_allclose(sequence_mesh(motion, mine), sequence_mesh(sequence, timestep), atol=1e-12)
+
+
+def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) and covariance (3, 3) of one splat on its triangle (3, 3), by GaussianAvatars' definition."""
+    p, q, r = corners
+    first = (q - p) / np.linalg.norm(q - p)
+    normal = np.cross(q - p, r - p)
+    normal = normal / np.linalg.norm(normal)
+    third = np.cross(first, normal)
+    size = (np.linalg.norm(q - p) + abs(third @ (r - p))) / 2
+    turn = np.column_stack([first, normal, third])
+    local = Rotation.from_quat(row["rotation"][[1, 2, 3, 0]]).as_matrix() * np.exp(row["log_scale"])
+    axes = size * turn @ local
+    return turn @ row["xyz"] * size + (p + q + r) / 3, axes @ axes.T
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
+    """Catches a pair that leaves out what strain color adds at rest: the least compression that it follows is not 0."""
+    avatar = avatar_on(sequence, convention)
+    strain_color = np.random.default_rng(1).normal(0, 0.2, (50, 3, 3)).astype(np.float32)
+    limits = np.broadcast_to(np.array([[-1, -1, -1], [-0.2, -0.2, 1]], np.float32), (len(avatar.faces), 2, 3)).copy()
+    avatar = replace(avatar, splats=replace(avatar.splats, strain_color=strain_color), strain_range=limits)
+    write_gaussian_avatars(tmp_path, avatar, sequence)
+    written = bound_splats(tmp_path / "point_cloud.ply").sh
+    added = -0.2 * (strain_color[:, 0] + strain_color[:, 1]) / 0.28209479177387814
+    np.testing.assert_allclose(written[:, 0], avatar.splats.sh[:, 0] + added, atol=1e-5)
+    np.testing.assert_array_equal(written[:, 1:], avatar.splats.sh[:, 1:])
+
+
+def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence):
+    """Catches a conversion that is only approximately right, checked by the viewer's own arithmetic."""
+    avatar = avatar_on(sequence, "stga")
+    write_gaussian_avatars(tmp_path, avatar, sequence)
+    splats = bound_splats(tmp_path / "point_cloud.ply")
+    neutral = avatar.neutral.astype(np.float64)
+    world = to_world(avatar.splats, face_frames(neutral, avatar.faces, neutral, "stga"))
+    np.testing.assert_array_equal(splats.face, avatar.splats.face)
+    np.testing.assert_array_equal(splats.sh, avatar.splats.sh)
+    for i, face in enumerate(splats.face):
+        row = {name: getattr(splats, name)[i].astype(np.float64) for name in ("xyz", "rotation", "log_scale")}
+        position, covariance = viewer_world(row, neutral[avatar.faces[face]])
+        axes = Rotation.from_quat(world.rotation[i, [1, 2, 3, 0]]).as_matrix() * np.exp(world.log_scale[i])
+        np.testing.assert_allclose(position, world.xyz[i], atol=2e-6)
+        np.testing.assert_allclose(covariance, axes @ axes.T, atol=5e-6 * np.abs(covariance).max())
+
+
+def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence):
+    """Catches a detour through world coordinates, which costs digits where the head is meters away."""
+    avatar = avatar_on(sequence, "stga")
+    far = replace(avatar, neutral=avatar.neutral + np.float32(64))
+    there = replace(far, splats=in_convention(far, "gaussian_avatars"), convention="gaussian_avatars")
+    back = in_convention(there, "stga")
+    np.testing.assert_allclose(back.xyz, avatar.splats.xyz, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(back.log_scale, avatar.splats.log_scale, atol=1e-5)
+    assert in_convention(far, "stga") is far.splats
+
+
+def test_another_mesh_is_refused_before_anything_is_written(tmp_path, sequence):
+    """Catches splats bound to triangles that the motion does not have."""
+    avatar = avatar_on(sequence, "stga")
+    other = replace(avatar, faces=avatar.faces[::-1].copy())
+    with pytest.raises(StgaError, match="triangles"):
+        write_gaussian_avatars(tmp_path / "out", other, sequence)
+    assert not (tmp_path / "out").exists()
+
+
+def test_plain_reader_ignores_the_binding(tmp_path, sequence):
+    """Catches an extra property that confuses ordinary 3DGS readers."""
+    avatar = avatar_on(sequence, "gaussian_avatars")
+    write_gaussian_avatars(tmp_path, avatar, sequence)
+    plain = read_ply(tmp_path / "point_cloud.ply")
+    np.testing.assert_array_equal(plain.xyz, avatar.splats.xyz)
+    assert not plain.face.any()

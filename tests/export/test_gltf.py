@@ -1,0 +1,169 @@
+"""glTF: against the extension's specification, by trimesh, and by the loader of three.js where it is installed."""
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from avatar.conftest import random_splats, rendered
+
+from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.export.formats import export_avatar
+
+PREFIX = "KHR_gaussian_splatting:"
+SHAPES = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
+FLOAT, UNSIGNED_BYTE = 5126, 5121
+COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The document and the attributes of the only primitive; checks what glTF demands of the container."""
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    assert size % 4 == 0
+    document = json.loads(data[20 : 20 + size])
+    binary_size, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
+    assert kind == b"BIN\0"
+    assert binary_size % 4 == 0
+    assert binary_size == document["buffers"][0]["byteLength"] == len(data) - 28 - size
+    binary = data[28 + size :]
+    primitive = document["meshes"][0]["primitives"][0]
+    return document, {name: column(document, binary, i) for name, i in primitive["attributes"].items()}
+
+
+def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+    accessor = document["accessors"][index]
+    view = document["bufferViews"][accessor["bufferView"]]
+    width = COMPONENTS[accessor["type"]]
+    dtype = np.dtype({FLOAT: "<f4", UNSIGNED_BYTE: "u1"}[accessor["componentType"]])
+    assert view["byteOffset"] % 4 == 0
+    assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
+    return np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_keeps_the_specification(avatar, tmp_path, degree):
+    """Catches missing fields, partly defined degrees, wrong component types, and values out of their range."""
+    avatar.splats.__dict__.update(random_splats(1, 50, 30, degree).__dict__)
+    path = tmp_path / "a.glb"
+    assert export_avatar(path, avatar, "gltf", [(0, avatar.neutral)]) == [path]
+    document, attributes = parsed(path)
+    assert document["asset"]["version"] == "2.0"
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    primitive = document["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0
+    extension = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert extension == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    coefficients = {f"SH_DEGREE_{n}_COEF_{i}": "VEC3" for n in range(degree + 1) for i in range(2 * n + 1)}
+    expected = {PREFIX + name: kind for name, kind in (SHAPES | coefficients).items()}
+    assert set(attributes) == {"POSITION", "COLOR_0", *expected}
+    for name, kind in expected.items():
+        accessor = document["accessors"][primitive["attributes"][name]]
+        assert (accessor["type"], accessor["componentType"], accessor["count"]) == (kind, FLOAT, 50)
+    position = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(position["min"], attributes["POSITION"].min(axis=0))
+    np.testing.assert_array_equal(position["max"], attributes["POSITION"].max(axis=0))
+    np.testing.assert_allclose(np.linalg.norm(attributes[PREFIX + "ROTATION"], axis=1), 1, atol=1e-6)
+    assert attributes[PREFIX + "SCALE"].min() >= 0
+    assert 0 <= attributes[PREFIX + "OPACITY"].min() <= attributes[PREFIX + "OPACITY"].max() <= 1
+
+
+def test_renders_equal(avatar, tmp_path):
+    """Catches wrong quaternion order, activations, or coefficient order."""
+    export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
+    _, found = parsed(tmp_path / "a.glb")
+    opacity = found[PREFIX + "OPACITY"][:, 0].astype(np.float64)
+    names = [f"{PREFIX}SH_DEGREE_{n}_COEF_{i}" for n in range(4) for i in range(2 * n + 1)]
+    again = Splats(
+        xyz=found["POSITION"],
+        rotation=found[PREFIX + "ROTATION"][:, [3, 0, 1, 2]],
+        log_scale=np.log(found[PREFIX + "SCALE"]),
+        opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
+        sh=np.stack([found[name] for name in names], axis=1),
+        face=np.zeros(50, np.int32),
+        unbound=np.zeros(50, bool),
+    )
+    expected = to_world(avatar.splats, avatar.frames(avatar.neutral))
+    assert np.abs(rendered(again) - rendered(expected)).max() < 1e-4
+
+
+def test_points_where_the_extension_is_unknown(avatar, tmp_path):
+    """Catches a file that an ordinary reader of glTF refuses, and fallback colors that are not linear."""
+    export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
+    (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
+    expected = to_world(avatar.splats, avatar.frames(avatar.neutral))
+    np.testing.assert_array_equal(cloud.vertices, expected.xyz)
+    color = np.clip(0.5 + SH_C0 * expected.sh[:, 0], 0, 1)
+    display = np.asarray(cloud.colors)[:, :3] / 255
+    encoded = np.where(display <= 0.0031308, 12.92 * display, 1.055 * display ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(encoded, color, atol=0.03)  # 8 bits of linear light are coarse in the dark
+
+
+LOAD = """
+import { readFileSync } from 'node:fs';
+import { pathToFileURL } from 'node:url';
+const three = pathToFileURL(process.argv[2] + '/three/examples/jsm/loaders/').href;
+globalThis.self = globalThis;
+const { GLTFLoader } = await import(three + 'GLTFLoader.js');
+const { GLTFGaussianSplatLoaderExtension } = await import(three + 'GLTFGaussianSplatLoaderExtension.js');
+const loader = new GLTFLoader();
+loader.register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
+const file = readFileSync(process.argv[3]);
+const buffer = file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength);
+const gltf = await loader.parseAsync(buffer, '');
+const found = {};
+gltf.scene.traverse((object) => {
+  if (object.userData.gltfExtensions === undefined) return;
+  found.extension = object.userData.gltfExtensions.KHR_gaussian_splatting;
+  for (const [name, attribute] of Object.entries(object.splatGeometry.attributes))
+    found[name] = Array.from(attribute.array);
+});
+console.log(JSON.stringify(found));
+"""
+
+
+def test_three_reads_it(avatar, tmp_path):
+    """Catches a file that the loader of three.js refuses or understands otherwise."""
+    modules = Path(os.environ.get("STGA_NODE_MODULES", "node_modules"))
+    if shutil.which("node") is None or not (modules / "three").is_dir():
+        pytest.skip("node or three is missing: npm install three, and STGA_NODE_MODULES=…/node_modules")
+    export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
+    script = tmp_path / "load.mjs"
+    script.write_text(LOAD)
+    run = ["node", str(script), str(modules.absolute()), str(tmp_path / "a.glb")]
+    done = subprocess.run(run, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    world = to_world(avatar.splats, avatar.frames(avatar.neutral))
+    assert found["extension"]["kernel"] == "ellipse"
+    np.testing.assert_allclose(np.reshape(found["position"], (-1, 3)), world.xyz)
+    axes = quaternion_to_matrix(world.unit_rotations()) * world.scales()[:, None]
+    covariance = axes @ axes.transpose(0, 2, 1)
+    rows, columns = np.triu_indices(3)
+    np.testing.assert_allclose(np.reshape(found["covariance"], (-1, 6)), covariance[:, rows, columns], atol=1e-7)
+    np.testing.assert_allclose(np.reshape(found["color"], (-1, 4))[:, 3], world.opacities() * 255, atol=0.51)
+    assert "sphericalHarmonics3" in found
+
+
+def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of unit quaternions wxyz (N, 4)."""
+    w, x, y, z = q.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.array(rows).transpose(2, 0, 1)

@@ -1,0 +1,228 @@
+"""3DGS PLY files: what other programs wrote, what they will read, and what is broken."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from avatar.conftest import random_splats
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stga_addon.avatar.splats import Splats
+from stga_addon.errors import StgaError
+from stga_addon.export.ply import read_ply, write_ply
+
+ARRAYS = ("xyz", "rotation", "log_scale", "opacity", "sh")
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
+    splats = random_splats(0, count, 1, sh_degree)
+    return replace(splats, unbound=np.zeros(count, bool))
+
+
+def by_hand(kind: str, properties: dict[str, str], rows: list[dict[str, float]], before: str = "") -> bytes:
+    """A PLY file put together without the code under test; `before` is header text of an earlier element."""
+    lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë"] + ([before] if before else [])
+    lines += [f"element vertex {len(rows)}", *(f"property {t} {name}" for name, t in properties.items()), "end_header"]
+    codes = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
+    if kind == "ascii":
+        body = "".join(" ".join(repr(float(row[name])) for name in properties) + "\n" for row in rows).encode()
+    else:
+        order = "<" if "little" in kind else ">"
+        body = b"".join(
+            np.array(row[name], order + codes[t]).tobytes() for row in rows for name, t in properties.items()
+        )
+    return "\n".join([*lines, ""]).encode() + body
+
+
+def layout(rest: int) -> list[str]:
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
+    return names + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+
+
+def numbered_rows(names: list[str]) -> list[dict[str, float]]:
+    return [{name: i + 100 * row for i, name in enumerate(names)} for row in range(2)]
+
+
+def assert_same(splats: Splats, expected: Splats) -> None:
+    for name in (*ARRAYS, "face", "unbound"):
+        have, want = getattr(splats, name), getattr(expected, name)
+        assert have.dtype == want.dtype, name
+        np.testing.assert_array_equal(have, want, err_msg=name)
+
+
+def test_round_trip_is_exact(tmp_path):
+    """Catches any rounding, swap of columns or activation applied on the way."""
+    splats = world_splats()
+    write_ply(tmp_path / "a.ply", splats)
+    assert_same(read_ply(tmp_path / "a.ply"), splats)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2])
+def test_lower_degrees_are_padded_with_zeros(tmp_path, sh_degree):
+    """Catches padding at the wrong place, which moves green and blue coefficients into red."""
+    splats = world_splats(sh_degree=sh_degree)
+    write_ply(tmp_path / "a.ply", splats)
+    back = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(back.sh[:, : splats.sh.shape[1]], splats.sh)
+    assert not back.sh[:, splats.sh.shape[1] :].any()
+
+
+def test_real_file_is_rewritten_byte_for_byte(shared_data, tmp_path):
+    """Catches any departure from the layout that the original trainer writes."""
+    source = shared_data / "real_splats" / "train-1000.ply"
+    splats = read_ply(source)
+    assert len(splats) == 1000
+    assert splats.sh_degree == 3
+    write_ply(tmp_path / "again.ply", splats)
+    assert (tmp_path / "again.ply").read_bytes() == source.read_bytes()
+
+
+def test_file_is_the_standard_layout(tmp_path):
+    """Catches column order and channel-major f_rest, read back by plain arithmetic on the bytes."""
+    splats = world_splats(3)
+    write_ply(tmp_path / "a.ply", splats)
+    head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float")]
+    standard = ["x", "y", "z", "nx", "ny", "nz", *layout(45)[3:]]
+    assert names == standard
+    assert head.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n")
+    rows = np.frombuffer(body, "<f4").reshape(3, len(names))
+    column = {name: rows[:, i] for i, name in enumerate(names)}
+    for channel in range(3):
+        np.testing.assert_array_equal(column[f"f_dc_{channel}"], splats.sh[:, 0, channel])
+        for k in range(15):
+            np.testing.assert_array_equal(column[f"f_rest_{channel * 15 + k}"], splats.sh[:, 1 + k, channel])
+    np.testing.assert_array_equal(column["opacity"], splats.opacity)
+    np.testing.assert_array_equal(column["rot_0"], splats.rotation[:, 0])
+    np.testing.assert_array_equal(column["scale_2"], splats.log_scale[:, 2])
+    assert not any(column[name].any() for name in ("nx", "ny", "nz"))
+
+
+def test_trimesh_reads_the_positions(tmp_path):
+    """Catches a header that only our own reader understands."""
+    trimesh = pytest.importorskip("trimesh")
+    splats = world_splats()
+    write_ply(tmp_path / "a.ply", splats)
+    np.testing.assert_array_equal(np.float32(trimesh.load(tmp_path / "a.ply").vertices), splats.xyz)
+
+
+@pytest.mark.parametrize("rest", [0, 9, 24, 45])
+@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
+    """Catches a wrong split of f_rest into channels, byte order, and dependence on the properties' order."""
+    names = layout(rest)
+    rows = numbered_rows(names)
+    shuffled = np.random.default_rng(0).permutation([*names, "binding_0", "red"]).tolist()
+    kinds = {name: {"red": "uchar", "binding_0": "int", "x": "double"}.get(name, "float") for name in shuffled}
+    content = by_hand(kind, kinds, [row | {"binding_0": 7, "red": 255} for row in rows])
+    (tmp_path / "a.ply").write_bytes(content)
+    splats = read_ply(tmp_path / "a.ply")
+    per_channel = rest // 3
+    for i, row in enumerate(rows):
+        assert splats.xyz[i].tolist() == [row["x"], row["y"], row["z"]]
+        assert splats.rotation[i].tolist() == [row[f"rot_{k}"] for k in range(4)]
+        assert splats.opacity[i] == row["opacity"]
+        for channel in range(3):
+            expected = [row[f"f_dc_{channel}"]] + [
+                row[f"f_rest_{channel * per_channel + k}"] for k in range(per_channel)
+            ]
+            assert splats.sh[i, :, channel].tolist() == expected
+
+
+def test_elements_before_and_after_the_vertices_are_skipped(tmp_path):
+    """Catches reading vertices from the start of the data where another element comes first."""
+    names = layout(0)
+    before = "element camera 2\nproperty float a\nproperty uchar b"
+    content = by_hand("binary_little_endian", dict.fromkeys(names, "float"), numbered_rows(names), before)
+    head, mark, body = content.partition(b"end_header\n")
+    head += b"element face 1\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "a.ply").write_bytes(head + mark + b"\xff" * 10 + body + b"\x03" + bytes(12))
+    assert read_ply(tmp_path / "a.ply").xyz.tolist() == [[0, 1, 2], [100, 101, 102]]
+
+
+def test_windows_line_ends_are_read(tmp_path):
+    """Catches a data offset computed for \\n only."""
+    names = layout(0)
+    content = by_hand("binary_little_endian", dict.fromkeys(names, "float"), numbered_rows(names))
+    head, mark, body = content.partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes((head + mark).replace(b"\n", b"\r\n") + body)
+    assert read_ply(tmp_path / "a.ply").xyz.tolist() == [[0, 1, 2], [100, 101, 102]]
+
+
+def test_empty_set_round_trips(tmp_path):
+    """Catches special cases of N = 0."""
+    write_ply(tmp_path / "a.ply", world_splats(0))
+    assert len(read_ply(tmp_path / "a.ply")) == 0
+
+
+def head(body: str) -> bytes:
+    return f"ply\nformat binary_little_endian 1.0\n{body}end_header\n".encode()
+
+
+GOOD = "".join(f"property float {name}\n" for name in layout(0))
+
+
+def ascii_head(body: str) -> bytes:
+    return head(body).replace(b"binary_little_endian", b"ascii")
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"", "not a PLY file"),
+        (b"solid stl\nend_header\n", "not a PLY file"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n", "no complete header"),
+        (head("element vertex 1000000000000\n" + GOOD), "truncated"),
+        (head("element vertex 1\n" + GOOD) + bytes(55), "truncated"),
+        (head("element vertex -1\n" + GOOD), "no vertices"),
+        (head("element vertex many\n" + GOOD), "cannot be understood"),
+        (head("element vertex 0\nproperty half x\n"), "cannot be understood"),
+        (head("element vertex 0\nproperty float x\nproperty float x\n"), "cannot be understood"),
+        (head("element vertex 1\nproperty list uchar int x\n"), "list property"),
+        (head("element vertex 0\n"), "no vertices"),
+        (head(""), "no vertices"),
+        (head("element vertex 1\n" + GOOD.replace("opacity", "density")) + bytes(56), "'opacity'"),
+        (head("element vertex 1\n" + GOOD.replace("scale_2", "s2")) + bytes(56), "'scale_2'"),
+        (head("element vertex 1\n" + GOOD + "property float f_rest_0\n") + bytes(60), "f_rest"),
+        (head("element vertex 1\n" + GOOD) + b"\x00\x00\xc0\x7f" + bytes(52), "'x' holds a value that is not finite"),
+        (ascii_head("element vertex 1\n" + GOOD) + b"1 2 three\n" * 9, "numbers"),
+        (ascii_head("element vertex 2\n" + GOOD) + b"1 1\n" * 14, "shape"),
+        (ascii_head("element vertex 90000000\n" + GOOD) + b"1 " * 14, "truncated"),
+    ],
+)
+def test_broken_files_are_named(tmp_path, content, complaint):
+    """Catches tracebacks, and memory allocated on the word of a header."""
+    path = tmp_path / "broken.ply"
+    path.write_bytes(content)
+    with pytest.raises(StgaError, match="broken.ply.*" + complaint):
+        read_ply(path)
+
+
+def test_missing_file_is_named(tmp_path):
+    """Catches a bare FileNotFoundError."""
+    with pytest.raises(StgaError, match=r"nowhere\.ply"):
+        read_ply(tmp_path / "nowhere.ply")
+
+
+def reads_or_complains(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    try:
+        splats = read_ply(path)
+    except StgaError:
+        return
+    for name in ARRAYS:
+        assert np.isfinite(getattr(splats, name)).all()
+
+
+@FUZZ
+@given(data=st.data())
+def test_damaged_files_never_crash(tmp_path, data):
+    """Catches any exception but StgaError after truncation and flipped bytes, in the header above all."""
+    write_ply(tmp_path / "a.ply", world_splats(4))
+    content = bytearray((tmp_path / "a.ply").read_bytes())
+    for _ in range(data.draw(st.integers(0, 3))):
+        content[data.draw(st.integers(0, 1700))] = data.draw(st.integers(0, 255))
+    reads_or_complains(tmp_path / "b.ply", bytes(content[: data.draw(st.integers(0, len(content)))]))

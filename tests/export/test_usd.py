@@ -1,0 +1,142 @@
+"""USD: read back by USD itself, checked by its validators and by what they do not look at, rendered equal."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from avatar.conftest import rendered
+
+from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.splats import Splats
+from stga_addon.errors import StgaError
+from stga_addon.export.formats import export_avatar, range_bytes
+
+FPS = 30.0
+
+
+def moved(avatar: Avatar, frames: tuple[int, ...] = (3, 4, 7)) -> Iterator[tuple[int, np.ndarray]]:
+    rng = np.random.default_rng(2)
+    for frame in frames:
+        yield frame, avatar.neutral + rng.normal(0, 0.01, avatar.neutral.shape)
+
+
+def strained(avatar: Avatar) -> Avatar:
+    change = np.random.default_rng(3).normal(0, 0.1, (len(avatar.splats), 3, 3)).astype(np.float32)
+    return replace(avatar, splats=replace(avatar.splats, strain_color=change))
+
+
+def opened(path: Path) -> Any:
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    return usd.Stage.Open(str(path))
+
+
+def splats_at(stage: Any, time: float) -> Splats:
+    """What USD's own class of the prim says, as splats; raises where array lengths differ."""
+    vol = pytest.importorskip("pxr.UsdVol")
+    field = vol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/Avatar/Splats"))
+    assert field
+    xyz = np.array(field.GetPositionsAttr().Get(time))
+    count, degree = len(xyz), field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    sh = field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(time)
+    if sh is None:
+        sh = field.GetRadianceSphericalHarmonicsCoefficientshAttr().Get(time)
+    rotation = [(q.GetReal(), *q.GetImaginary()) for q in field.GetOrientationsAttr().Get(time)]
+    opacity = np.array(field.GetOpacitiesAttr().Get(time), np.float64)
+    return Splats(
+        xyz=xyz,
+        rotation=np.array(rotation, np.float32).reshape(count, 4),
+        log_scale=np.log(np.array(field.GetScalesAttr().Get(time))).reshape(count, 3),
+        opacity=np.log(opacity / (1 - opacity)).astype(np.float32).reshape(count),
+        sh=np.array(sh, np.float32).reshape(count, (degree + 1) ** 2, 3),
+        face=np.zeros(count, np.int32),
+        unbound=np.zeros(count, bool),
+    )
+
+
+@pytest.mark.parametrize("color", ["constant", "strain"])
+@pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
+def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
+    """Catches wrong quaternion order, activations, coefficient order, frames off by one, and strain left out."""
+    path = tmp_path / f"a{suffix}"
+    stage_of = avatar if color == "constant" else strained(avatar)
+    assert export_avatar(path, stage_of, "usd", moved(avatar), fps=FPS) == [path]
+    stage = opened(path)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (3, 7, FPS)
+    pictures = []
+    for frame, mesh in moved(avatar):
+        expected = to_world(stage_of.splats, stage_of.frames(mesh))
+        found = splats_at(stage, frame)
+        np.testing.assert_array_equal(found.xyz, expected.xyz)
+        np.testing.assert_allclose(np.linalg.norm(found.rotation, axis=1), 1, atol=1e-6)
+        pictures.append(rendered(found))
+        assert np.abs(pictures[-1] - rendered(expected)).max() < 1e-3
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.05
+    assert [path.name for path in tmp_path.iterdir()] == [path.name]
+
+
+def test_valid(avatar, tmp_path):
+    """Catches what USD's validators find, and what they do not: units, axis, hints, an extent that is too small."""
+    validation = pytest.importorskip("pxr.UsdValidation", reason="the package usd-core is not installed")
+    from pxr import UsdGeom
+
+    path = tmp_path / "a.usdz"
+    export_avatar(path, avatar, "usd", moved(avatar), fps=FPS)
+    stage = opened(path)
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert validators
+    assert [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)] == []
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
+    assert str(stage.GetDefaultPrim().GetPath()) == "/Avatar"
+    prim = stage.GetPrimAtPath("/Avatar/Splats")
+    values = {name: prim.GetAttribute(name).Get() for name in ("projectionModeHint", "sortingModeHint")}
+    assert values == {"projectionModeHint": "perspective", "sortingModeHint": "zDepth"}
+    for frame, mesh in moved(avatar):
+        world = to_world(avatar.splats, avatar.frames(mesh))
+        low, high = np.array(prim.GetAttribute("extent").Get(frame))
+        reach = 3 * np.exp(world.log_scale).max(axis=1, keepdims=True)
+        assert (low <= world.xyz - reach + 1e-6).all()
+        assert (high >= world.xyz + reach - 1e-6).all()
+    authored = {attribute.GetName() for attribute in prim.GetAuthoredAttributes()}
+    assert authored <= set(prim.GetPrimDefinition().GetPropertyNames())
+
+
+@pytest.mark.parametrize("color", ["constant", "strain"])
+def test_size_is_known_before(avatar, tmp_path, color):
+    """Catches an estimate that would let a range fill the disk."""
+    pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    many = np.random.default_rng(0).integers(0, len(avatar.splats), 5000)
+    avatar = replace(avatar, splats=avatar.splats.rows(many))
+    avatar = avatar if color == "constant" else strained(avatar)
+    export_avatar(tmp_path / "a.usdc", avatar, "usd", moved(avatar, (0, 1, 2, 3)))
+    assert range_bytes(avatar, "usd", 4) == pytest.approx((tmp_path / "a.usdc").stat().st_size, rel=0.02)
+
+
+def test_nothing_is_left_of_an_export_that_ends_early(avatar, tmp_path):
+    """Catches half a file, and the unpacked layer beside a package."""
+    pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+
+    def stops() -> Iterator[tuple[int, np.ndarray]]:
+        yield 0, avatar.neutral
+        raise KeyboardInterrupt
+
+    for suffix in (".usdc", ".usdz"):
+        with pytest.raises(KeyboardInterrupt):
+            export_avatar(tmp_path / f"a{suffix}", avatar, "usd", stops())
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_mistakes_are_sentences(avatar, tmp_path, monkeypatch):
+    """Catches a traceback where USD is not installed, or for a name that USD takes for another format."""
+    with pytest.raises(StgaError, match=r"a\.abc: expected a name that ends in \.usdc or \.usdz"):
+        export_avatar(tmp_path / "a.abc", avatar, "usd", moved(avatar))
+    for name in [name for name in sys.modules if name.partition(".")[0] == "pxr"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(StgaError, match=r"USD files need the package usd-core"):
+        export_avatar(tmp_path / "a.usdc", avatar, "usd", moved(avatar))
+    assert list(tmp_path.iterdir()) == []

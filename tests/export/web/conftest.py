@@ -1,0 +1,124 @@
+"""A FLAME head with splats on it, in a motion of three frames."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from avatar.conftest import random_splats
+
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.strain import seen_range, strain_basis
+from stga_addon.capture.camera import Camera, look_at
+from stga_addon.development.browser import Browser, find_browser
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.export.playback import Playback
+from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.page import page
+from stga_addon.export.web.rig import WebRig, flame_rig
+from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh
+
+SPLATS = 1500
+SIZE = 120
+READY = """new Promise((done) => {
+  const avatar = document.querySelector('stga-avatar');
+  const look = () => (avatar.info || avatar.shadowRoot?.querySelector('p').textContent ? done() : setTimeout(look, 20));
+  look();
+})"""
+
+
+@pytest.fixture(scope="module")  # not longer: the page would go on playing, on software graphics, beside other tests
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    executable = find_browser()
+    if executable is None:
+        pytest.skip("no Chromium on this machine (apt-get install chromium)")
+    opened = Browser(executable, tmp_path_factory.mktemp("profile"), (500, 400))
+    yield opened
+    opened.close()
+
+
+def show(browser: Browser, folder: Path, data: bytes) -> None:
+    """Open the page of a data file from disk."""
+    (folder / "a.html").write_text(page("Zoë", "", data), encoding="utf-8")
+    browser.open((folder / "a.html").as_uri())
+    browser.evaluate(READY)
+
+
+@dataclass(frozen=True)
+class Head:
+    """An avatar, its motion, the meshes (T, V, 3) of it and a camera."""
+
+    avatar: Avatar
+    sequence: FlameSequence
+    meshes: np.ndarray
+    camera: Camera
+
+    @property
+    def rig(self) -> WebRig:
+        return flame_rig(self.sequence)
+
+    def data(self, rig: WebRig | None = None, exact: bool = False) -> bytes:
+        playback = Playback(title="Zoë", fps=2.0, views={"front": self.camera}, selection=self.selection)
+        return data_file(self.avatar, rig or self.rig, playback, exact)
+
+    @property
+    def selection(self) -> list[np.ndarray]:
+        faces = np.arange(len(self.avatar.faces))
+        return [faces % (number + 2) == 0 for number in range(len(self.meshes))]
+
+
+def make_head(
+    convention: str = "stga",
+    sh_degree: int = 3,
+    antialiased: bool = True,
+    strain: bool = True,
+    strain_position: bool = False,
+) -> Head:
+    """strain: whether colors follow it; strain_position: whether splats move with it, as far as they spread."""
+    model = synthetic_flame(0)
+    rng = np.random.default_rng(3)
+    frames = [
+        FlameFrame(
+            expr=rng.normal(0, 0.5, model.n_expression),
+            rotation=rng.normal(0, 0.1, 3),
+            neck_pose=rng.normal(0, 0.1, 3),
+            jaw_pose=np.array([0.2, 0.02, 0.0]),
+            translation=rng.normal(0, 0.01, 3),
+            eyes_pose=rng.normal(0, 0.2, 6),
+            dynamic_offset=rng.normal(0, 2e-4, model.v_template.shape) if number == 1 else None,
+        )
+        for number in range(3)
+    ]
+    shape = rng.normal(0, 0.5, model.n_identity)
+    offset = rng.normal(0, 1e-4, model.v_template.shape)
+    sequence = FlameSequence(model, shape, offset, (0, 1, 2), frames.__getitem__)
+    unit = 1.0 if convention == "gaussian_avatars" else 0.005
+    splats = random_splats(5, SPLATS, len(model.faces), sh_degree)
+    object.__setattr__(splats, "xyz", splats.xyz * np.float32(0.3 * unit))
+    object.__setattr__(splats, "log_scale", splats.log_scale * np.float32(0.3) + np.float32(np.log(0.8 * unit) + 1.2))
+    object.__setattr__(splats, "sh", splats.sh * np.float32(0.3))
+    if strain:
+        strain_color = rng.normal(0, 0.1, (SPLATS, 3, 3)).astype(np.float32)
+        object.__setattr__(splats, "strain_color", strain_color)
+    neutral = neutral_mesh(sequence).astype(np.float32)
+    meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
+    limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
+    moves = rng.normal(0, 0.3 * unit, (len(model.faces), 3, 3)).astype(np.float32)
+    avatar = Avatar(
+        splats,
+        convention,
+        neutral,
+        model.faces,
+        antialiased=antialiased,
+        strain_range=limits if strain or strain_position else None,
+        strain_position=moves if strain_position else None,
+    )
+    camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
+    return Head(avatar, sequence, meshes, camera)
+
+
+@pytest.fixture(scope="session")
+def head() -> Head:
+    return make_head()

@@ -1,0 +1,166 @@
+"""The page in a real browser: its pictures against the renderer, its interface, and damaged data."""
+
+import base64
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.avatar.file import Avatar
+from stga_addon.capture.open import open_capture
+from stga_addon.development.browser import Browser
+from stga_addon.export.playback import Playback
+from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.rig import baked_rig
+from stga_addon.render.render import render_avatar, to_uint8
+from stga_addon.training.optimize.initial_splats import initial_splats
+from stga_addon.training.settings import make_settings
+
+from .conftest import Head, make_head, show
+
+MIN_PSNR = 55.0
+MIN_QUANTIZED_PSNR = 58.0
+"""Quantized against unquantized, of opaque splats with random colors. Trained heads reach 60 dB and more."""
+MIN_EXACT_PSNR = 68.0
+"""Unquantized. Splats placed on the driver's grid of 1/16 pixel, as interpolated offsets are, lower it to 58 dB; colors
+in half floats take some dB of the rest."""
+SNAPSHOT = """(async () => {
+  const avatar = document.querySelector('stga-avatar');
+  avatar.player.frame = avatar.frame = %d;
+  avatar.camera = 'front';
+  avatar.background = '#ffffff';
+  const blob = await avatar.snapshot();
+  const reader = new FileReader();
+  return new Promise((done) => Object.assign(reader, { onload: () => done(reader.result) }).readAsDataURL(blob));
+})()"""
+
+
+def picture(browser: Browser, frame: int) -> np.ndarray:
+    """What the page shows, as its camera sees it: (H, W, 3) in levels."""
+    encoded = browser.evaluate(SNAPSHOT % frame).partition(",")[2]
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"), float)
+
+
+def difference(one: np.ndarray, other: np.ndarray) -> float:
+    """PSNR in dB of two pictures in levels."""
+    return float(10 * np.log10(255**2 / np.mean((one - other) ** 2)))
+
+
+def psnr(browser: Browser, head: Head, frame: int) -> float:
+    """Of the page's picture against the renderer's, both in eight bits."""
+    expected = to_uint8(render_avatar(head.avatar, head.meshes[frame], head.camera))
+    return difference(picture(browser, frame), expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "exact"),
+    [
+        ({}, True),
+        ({}, False),
+        ({"convention": "gaussian_avatars", "sh_degree": 1, "strain": False, "antialiased": False}, True),
+        ({"strain_position": True}, True),
+        ({"strain_position": True}, False),
+        ({"convention": "gaussian_avatars", "strain": False, "strain_position": True}, False),
+    ],
+)
+def test_picture_is_the_renderers(options, exact, browser, tmp_path):
+    """Catches a difference of projection, position, color, blending or quantization, and any request of the page."""
+    head = make_head(**options)
+    show(browser, tmp_path, head.data(exact=exact))
+    for frame in (0, 2):
+        assert psnr(browser, head, frame) >= (MIN_EXACT_PSNR if exact else MIN_PSNR)
+    assert browser.errors == []
+    assert browser.requests == [(tmp_path / "a.html").as_uri()]
+
+
+def test_baked_meshes_play_as_rendered(browser, head, tmp_path):
+    """Catches a baked motion that is not that of the meshes, or strain that is lost with it."""
+    show(browser, tmp_path, head.data(rig=baked_rig(list(head.meshes))))
+    for frame in range(len(head.meshes)):
+        assert psnr(browser, head, frame) >= MIN_PSNR
+
+
+@pytest.mark.slow
+def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
+    """Catches a page that differs from the renderer on the size, cameras and meshes of a capture, and steps of the data
+    file that are coarse enough to be seen."""
+    capture = open_capture(shared_data / "studio_head")
+    splats = initial_splats(capture, make_settings(iterations=1, strain_color=True))
+    rng = np.random.default_rng(0)
+    splats = replace(
+        splats,
+        opacity=splats.opacity + np.float32(3.0),
+        sh=splats.sh + rng.normal(0, 0.05, splats.sh.shape).astype(np.float32),
+        strain_color=rng.normal(0, 0.03, splats.strain_color.shape).astype(np.float32),
+    )
+    avatar = Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces, antialiased=True)
+    views = [capture.views["val"][0], capture.views["test"][20]]
+    meshes = [capture.mesh(view.timestep) for view in views]
+    for number, view in enumerate(views):
+        playback = Playback(title="Studio", fps=2.0, views={"front": view.camera})
+        show(browser, tmp_path, data_file(avatar, baked_rig(meshes), playback))
+        expected = to_uint8(render_avatar(avatar, meshes[number], view.camera))
+        quantized = picture(browser, number)
+        assert difference(quantized, expected) >= MIN_PSNR
+        show(browser, tmp_path, data_file(avatar, baked_rig(meshes), playback, exact=True))
+        assert difference(quantized, picture(browser, number)) >= MIN_QUANTIZED_PSNR
+
+
+def test_controls(browser, head, tmp_path):
+    """Catches a slider, key or property of the page that does nothing, or something else than it says."""
+    show(browser, tmp_path, head.data())
+    found = browser.evaluate("""(() => {
+      const avatar = document.querySelector('stga-avatar');
+      const rows = [...document.querySelectorAll('.slider')];
+      const name = rows[0].firstChild.textContent;
+      const input = rows[0].querySelector('input');
+      input.value = 0.5;
+      input.dispatchEvent(new Event('input'));
+      avatar.frame = 1;
+      document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true }));
+      document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 's', bubbles: true }));
+      const before = [...avatar.camera.matrix];
+      document.getElementById('panel').hidden = false;
+      avatar.frame = 0;
+      avatar.frame = 2;
+      const shown = Number(rows[1].querySelector('.value').textContent);
+      const played = avatar.info.sliders[1].component;
+      avatar.setPose('jaw', [0.3, null, null]);
+      avatar.player.draw();
+      return { shown_value: shown, played, sliders: rows.length,
+        pinned: document.querySelectorAll('.pinned').length, frame: avatar.frame,
+        value: avatar.player.motion.pinnedCoefficients[avatar.info.sliders[0].component], shown: avatar.showSelection,
+        notice: document.getElementById('number').textContent, name, jaw: avatar.player.motion.pinnedPose[6],
+        views: document.getElementById('view').options.length, before };
+    })()""")
+    assert found["sliders"] == head.sequence.model.n_expression + 6
+    assert (found["pinned"], found["value"], found["frame"], found["shown"]) == (1, 0.5, 2, True)
+    assert found["shown_value"] == pytest.approx(head.rig.coefficients[2, found["played"]], abs=0.006)
+    assert found["jaw"] == pytest.approx(0.3)
+    assert found["notice"] == "3 / 3"
+    assert np.allclose(found["before"], head.camera.world_to_camera.ravel())
+    assert browser.errors == []
+
+
+def test_damaged_data_shows_a_sentence(browser, head, tmp_path):
+    """Catches a blank page."""
+    data = head.data()
+    show(browser, tmp_path, data[: len(data) // 2])
+    shown = browser.evaluate("document.querySelector('stga-avatar').shadowRoot.querySelector('p').textContent")
+    assert shown == "The avatar data is damaged."
+    assert browser.errors == []
+
+
+def test_a_browser_without_webgl2_is_told(browser, head, tmp_path):
+    """Catches a blank page, or an exception, where the graphics driver is blocked."""
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=source)
+    try:
+        show(browser, tmp_path, head.data())
+    finally:
+        browser.send("Page.removeScriptToEvaluateOnNewDocument", **added)
+    shown = browser.evaluate("document.querySelector('stga-avatar').shadowRoot.querySelector('p').textContent")
+    assert shown == "This page needs WebGL 2, which this browser or graphics driver does not offer."
+    assert browser.errors == []

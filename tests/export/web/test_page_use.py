@@ -1,0 +1,270 @@
+"""The page in use in a real browser: touch, keys, sliders, a lost graphics context, long play, embedding."""
+
+import functools
+import re
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.development.browser import Browser
+from stga_addon.export.playback import Playback
+from stga_addon.export.web.write import SCRIPT_NAME, write_web
+from stga_addon.flame.forward import FlameFrame, flame_forward
+
+from .conftest import Head, show
+from .test_page import psnr
+
+ROOT = Path(__file__).resolve().parents[3]
+PLAY_S, PLAY_RATE = 600, 10
+"""Length of the long play, and pictures drawn in each second of it."""
+BATCH = 250
+"""Pictures drawn at once."""
+MAX_HEAP_GROWTH = 300_000
+"""Bytes that may be left over from a run of pictures: compiled code and the browser's own bookkeeping."""
+CAMERA = "[...document.querySelector('stga-avatar').camera.matrix]"
+MIDDLE_IN_CAMERA = """(() => {
+  const { player, camera } = document.querySelector('stga-avatar');
+  const p = [...player.middle, 1];
+  return [0, 1, 2].map((row) => p.reduce((sum, value, k) => sum + camera.matrix[4 * row + k] * value, 0));
+})()"""
+# Counts WebGL objects alive, draws one splat, and lets the test turn the clock of requestAnimationFrame.
+INSTRUMENTS = """
+window.alive = 0;
+const prototype = WebGL2RenderingContext.prototype;
+for (const kind of ['Texture', 'Buffer', 'Framebuffer', 'VertexArray', 'Program', 'Shader']) {
+  for (const [verb, by] of [['create', 1], ['delete', -1]]) {
+    const original = prototype[verb + kind];
+    prototype[verb + kind] = function (...values) {
+      window.alive += by;
+      return original.apply(this, values);
+    };
+  }
+}
+const draw = prototype.drawArraysInstanced;
+prototype.drawArraysInstanced = function (mode, first, count) {
+  draw.call(this, mode, first, count, 1); // of all splats one: software draws them slowly
+};
+window.waiting = [];
+window.requestAnimationFrame = (callback) => window.waiting.push(callback);
+window.playFor = (pictures, rate) => {
+  const avatar = document.querySelector('stga-avatar');
+  let wraps = 0;
+  for (let k = 0; k < pictures; k++) {
+    const before = avatar.frame;
+    window.now = (window.now ?? 0) + 1000 / rate;
+    for (const callback of window.waiting.splice(0)) callback(window.now);
+    if (avatar.frame < before) wraps++;
+  }
+  return wraps;
+};"""
+
+
+def touch(browser: Browser, *paths: list[tuple[float, float]]) -> None:
+    """Fingers that go along `paths` of equal length together (pixels)."""
+    for step in range(len(paths[0])):
+        points = [{"x": path[step][0], "y": path[step][1], "id": finger} for finger, path in enumerate(paths)]
+        browser.send("Input.dispatchTouchEvent", type="touchMove" if step else "touchStart", touchPoints=points)
+    browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+
+def line(start: tuple[float, float], end: tuple[float, float]) -> list[tuple[float, float]]:
+    return [(start[0] + s * (end[0] - start[0]), start[1] + s * (end[1] - start[1])) for s in np.linspace(0, 1, 6)]
+
+
+def press(browser: Browser, key: str) -> None:
+    text = {"text": key} if len(key) == 1 else {}
+    browser.send("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
+    browser.send("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+
+def of_avatar(browser: Browser, member: str) -> Any:
+    return browser.evaluate(f"document.querySelector('stga-avatar').{member}")
+
+
+def test_touch(browser, head, tmp_path):
+    """Catches fingers that do nothing, scroll the page, or move the head the wrong way."""
+    show(browser, tmp_path, head.data())
+    first, middle = np.reshape(browser.evaluate(CAMERA), (4, 4)), browser.evaluate(MIDDLE_IN_CAMERA)
+    touch(browser, line((200, 120), (260, 120)))
+    turned = np.reshape(browser.evaluate(CAMERA), (4, 4))
+    assert turned[2, 0] != pytest.approx(first[2, 0], abs=0.1)  # the viewing direction has turned
+    assert browser.evaluate(MIDDLE_IN_CAMERA) == pytest.approx(middle, abs=1e-9)  # about the head
+    touch(browser, line((200, 120), (150, 120)), line((300, 120), (350, 120)))
+    nearer = browser.evaluate(MIDDLE_IN_CAMERA)
+    assert nearer[2] == pytest.approx(middle[2] / 2, rel=0.05)
+    touch(browser, line((200, 120), (240, 120)), line((300, 120), (340, 120)))
+    panned = browser.evaluate(MIDDLE_IN_CAMERA)
+    assert panned[0] > nearer[0] + 0.01
+    assert panned[1:] == pytest.approx(nearer[1:], abs=1e-3)
+    assert browser.errors == []
+
+
+def test_keyboard(browser, head, tmp_path):
+    """Catches a key of docs/web.md that does nothing, or something else."""
+    show(browser, tmp_path, head.data())
+    loop = of_avatar(browser, "loop")
+    press(browser, " ")
+    assert of_avatar(browser, "playing")
+    press(browser, " ")
+    assert not of_avatar(browser, "playing")
+    for key, frame in (("End", 2), ("ArrowLeft", 1), ("ArrowRight", 2), ("Home", 0)):
+        press(browser, key)
+        assert of_avatar(browser, "frame") == frame, key
+    press(browser, "l")
+    assert of_avatar(browser, "loop") is not loop
+    press(browser, "s")
+    assert of_avatar(browser, "showSelection")
+    before = browser.evaluate(CAMERA)
+    touch(browser, line((200, 120), (260, 120)))
+    for key in ("r", "1"):
+        press(browser, key)
+        assert browser.evaluate(CAMERA) == before, key
+    for key, expression in (
+        ("c", "document.getElementById('panel').hidden"),
+        ("h", "document.body.classList.contains('bare')"),
+        ("t", "document.documentElement.dataset.theme"),
+    ):
+        state = browser.evaluate(expression)
+        press(browser, key)
+        assert browser.evaluate(expression) != state, key
+    browser.evaluate("document.querySelector('stga-avatar').setExpression(0, 0.5)")
+    press(browser, "x")
+    assert browser.evaluate("[...document.querySelector('stga-avatar').player.motion.pinnedCoefficients].every(isNaN)")
+    assert browser.errors == []
+
+
+def test_sliders_are_flames(browser, head, tmp_path):
+    """Catches a slider that moves another blend shape, joint or axis than FLAME's of its name."""
+    show(browser, tmp_path, head.data(exact=True))
+    rng = np.random.default_rng(1)
+    expressions = rng.uniform(-0.9, 0.9, head.sequence.model.n_expression)
+    jaw = [0.25, 0.05, -0.03]
+    found = browser.evaluate(f"""(() => {{
+      const avatar = document.querySelector('stga-avatar');
+      for (const [k, value] of Object.entries({expressions.tolist()})) {{
+        const input = document.querySelector(`.slider[data-name="expr_${{k.padStart(3, '0')}}"] input`);
+        input.value = value;
+        input.dispatchEvent(new Event('input'));
+      }}
+      avatar.setPose('jaw', {jaw});
+      avatar.player.draw();
+      return Array.from(avatar.player.rig.vertices);
+    }})()""")
+    recorded = head.sequence.frame(0)
+    wanted = FlameFrame(
+        expr=expressions,
+        rotation=recorded.rotation,
+        neck_pose=recorded.neck_pose,
+        jaw_pose=np.array(jaw),
+        translation=recorded.translation,
+        eyes_pose=recorded.eyes_pose,
+    )
+    expected = flame_forward(head.sequence.model, head.sequence.shape, wanted, head.sequence.static_offset)
+    assert np.abs(np.reshape(found, (-1, 3)) - expected).max() < 1e-5
+
+
+def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
+    """Catches a blank page, or another camera and pose, after the graphics driver was restarted."""
+    show(browser, tmp_path, head.data())
+    message = "document.querySelector('stga-avatar').shadowRoot.querySelector('p')"
+    browser.evaluate("document.querySelector('stga-avatar').setExpression(1, 0.9)")
+    pictures = "document.querySelector('stga-avatar').player.read(document.querySelector('stga-avatar').camera)"
+    before = browser.evaluate(f"Array.from({pictures})")
+    event = "new Promise((done) => avatar.shadowRoot.querySelector('canvas').addEventListener('webglcontext%s', %s))"
+    browser.evaluate(f"""(async () => {{
+      const avatar = document.querySelector('stga-avatar');
+      window.extension = avatar.player.gl.getExtension('WEBGL_lose_context');
+      const lost = {event % ("lost", "done")};
+      window.extension.loseContext();
+      await lost;
+    }})()""")
+    assert "restarted" in browser.evaluate(f"{message}.textContent")
+    assert not browser.evaluate(f"{message}.hidden")
+    browser.evaluate(f"""(async () => {{
+      const avatar = document.querySelector('stga-avatar');
+      const restored = {event % ("restored", "done")};
+      window.extension.restoreContext();
+      await restored;
+    }})()""")
+    assert browser.evaluate(f"{message}.hidden")
+    assert browser.evaluate(f"Array.from({pictures})") == before
+    browser.evaluate("document.querySelector('stga-avatar').release()")
+    assert psnr(browser, head, 0) > 50
+    assert browser.errors == []
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
+    """Catches textures, buffers and objects that pile up with the frames (ten minutes on an accelerated clock)."""
+    added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=INSTRUMENTS)
+    try:
+        show(browser, tmp_path, head.data())
+    finally:
+        browser.send("Page.removeScriptToEvaluateOnNewDocument", **added)
+    browser.evaluate("""(() => {
+      const avatar = document.querySelector('stga-avatar');
+      avatar.style.cssText = 'width: 32px; height: 32px'; // software draws
+      document.getElementById('panel').hidden = false; // its sliders follow
+      avatar.loop = true;
+      avatar.play();
+    })()""")
+
+    def played(pictures: int) -> tuple[int, int, int]:
+        """Rounds of the motion, WebGL objects alive and bytes of JavaScript afterwards."""
+        rounds = sum(browser.evaluate(f"window.playFor({BATCH}, {PLAY_RATE})") for _ in range(pictures // BATCH))
+        browser.send("HeapProfiler.collectGarbage")
+        return rounds, browser.evaluate("window.alive"), browser.send("Runtime.getHeapUsage")["usedSize"]
+
+    _, alive_before, heap_before = played(4 * BATCH)  # compiled by then
+    rounds, alive, heap = played(PLAY_S * PLAY_RATE)
+    assert rounds == pytest.approx(PLAY_S * 2 / 3, abs=2)  # two recorded frames a second, three in a round
+    assert alive == alive_before
+    assert heap < heap_before + MAX_HEAP_GROWTH
+    assert browser.errors == []
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    """Address of a plain web server of the folder `site`."""
+    (tmp_path / "site").mkdir()
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *values: Any) -> None: ...
+
+    made = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(tmp_path / "site")))
+    threading.Thread(target=made.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{made.server_port}"
+    made.shutdown()
+    made.server_close()
+
+
+def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
+    """Catches a snippet of docs/web.md that does not work as it stands, and an element that loads something else."""
+    site = tmp_path / "site"
+    write_web(site / "anna.stga", head.avatar, Playback(title="Anna"), sequence=head.sequence)
+    text = (ROOT / "docs/web.md").read_text(encoding="utf-8")
+    markup, script = (re.search(rf"```{kind}\n(.*?)```", text, re.DOTALL)[1] for kind in ("html", "js"))
+    own = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><h1>Our team</h1>'
+    (site / "index.html").write_text(f"{own}{markup}<script>{script}</script>", encoding="utf-8")
+    browser.open(f"{server}/index.html")
+    found = browser.evaluate("""new Promise((done) => {
+      const look = () => {
+        const avatar = document.querySelector('stga-avatar');
+        if (!avatar.info || !avatar.playing) return setTimeout(look, 20);
+        const { coefficients } = avatar.player.motion;
+        done({ title: avatar.info.title, height: avatar.clientHeight, width: avatar.clientWidth, loop: avatar.loop,
+          background: avatar.background, expression: coefficients[3], jaw: avatar.getPose('jaw')[0] });
+      };
+      look();
+    })""")
+    assert found["title"] == "Anna"
+    assert (found["height"], found["loop"], found["background"]) == (480, True, "#202020")
+    assert found["expression"] == pytest.approx(0.8)
+    assert found["jaw"] == pytest.approx(0.2)
+    assert browser.requests == [f"{server}/{name}" for name in ("index.html", SCRIPT_NAME, "anna.stga")]
+    assert browser.errors == []

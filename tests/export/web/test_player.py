@@ -1,0 +1,155 @@
+"""The player's numerics in Node against numpy: pose, frames, strain, order, and damaged files."""
+
+import gzip
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from avatar.conftest import random_splats
+
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.strain import color_range
+from stga_addon.export.playback import Playback
+from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.page import PLAYER
+from stga_addon.export.web.rig import baked_rig
+
+from .conftest import make_head
+
+
+def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
+    """What evaluate.mjs makes of a data file."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no Node.js on this machine")
+    (folder / "a.stga").write_bytes(data)
+    script = Path(__file__).with_name("evaluate.mjs")
+    done = subprocess.run([node, str(script), str(PLAYER), str(folder / "a.stga")], capture_output=True, timeout=120)
+    assert not done.stderr, done.stderr.decode()
+    return dict(json.loads(done.stdout))
+
+
+@pytest.mark.parametrize("baked", [False, True])
+def test_pose_is_flames(head, baked, tmp_path):
+    """Catches a joint, corrective, offset or rotation of the player that is not FLAME's."""
+    rig = baked_rig(list(head.meshes)) if baked else head.rig
+    results = evaluated(head.data(rig, exact=True), tmp_path)["results"]
+    for mesh, result in zip(head.meshes, results, strict=True):
+        assert np.abs(np.reshape(result["vertices"], (-1, 3)) - mesh).max() < 6e-6
+
+
+@pytest.mark.parametrize(
+    ("convention", "strain", "strain_position"),
+    [
+        ("stga", True, False),
+        ("gaussian_avatars", True, False),
+        ("stga", True, True),
+        ("stga", False, True),
+        ("gaussian_avatars", True, True),
+        ("gaussian_avatars", False, True),
+    ],
+)
+def test_frames_and_strain_are_the_embedding(convention, strain, strain_position, tmp_path):
+    """Catches another axis, scale, sliver rule or strain than the one that the splats were trained with, and origins
+    that do not move with the nearby strain, or with that of the frame before."""
+    head = make_head(convention, strain=strain, strain_position=strain_position)
+    results = evaluated(head.data(exact=True), tmp_path)["results"]
+    for mesh, result in zip(head.meshes, results, strict=True):
+        expected = head.avatar.frames(mesh)
+        found = np.reshape(result["frames"], (-1, 3, 4))
+        scale = np.abs(expected.rotation * expected.scale[:, None, None]).max()
+        # The mesh is that of float32 blend shapes: a thin triangle's axes turn with the last digit.
+        error = np.abs(found[..., :3] - expected.rotation * expected.scale[:, None, None]).max((1, 2)) / scale
+        assert np.quantile(error, 0.99) < 1e-3
+        assert np.abs(found[..., 3] - expected.origin).max() < 1e-6
+        still = replace(head.avatar, strain_position=None).frames(mesh).origin
+        assert (np.abs(expected.origin - still).max() > 1e-3) == strain_position
+        assert np.quantile(np.abs(np.reshape(result["strain"], (-1, 3)) - expected.strain), 0.99) < 2e-3
+        free = replace(head.avatar, strain_range=None).frames(mesh).strain
+        assert (np.abs(free - expected.strain) > 0.01).mean() > 0.05  # the range matters here
+
+
+def test_nearby_strain_where_edges_have_any_number_of_triangles(tmp_path):
+    """Catches neighbors that are lost, or counted another number of times, where more than two triangles share an edge,
+    two share all edges, or one has an edge twice: against a search of all pairs of edges, and numpy's frames."""
+    rng = np.random.default_rng(0)
+    neutral = rng.normal(0, 0.1, (9, 3)).astype(np.float32)
+    faces = np.stack([rng.permutation(9)[:3] for _ in range(40)]).astype(np.int32)
+    faces[30:33], faces[33] = faces[:3], faces[0, ::-1]
+    faces[35:] = [[3, 3, 4], [3, 4, 4], [5, 6, 5], [7, 7, 7], [4, 3, 8]]
+    moves = rng.normal(0, 0.01, (40, 3, 3)).astype(np.float32)
+    avatar = Avatar(random_splats(1, 60, 40, 0), "stga", neutral, faces, strain_position=moves)
+    meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
+    data = data_file(avatar, baked_rig(meshes), Playback(), exact=True)
+    edges = [{frozenset((face[k - 1], face[k])): 0 for k in range(3)} for face in faces]
+    for own, face in zip(edges, faces, strict=True):
+        for k in range(3):
+            own[frozenset((face[k - 1], face[k]))] += 1
+    weight = np.array([[sum(n * other.get(edge, 0) for edge, n in own.items()) for other in edges] for own in edges])
+    np.fill_diagonal(weight, 1)
+    assert (weight.sum(1).max() > 10, weight.sum(1).min()) == (True, 1)
+    for mesh, result in zip(meshes, evaluated(data, tmp_path)["results"], strict=True):
+        expected = np.reshape(result["strain"], (-1, 3))
+        for _ in range(3):
+            expected = weight @ expected / weight.sum(1, keepdims=True)
+        assert np.abs(np.reshape(result["nearby"], (-1, 3)) - expected).max() < 1e-9
+        origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
+        assert np.abs(origin - avatar.frames(mesh).origin).max() < 1e-5
+
+
+def test_a_head_at_rest_stays_where_it_is(tmp_path):
+    """Catches strain that is not taken off: within the range of colors, a mesh at rest has some."""
+    head = make_head(strain_position=True)
+    neutral = head.avatar.neutral
+    avatar = replace(head.avatar, strain_range=color_range(len(head.avatar.faces)))
+    [result] = evaluated(data_file(avatar, baked_rig([neutral]), Playback(), exact=True), tmp_path)["results"]
+    assert np.min(result["strain"]) < -0.19
+    origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
+    assert np.abs(origin - neutral[avatar.faces].mean(1)).max() < 1e-6
+
+
+def test_order_is_back_to_front(head, tmp_path):
+    """Catches splats blended in the wrong order, left out or drawn twice."""
+    result = evaluated(head.data(exact=True), tmp_path)["results"][0]
+    splats = head.avatar.splats.rows(np.argsort(head.avatar.splats.face, kind="stable"))
+    frames = head.avatar.frames(head.meshes[0])
+    turned = np.einsum("nij,nj->ni", frames.rotation[splats.face], splats.xyz)
+    world = frames.scale[splats.face, None] * turned + frames.origin[splats.face]
+    depth = head.camera.project(world)[1][result["order"]]
+    assert sorted(result["order"]) == list(range(len(splats)))
+    assert np.diff(depth).max() <= 2 * np.ptp(depth) / 65535
+
+
+def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
+    """Catches a player that hangs, or draws garbage, on a file that was cut off, altered or made by a later version."""
+    whole = head.data()
+    raw = gzip.decompress(whole)
+    length = int.from_bytes(raw[8:12], "little")
+    header = raw[12 : 12 + length]
+    altered = [
+        whole[: len(whole) // 2],
+        b"PK" + whole,
+        gzip.compress(raw[:-5]),
+        gzip.compress(raw[:4] + b"\x09" + raw[5:]),
+        gzip.compress(raw[:12] + header.replace(b'"fps": 2.0', b'"fps": -20') + raw[12 + length :]),
+        gzip.compress(raw[:12] + header.replace(b'"planes": 1', b'"planes": 9', 1) + raw[12 + length :]),
+        gzip.compress(raw[:12] + header.replace(b'"parents": [-1', b'"parents": [77', 1) + raw[12 + length :]),
+        gzip.compress(raw[:8] + b"\xff\xff\xff\x7f" + raw[12:]),
+    ]
+    for data in altered:
+        error = evaluated(data, tmp_path).get("error", "")
+        assert error.startswith("DataError: "), error
+        assert error.endswith("."), error
+
+
+def test_an_avatar_without_motion_plays(head, tmp_path):
+    """Catches a single frame, or an avatar without selection, color harmonics and strain, that the player refuses."""
+    plain = make_head(sh_degree=0, strain=False)
+    data = data_file(plain.avatar, baked_rig([plain.avatar.neutral]), Playback())
+    vertices = evaluated(data, tmp_path)["results"][0]["vertices"]
+    assert np.abs(np.reshape(vertices, (-1, 3)) - plain.avatar.neutral).max() < 1e-6

@@ -1,0 +1,162 @@
+"""Layers rendered together, in this process and by a render server in another interpreter."""
+
+import io
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.embedding import WORLD, face_frames
+from stga_addon.avatar.splats import Splats
+from stga_addon.avatar.strain import strain_basis
+from stga_addon.capture.camera import Camera
+from stga_addon.errors import StgaError
+from stga_addon.raster.cpu.compose import compose
+from stga_addon.raster.posed_splats import PosedSplats
+from stga_addon.render import client as render_client
+from stga_addon.render.client import RenderClient
+from stga_addon.render.protocol import pack_layers, receive, unpack_layers
+from stga_addon.render.render import render
+
+HERE = np.eye(4)
+AHEAD = np.array([0, 0, 1.2])
+CAMERA = Camera(50, 40, 60.0, 60.0, 25.0, 20.0, HERE)
+
+
+def cloud(count: int = 200, seed: int = 0, face: int = 1) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        xyz=(rng.normal(0, 0.2, (count, 3)) + AHEAD).astype(np.float32),
+        rotation=rng.normal(0, 1, (count, 4)).astype(np.float32),
+        log_scale=rng.normal(-3.5, 0.4, (count, 3)).astype(np.float32),
+        opacity=rng.normal(0, 1.5, count).astype(np.float32),
+        sh=rng.normal(0, 0.15, (count, 9, 3)).astype(np.float32),
+        face=rng.integers(0, face, count).astype(np.int32),
+        unbound=np.zeros(count, bool),
+    )
+
+
+def world(splats: Splats, place: np.ndarray = HERE) -> PosedSplats:
+    return PosedSplats(splats, WORLD, place)
+
+
+def embedded() -> PosedSplats:
+    rng = np.random.default_rng(1)
+    faces, neutral = np.array([[0, 1, 2], [1, 3, 2]]), rng.normal(0, 0.2, (4, 3)) + AHEAD
+    frames = face_frames(1.1 * neutral, faces, neutral, strain=strain_basis(neutral, faces))
+    splats = cloud(60, 2, 2)
+    colors = rng.normal(0, 0.3, (60, 3, 3)).astype(np.float32)
+    return PosedSplats(replace(splats, xyz=0.05 * splats.xyz, strain_color=colors), frames, HERE, True)
+
+
+def test_one_layer_gives_the_pixels_of_render():
+    """Catches differences between `compose` and `render`."""
+    splats = cloud()
+    picture = compose([world(splats)], CAMERA)
+    expected = render(splats, CAMERA, (1.0, 0.5, 0.0))
+    behind = (1 - picture.alpha) * np.array([1.0, 0.5, 0.0])[:, None, None]
+    np.testing.assert_allclose(np.clip(picture.rgb + behind, 0, 1), expected, atol=2e-6)
+    assert picture.depth is None
+
+
+def test_layers_are_sorted_together():
+    """Catches layers that are composited one over the other: two halves of a cloud must make the whole cloud."""
+    splats = cloud()
+    half = np.arange(len(splats)) % 2 == 0
+    whole, halves = (compose(layers, CAMERA, True) for layers in (
+        [world(splats)], [world(splats.rows(half)), world(splats.rows(~half))]
+    ))  # fmt: skip
+    np.testing.assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
+    np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
+
+
+def test_moving_scene_and_camera_together_changes_nothing():
+    """Catches colors that follow the scene's directions instead of the layer's own."""
+    turn = np.eye(4)
+    turn[:3, :3] = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    turn[:3, :3] *= np.sign(np.linalg.det(turn[:3, :3]))
+    camera = replace(CAMERA, world_to_camera=np.linalg.inv(turn))
+    splats = cloud()
+    for size in (1.0, 2.0):
+        small = replace(
+            splats, xyz=splats.xyz / np.float32(size), log_scale=splats.log_scale - np.float32(np.log(size))
+        )
+        picture = compose([world(small, turn @ np.diag([size, size, size, 1]))], camera)
+        np.testing.assert_allclose(picture.rgb, compose([world(splats)], CAMERA).rgb, atol=1e-4)
+
+
+def test_depth_is_the_mean_of_what_a_pixel_shows():
+    """Catches depth that is not divided by alpha."""
+    one = cloud(1)
+    splats = replace(one, xyz=np.array([[0, 0, 3]], np.float32), log_scale=np.full((1, 3), -1, np.float32))
+    depth = compose([world(splats)], CAMERA, True).depth
+    assert depth is not None
+    np.testing.assert_allclose(depth[depth > 0], 3, rtol=1e-5)
+    assert compose([], CAMERA, True).alpha.max() == 0
+
+
+def test_layers_survive_the_protocol():
+    """Catches a field that is not sent to the server."""
+    layers = [embedded(), world(cloud())]
+    for layer, back in zip(layers, unpack_layers(pack_layers(layers)), strict=True):
+        for name, value in vars(layer.splats).items():
+            np.testing.assert_array_equal(getattr(back.splats, name), value)
+        for name in ("origin", "rotation", "scale", "strain"):
+            np.testing.assert_array_equal(getattr(back.frames, name), getattr(layer.frames, name))
+        assert (back.antialiased, back.to_world.tolist()) == (layer.antialiased, layer.to_world.tolist())
+
+
+@pytest.mark.slow
+def test_the_server_renders_the_same(monkeypatch):
+    """Catches a server that renders something else, forgets its layers, or is left running."""
+    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
+    remote = RenderClient(lambda: sys.executable)
+    layers = [embedded(), world(cloud())]
+    for camera in (CAMERA, CAMERA.scaled(0.5)):
+        here, there = compose(layers, camera, True), remote.compose(layers, camera, True)
+        for name in ("rgb", "alpha", "depth"):
+            np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    assert remote._server is not None
+    _, server = remote._server
+    with pytest.raises(StgaError, match="could not render"):
+        remote.compose(layers, replace(CAMERA, world_to_camera=np.zeros(3)))
+    server.kill()
+    server.wait()
+    with pytest.raises(StgaError, match="exited unexpectedly"):
+        remote.compose(layers, CAMERA)
+    assert remote.compose([world(cloud())], CAMERA).alpha.max() > 0
+    remote.close()
+    assert subprocess.Popen.poll(server) is not None
+
+
+@pytest.mark.slow
+def test_output_of_libraries_does_not_disturb_the_protocol(tmp_path, monkeypatch):
+    """Catches a server whose replies are mixed with what C code writes to descriptor 1 while packages are imported."""
+    shim = "import os, sys\nos.write(1, b'noise' * 100)\nsys.path.remove({!r})\ndel sys.modules[__name__]\nimport {}\n"
+    (tmp_path / "platformdirs.py").write_text(shim.format(str(tmp_path), "platformdirs"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
+    remote = RenderClient(lambda: sys.executable)
+    np.testing.assert_array_equal(remote.compose([world(cloud())], CAMERA).rgb, compose([world(cloud())], CAMERA).rgb)
+    remote.close()
+
+
+def test_what_is_no_message_is_refused():
+    """Catches a length read from foreign output, for which the client would wait forever."""
+    with pytest.raises(ValueError, match="begins with"):
+        receive(io.BytesIO(b"Loading something, please wait"))
+
+
+def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
+    """Catches a traceback where Blender's Python has no numba and there is no training environment."""
+
+    def nobody() -> str:
+        raise StgaError("no training environment")
+
+    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
+    with pytest.raises(StgaError, match=r"Rendering splats needs numba and platformdirs .*training environment"):
+        RenderClient(nobody).compose([], CAMERA)
+    with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
+        RenderClient(lambda: "/no/such/python").compose([], CAMERA)

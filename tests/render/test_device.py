@@ -1,0 +1,135 @@
+"""Choice of the device that trains or renders, and the message if the wanted one cannot be used."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.render import device as device_module
+from stga_addon.render.device import adapter_names, choose_device, is_device
+
+pytest.importorskip("wgpu")
+
+from stga_addon.raster.gpu import device as gpu
+from stga_addon.raster.gpu import trial
+from stga_addon.raster.gpu.trial import Trial
+
+CARD, OTHER, SOFTWARE = "Card 9000 (Vulkan)", "Card 9000 (DX12)", "llvmpipe (Vulkan)"
+
+
+@pytest.fixture
+def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
+    """A machine with two names of a card and a software adapter; what a trial of each finds, to be changed."""
+    kinds = {CARD: "DiscreteGPU", OTHER: "DiscreteGPU", SOFTWARE: "CPU"}
+    adapters = {name: SimpleNamespace(info={"adapter_type": kind}) for name, kind in kinds.items()}
+    found = {name: Trial(1e-6, 0.002, 0.02) for name in adapters}
+    monkeypatch.setattr(gpu, "adapters", lambda: adapters)
+    monkeypatch.setattr(gpu, "Device", lambda name: name)
+    monkeypatch.setattr(trial, "try_device", lambda name: found[name])
+    device_module._trial.cache_clear()
+    yield found
+    device_module._trial.cache_clear()
+
+
+def test_a_right_and_faster_gpu_is_taken(trials: dict[str, Trial]) -> None:
+    """Catches "auto" that never takes the GPU, and "cpu" that does."""
+    assert choose_device("auto") == choose_device("gpu")
+    chosen, why = choose_device("auto")
+    assert chosen == f"gpu:{CARD}"
+    assert why == f"Training on {CARD}, 10.0 times as fast as the CPU in a trial (2.0 and 20.0 ms an image)"
+    assert choose_device("cpu")[0] == "cpu"
+    assert choose_device("gpu:dx12")[0] == f"gpu:{OTHER}"
+
+
+def test_the_next_adapter_is_taken_where_the_first_is_wrong(trials: dict[str, Trial]) -> None:
+    """Catches one broken driver that hides another that works."""
+    trials[CARD] = Trial(0.5, 0.002, 0.02)
+    assert choose_device("auto")[0] == f"gpu:{OTHER}"
+
+
+def test_software_is_only_taken_by_name(trials: dict[str, Trial]) -> None:
+    """Catches "auto" that trains on software Vulkan, and a test machine on which nobody can."""
+    trials[CARD] = trials[OTHER] = Trial(1e-6, 0.04, 0.02)
+    chosen, why = choose_device("auto")
+    assert chosen == "cpu"
+    assert why.startswith(f"Training on the CPU: {CARD} is 2.0 times slower than the CPU in a trial (40.0 and 20.0 ms")
+    assert choose_device("gpu:llvm")[0] == f"gpu:{SOFTWARE}"
+
+
+@pytest.mark.parametrize("error", [0.02, float("nan")])
+def test_wrong_gradients_are_refused(trials: dict[str, Trial], error: float) -> None:
+    """Catches training on a driver that computes something else."""
+    for name in trials:
+        trials[name] = Trial(error, 0.002, 0.02)
+    with pytest.raises(StgaError, match=r"^--device gpu: Card .* computes gradients that differ"):
+        choose_device("gpu")
+    assert choose_device("auto")[0] == "cpu"
+
+
+def test_names_that_fit_none_or_several(trials: dict[str, Trial]) -> None:
+    """Catches an adapter that nobody meant."""
+    with pytest.raises(StgaError, match=r"^--device gpu:card: several adapters .*llvmpipe"):
+        choose_device("gpu:card")
+    with pytest.raises(StgaError, match=r"^--device gpu:Voodoo: no adapter of that name; there are: Card"):
+        choose_device("gpu:Voodoo")
+
+
+def raises(name: str) -> None:
+    raise RuntimeError("device lost\nand more lines")
+
+
+WRONG = {
+    "no package": ((device_module, "find_spec", lambda name: None), "package wgpu .* is not installed"),
+    "no driver": ((gpu, "adapters", dict), "no graphics driver with Vulkan"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_said_and_only_auto_falls_back(
+    trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """Catches a traceback, a silent fallback, and training on a GPU that cannot."""
+    place, reason = WRONG[what]
+    monkeypatch.setattr(*place)
+    with pytest.raises(StgaError, match=f"^--device gpu: .*{reason}"):
+        choose_device("gpu")
+    chosen, why = choose_device("auto")
+    assert chosen == "cpu"
+    assert why.startswith("Training on the CPU: ")
+    assert "--device" not in why
+
+
+def test_a_driver_that_fails_leaves_the_cpu(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches "auto" that ends in a driver's traceback."""
+    works, broken = trial.try_device, {CARD}
+    monkeypatch.setattr(trial, "try_device", lambda name: raises(name) if name in broken else works(name))
+    assert choose_device("auto")[0] == f"gpu:{OTHER}"
+    device_module._trial.cache_clear()
+    broken.add(OTHER)
+    reasons = f"{CARD} fails (device lost); {OTHER} fails (device lost)"
+    assert choose_device("auto") == ("cpu", f"Training on the CPU: {reasons}")
+
+
+def test_only_software_is_no_gpu(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a server without a card on which "auto" looks at llvmpipe."""
+    software = {SOFTWARE: SimpleNamespace(info={"adapter_type": "CPU"})}
+    monkeypatch.setattr(gpu, "adapters", lambda: software)
+    assert choose_device("auto") == ("cpu", "Training on the CPU: no GPU was found")
+    assert adapter_names() == [SOFTWARE]
+
+
+def test_what_is_a_device() -> None:
+    """Catches a run or a job whose file names nonsense."""
+    assert all(map(is_device, ("auto", "cpu", "gpu", "gpu:any name")))
+    assert not any(map(is_device, ("", "gpu:", "cuda", "gpux", None, 3, ["cpu"], "gpu:" + 999 * "x")))
+
+
+def test_wgpu_is_imported_only_where_it_works() -> None:
+    """Catches a run on the CPU that needs wgpu, or waits for a driver."""
+    script = (
+        "import sys; from stga_addon.render import device; from stga_addon.training.run import loop; "
+        "device.choose_device('cpu'); sys.exit('wgpu' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0

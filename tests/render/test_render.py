@@ -1,0 +1,107 @@
+"""The public functions of `render.render`, and the example of its docstring."""
+
+import doctest
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("numba")
+
+from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.capture.camera import look_at
+from stga_addon.export.ply import write_ply
+from stga_addon.render import render as render_module
+from stga_addon.render.render import render
+
+
+def one_splat(color: tuple[float, float, float]) -> Splats:
+    """A nearly opaque ball of 2 cm at the world's origin."""
+    return Splats(
+        xyz=np.zeros((1, 3), np.float32),
+        rotation=np.float32([[1, 0, 0, 0]]),
+        log_scale=np.full((1, 3), np.log(0.02), np.float32),
+        opacity=np.float32([6]),
+        sh=((np.float32(color) - 0.5) / np.float32(SH_C0))[None, None],
+        face=np.zeros(1, np.int32),
+        unbound=np.zeros(1, bool),
+    )
+
+
+def test_the_example_renders_a_ply_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an example that no longer runs, and a picture that does not show the splats where they are."""
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("splats.ply"), one_splat((0.8, 0.4, 0.1)))
+    example = doctest.DocTestParser().get_doctest(render_module.__doc__ or "", {}, "example", None, 0)
+    runner = doctest.DocTestRunner()
+    assert len(example.examples) == 9
+    assert runner.run(example).failed == 0
+    pixels = np.asarray(Image.open("splats.png"))
+    assert pixels.shape == (480, 640, 3)
+    np.testing.assert_allclose(pixels[240, 320], [204, 102, 26], atol=2)
+    np.testing.assert_array_equal(pixels[0, 0], [255, 255, 255])
+
+
+def test_look_at_gives_the_pose_worked_out_by_hand() -> None:
+    """Catches mirrored or exchanged axes, and a translation in world instead of camera axes.
+
+    From (3, 2, 0) towards (1, 2, 0) with +y up: forward is -x, right is -z, down is -y.
+    """
+    camera = look_at((3, 2, 0), (1, 2, 0), width=40, height=30, focal_length=50)
+    np.testing.assert_allclose(
+        camera.world_to_camera, [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]], atol=1e-15
+    )
+    np.testing.assert_allclose(camera.position, [3, 2, 0], atol=1e-15)
+    assert (camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy) == (40, 30, 50, 50, 20, 15)
+    with pytest.raises(ValueError, match="parallel to up"):
+        look_at((0, 1, 0), (0, 0, 0), 40, 30, 50)
+
+
+def test_up_is_up_and_right_is_right() -> None:
+    """Catches an image upside down or mirrored: a splat up and to the right of the target is in that quarter."""
+    splats = one_splat((0, 0, 0))
+    splats.xyz[0] = [0.1, 0.08, 0]  # seen from +z, +x is to the right
+    image = render(splats, look_at((0, 0, 1), (0, 0, 0), 64, 48, 100))
+    row, column = np.unravel_index(np.argmin(image.sum(0)), (48, 64))
+    assert (row, column) == (pytest.approx(24 - 8, abs=1), pytest.approx(32 + 10, abs=1))
+
+
+def test_background_and_values_are_clipped_display_values() -> None:
+    """Catches a default background that is not white, and colors above one that leave 0…1."""
+    image = render(one_splat((3.0, 0.5, 0.5)), look_at((0, 0, 1), (0, 0, 0), 64, 48, 400))
+    np.testing.assert_array_equal(image[:, 0, 0], 1)
+    assert image.shape == (3, 48, 64)
+    assert image.dtype == np.float32
+    assert image.max() == 1
+
+
+def test_a_gpu_renders_the_same_picture() -> None:
+    """Catches strain, frames, background or antialiasing that only the CPU draws."""
+    from numerics.meshes import bent_ball
+    from raster import gpu_device
+
+    from stga_addon.avatar.embedding import face_frames
+    from stga_addon.avatar.strain import strain_basis
+    from stga_addon.render.compose import Composer
+
+    posed, neutral, faces = bent_ball()
+    count, random = len(faces), np.random.default_rng(3)
+    splats = Splats(
+        xyz=random.normal(0, 0.1, (count, 3)).astype(np.float32),
+        rotation=random.normal(size=(count, 4)).astype(np.float32),
+        log_scale=random.normal(-1, 0.5, (count, 3)).astype(np.float32),
+        opacity=random.normal(1, 1, count).astype(np.float32),
+        sh=random.normal(0, 0.4, (count, 4, 3)).astype(np.float32),
+        face=np.arange(count, dtype=np.int32),
+        unbound=np.zeros(count, bool),
+        strain_color=random.normal(0, 0.3, (count, 3, 3)).astype(np.float32),
+    )
+    size = float(np.ptp(posed, axis=0).max())
+    camera = look_at((0, 0, 2.5 * size), posed.mean(0), width=90, height=70, focal_length=150)
+    frames = face_frames(posed, faces, neutral, "stga", strain_basis(neutral, faces))
+    expected = render(splats, camera, (0.2, 0.9, 0.4), frames, antialiased=True)
+    composer = Composer(f"gpu:{gpu_device.device().name}")
+    got = render(splats, camera, (0.2, 0.9, 0.4), frames, True, composer)
+    assert np.abs(got - np.float32([0.2, 0.9, 0.4])[:, None, None]).max() > 0.2
+    np.testing.assert_allclose(got, expected, atol=1e-5)

@@ -1,0 +1,152 @@
+"""Video jobs without Blender: recorded layers, rendered by the function that the worker calls."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.camera import look_at
+from stga_addon.errors import StgaError
+from stga_addon.files import write_json
+from stga_addon.raster.cpu.compose import compose
+from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
+from stga_addon.render.protocol import pack_layers, unpack_layers
+from stga_addon.requests.video_job import IMAGES, VIDEO, Recorder, VideoJob, finished, read_video_job, run_video_job
+from stga_addon.worker.status import inspect_worker, request_cancel
+
+CAMERA = look_at((0, 0, 2), (0, 0, 0), 32, 24, 40.0)
+
+
+def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> PosedSplats:
+    rng = np.random.default_rng(seed)
+    floats = {"xyz": rng.normal(0, 0.3, (count, 3)), "rotation": rng.normal(size=(count, 4))}
+    floats |= {"log_scale": np.full((count, 3), -2.5), "opacity": np.ones(count), "sh": rng.normal(size=(count, 1, 3))}
+    arrays = {name: values.astype(np.float32) for name, values in floats.items()}
+    splats = Splats(**arrays, face=np.zeros(count, np.int32), unbound=np.zeros(count, bool))
+    return PosedSplats(splats, WORLD, np.eye(4) if to_world is None else to_world)
+
+
+def moved(x: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    return matrix
+
+
+def test_layers_without_what_the_reader_has() -> None:
+    """Catches splats that are sent again with each image, and others that are taken for those sent before."""
+    before = [layer(0), layer(1)]
+    after = [replace(layer(0), to_world=moved(1)), layer(2), layer(3)]
+    packed = pack_layers(after, before)
+    assert "0 splats xyz" not in packed
+    assert {"1 splats xyz", "2 splats xyz"} <= set(packed)
+    read = unpack_layers(packed, before)
+    assert len(read) == 3
+    for given, again in zip(after, read, strict=True):
+        np.testing.assert_array_equal(again.splats.xyz, given.splats.xyz)
+        np.testing.assert_array_equal(again.to_world, given.to_world)
+
+
+def test_images_are_those_recorded(tmp_path: Path) -> None:
+    """Catches images of other splats, poses or cameras than recorded, and a recording left on the disk."""
+    folder, out = tmp_path / "job", tmp_path / "out"
+    images = [[layer(0)], [replace(layer(0), to_world=moved(0.3))], [layer(1), layer(0)]]
+    recorder = Recorder(folder, VideoJob(out, len(images), 25.0, (1.0, 0.5, 0.0)))
+    for layers in images:
+        recorder.add(layers, CAMERA)
+    recorder.close()
+    run_video_job(folder)
+    assert inspect_worker(folder).state == "finished"
+    assert not (folder / IMAGES).exists()
+    for index, layers in enumerate(images):
+        expected = finished(compose(layers, CAMERA), (1.0, 0.5, 0.0), opaque=False)
+        with Image.open(out / f"{index + 1:04d}.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), expected)
+
+
+def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
+    """Catches half a video under the name of a whole one, and a cancel that counts as a failure."""
+    pytest.importorskip("av")
+    folder = tmp_path / "job"
+    recorder = Recorder(folder, VideoJob(tmp_path / "video.mp4", 1, 25.0, None))
+    recorder.add([layer(0)], CAMERA)
+    recorder.close()
+    request_cancel(folder)
+    run_video_job(folder)
+    assert inspect_worker(folder).state == "cancelled"
+    assert [path.name for path in tmp_path.iterdir()] == ["job"]
+
+
+def test_backgrounds() -> None:
+    """Catches premultiplied color in a PNG with alpha, and a background in front of the splats."""
+    image = ComposedImage(np.full((3, 1, 1), 0.25, np.float32), np.full((1, 1), 0.5, np.float32), None)
+    assert finished(image, None, opaque=False).tolist() == [[[128, 128, 128, 128]]]
+    assert finished(image, None, opaque=True).tolist() == [[[64, 64, 64]]]
+    assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
+
+
+VALID = {
+    "format": "stga-video", "version": 1, "output": "v.mp4", "images": 1, "fps": 1, "background": None, "device": "cpu"
+}  # fmt: skip
+
+
+def test_a_whole_job_is_read(tmp_path: Path) -> None:
+    """Catches a damaged job below that is refused for something else than its one damaged field."""
+    write_json(tmp_path / VIDEO, VALID)
+    assert read_video_job(tmp_path) == VideoJob(Path("v.mp4"), 1, 1.0, None, "cpu")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [],
+        {"format": "stga-job", "version": 1},
+        {"format": "stga-video", "version": 1},
+        VALID | {"images": "x"},
+        VALID | {"background": [1, 2]},
+        VALID | {"device": "x"},
+    ],
+)
+def test_damaged_jobs(tmp_path: Path, values: object) -> None:
+    """Catches a traceback for a file that was edited or is of another version."""
+    write_json(tmp_path / VIDEO, values)
+    with pytest.raises(StgaError, match=VIDEO):
+        read_video_job(tmp_path)
+
+
+def test_a_truncated_recording(tmp_path: Path) -> None:
+    """Catches a traceback where the disk was full while Blender recorded."""
+    folder = tmp_path / "job"
+    recorder = Recorder(folder, VideoJob(tmp_path / "out", 2, 25.0, None))
+    recorder.add([layer(0)], CAMERA)
+    recorder.close()
+    with pytest.raises(StgaError, match="cannot be read as the images of a video"):
+        run_video_job(folder)
+    assert inspect_worker(folder).state == "failed"
+    assert not (folder / IMAGES).exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_full_disk_while_recording(tmp_path: Path) -> None:
+    """Catches a recording whose end never reached the disk and that counts as whole, and a traceback."""
+    recorder = Recorder(tmp_path / "job", VideoJob(tmp_path / "out", 1, 25.0, None))
+    recorder._stream.close()
+    recorder._stream = Path("/dev/full").open("wb")  # noqa: SIM115
+    with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
+        recorder.add([layer(0, count=10_000)], CAMERA)
+    with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
+        recorder.close()
+    recorder.close()
+
+
+@pytest.mark.parametrize("output", ["file/video.mp4", "folder.mp4", "file"])
+def test_an_output_that_cannot_be_written(tmp_path: Path, output: str) -> None:
+    """Catches a path that is refused only after everything was rendered."""
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.mp4").mkdir()
+    with pytest.raises(StgaError, match="cannot be written"):
+        Recorder(tmp_path / "job", VideoJob(tmp_path / output, 1, 25.0, None))
+    assert not (tmp_path / "job").exists()

@@ -1,0 +1,171 @@
+"""Cost of effects: one that is off takes no memory and makes no calls; one that is on reaches the training."""
+
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from stga_addon.capture.images import read_view
+from stga_addon.capture.model import View
+from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
+from stga_addon.raster import reference
+from stga_addon.raster.cpu.rasterize import Parameters
+from stga_addon.training.effects.plan import plan_effects
+from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
+from stga_addon.training.optimize.exposure import exposure_correction
+from stga_addon.training.run import loop
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import Run
+from stga_addon.training.settings import make_settings
+from training.heads import write_head
+
+from .test_rules import unlike_cameras
+
+# What each effect calls, by where the call is made from.
+CALLS = {
+    "background": (cpu_backend, "change_background"),
+    "hull-points": (initial_splats, "hull_points"),
+    "density": (strategies, "control_density"),
+    "selection": (loop, "select_capture"),
+    "strain-color": (frames, "strain_basis"),
+}
+ITERATIONS = 12
+
+
+def train(capture, folder, monkeypatch, choice):
+    """Train with all effects on or off; how often each was called, and the checkpoint."""
+    names = dict.fromkeys((*CALLS, "view-color", "antialiasing"), choice)
+    wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up_share=0.0)
+    settings, plan = plan_effects(capture, wanted)
+    if settings.density_interval:
+        settings = replace(settings, density_interval=2, density_span=(0.0, 1.0))
+    calls: Counter[str] = Counter()
+    for effect, (module, name) in CALLS.items():
+        monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
+    loop.train(capture, folder, Run(capture.root, None, "vhap", settings, plan))
+    return calls, read_checkpoint(folder).state.splats()
+
+
+def counting(calls, effect, function):
+    def counted(*arguments, **more):
+        calls[effect] += 1
+        return function(*arguments, **more)
+
+    return counted
+
+
+def test_off_calls_nothing(painted, tmp_path, monkeypatch):
+    """Catches work and memory that an effect takes although it is off."""
+    calls, splats = train(painted(), tmp_path, monkeypatch, "off")
+    assert calls == {}
+    assert splats.sh.shape[1] == 1
+    assert splats.strain_color.size == 0
+    assert len(splats) == 6 * len(painted().faces)
+
+
+def test_on_calls_all(painted, tmp_path, monkeypatch):
+    """Catches an effect that is on but not called, which would also make the test above pass."""
+    calls, splats = train(painted(), tmp_path, monkeypatch, "on")
+    assert set(calls) == set(CALLS)
+    assert calls["background"] == ITERATIONS
+    assert splats.sh.shape[1] == 16
+    assert splats.strain_color.shape[1] == 3
+
+
+@pytest.mark.parametrize("choice", ["on", "off"])
+def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
+    """Catches parameters that are refined or written with the effect off, or not refined with it on."""
+    capture, _ = write_head(tmp_path / "head")
+    settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
+    calls: Counter[str] = Counter()
+    for module, name in ((trainer, "refinable_tracking"), (cpu_backend, "frame_backward"), (loop, "write_tracking")):
+        monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
+    loop.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
+    if choice == "off":
+        assert calls == {}
+        assert read_checkpoint(tmp_path / "run").tracking is None
+        assert not (tmp_path / "run/tracking.npz").exists()
+    else:
+        assert calls["refinable_tracking"] == 1
+        assert calls["frame_backward"] == ITERATIONS - 2  # none in the first 15 %
+        assert calls["write_tracking"] > 0
+
+
+def test_exposure_is_taken_away(painted):
+    """Catches gains and offsets applied inversely, to the background, or to another camera."""
+    gain, offset = unlike_cameras()
+    rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
+    correct = exposure_correction(make_settings(iterations=1, exposure=rows))
+    assert correct is not None
+    alike, unlike = painted(), painted(gain=gain, offset=offset)
+    for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
+        (_, expected, _), (view, image, mask) = read_view(same), read_view(other)
+        before, after = (abs(i.astype(int) - expected)[mask > 0].mean() for i in (image, correct(view, image, mask)))
+        assert after < 1.0
+        assert before > 2 * after
+        assert (correct(view, image, mask)[mask == 0] == image[mask == 0]).all()
+    stranger = replace(view, camera_index=99)
+    assert correct(stranger, image, mask) is image
+
+
+def test_no_exposure_is_no_pass():
+    """Catches images that are copied although nothing is corrected."""
+    assert exposure_correction(make_settings(iterations=1)) is None
+
+
+def test_no_splats_on_teeth(painted):
+    """Catches splats on teeth that are never visible."""
+    capture = painted()
+    vertices = len(capture.neutral)
+    rows = np.zeros((120, 3)) + capture.neutral[0] + np.random.default_rng(0).normal(0, 0.002, (120, 3))
+    faces = np.concatenate([capture.faces, teeth_faces(vertices)])
+    masks = {"teeth": np.arange(vertices, vertices + 120)}
+    flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
+    toothed = replace(
+        capture,
+        faces=faces,
+        neutral=np.concatenate([capture.neutral, rows]),
+        mesh=lambda timestep: np.concatenate([capture.mesh(timestep), rows]),
+        flame=flame,
+    )
+    for kept in (True, False):
+        splats = initial_splats.initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
+        on_teeth = (splats.face >= len(capture.faces)).sum()
+        assert on_teeth == (6 * TEETH_FACES if kept else 0)
+        assert len(splats) - on_teeth == 6 * len(capture.faces)
+
+
+def test_antialiasing_reaches_training_and_evaluation(painted):
+    """Catches an effect that is decided and then forgotten: losses and pixels must be those of the reference."""
+    capture, losses, pictures = painted(), [], []
+    view, image, _ = read_view(capture.views["train"][0], 0.4)
+    target = torch.from_numpy(image.transpose(2, 0, 1) / 255)
+    for choice in ("on", "off"):
+        settings, _ = plan_effects(capture, make_settings(iterations=1, effects={"antialiasing": choice}))
+        settings = replace(settings, lattice=0, hull_points=False)
+        small = trainer.Trainer(capture, settings, {})
+        for parameters in (small.state.parameters, small.state.average):
+            parameters.log_scale.sub_(1.5)  # narrower than a pixel
+            parameters.sh[:, 0, 0] = 1.0
+        expected = reference_image(small, view, choice == "on")
+        pictures.append(small.render(view, 0.0))
+        np.testing.assert_allclose(pictures[-1], expected, atol=1e-4)
+        difference, ssim = reference.image_loss(expected, target)
+        weight = settings.ssim_weight
+        losses.append(small.step(view, image, 0.0))
+        expected_loss = (1 - weight) * difference.mean() + weight * (1 - ssim.mean())
+        assert losses[-1] == pytest.approx(float(expected_loss), rel=1e-4)
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.05
+    assert abs(losses[0] - losses[1]) > 1e-3
+
+
+def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> torch.Tensor:
+    """The trainer's splats over white, by the reference renderer in float64."""
+    state = small.state
+    p = Parameters(*(tensor.double() for tensor in state.parameters))
+    placed = reference.embed(p.xyz, p.rotation, p.log_scale, small.frames.of(view.timestep), state.face.long())
+    color, alpha, _ = reference.render(*placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased)
+    return color + 1 - alpha

@@ -1,0 +1,133 @@
+"""Effect plan: decided once, printed, stored with the run and kept on resume."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from capture import factory
+
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+from stga_addon.errors import StgaError
+from stga_addon.files import read_json, write_json
+from stga_addon.training.effects import plan as planning
+from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
+from stga_addon.training.effects.rules import Verdict
+from stga_addon.training.run.folder import Run, read_run, write_run
+from stga_addon.training.settings import make_settings
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return factory.write_mesh_capture(tmp_path_factory.mktemp("effects") / "ball", (0, 1, 3), range(3))
+
+
+@pytest.fixture(scope="module")
+def trained(root, tmp_path_factory):
+    out = tmp_path_factory.mktemp("effects") / "run"
+    choices = ["--effect", "strain-color=on", "--effect", "hull-points=off"]
+    assert main(["train", str(root), "--out", str(out), "--iterations", "4", *choices]) == 0
+    return out
+
+
+def test_the_run_keeps_its_plan(trained):
+    """Catches decisions or their reasons that are lost in run.json, and settings that do not follow them."""
+    run = read_run(trained)
+    plan = {decision.effect: decision for decision in run.effect_plan}
+    assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == ("on", True, True)
+    assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == ("off", False, False)
+    assert plan["exposure"].choice == "auto"
+    assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
+
+
+@pytest.mark.parametrize("effect", ["strain-color", "strain-position"])
+@pytest.mark.parametrize(("choice", "expected"), [("auto", True), ("off", False)])
+def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
+    """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is overruled."""
+    capture = open_capture(root)
+    settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
+    run = with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
+    setting = effect.replace("-", "_")
+    assert not getattr(run.settings, setting)
+    called_for = [
+        replace(each, rule=lambda facts: Verdict(True, "two takes say so")) if each.name == effect else each
+        for each in planning.EFFECTS
+    ]
+    monkeypatch.setattr(planning, "EFFECTS", called_for)
+    extended = with_effects_of_takes(run, capture)
+    assert getattr(extended.settings, setting) == expected
+    changed = [now for now, then in zip(extended.effect_plan, run.effect_plan, strict=True) if now != then]
+    assert [(each.effect, each.on, each.reason) for each in changed] == expected * [(effect, True, "two takes say so")]
+    assert with_effects_of_takes(extended, capture) == extended
+
+
+def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
+    """Catches a run that goes on with other effects than it began with."""
+    monkeypatch.setattr(planning, "plan_effects", None)
+    before = read_run(trained)
+    train = ["train", str(root), "--out", str(trained), "--resume"]
+    assert main([*train, "--effect", "strain-color=on"]) == 0
+    assert read_run(trained) == before
+    assert any(
+        line.split()[:4] == ["strain-color", "on,", "as", "asked:"] for line in capsys.readouterr().out.splitlines()
+    )
+    assert main([*train, "--effect", "strain-color=off"]) == 2
+    assert "differs from what was decided for this run" in capsys.readouterr().err
+
+
+def test_info_shows_the_plan(root, capsys):
+    """Catches an overview without the plan, or with choices that it does not heed."""
+    assert main(["info", str(root), "--effect", "strain-color=on"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (strain,) = [line for line in lines if line.startswith("strain-color")]
+    assert "on, as asked: " in strain
+    assert "coefficients more a splat" in strain
+    assert any(line.startswith("exposure") and "off: " in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("effect", "says"),
+    [
+        ("jaw=on", "--effect jaw=on: "),
+        ("teeth=on", "--effect teeth=on: "),
+        ("strain=on", "--effect: 'strain=on' is not NAME=on"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(root, tmp_path, capsys, effect, says):
+    """Catches an impossible choice that is taken in silence, or ends in a traceback."""
+    assert main(["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2", "--effect", effect]) == 2
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_baselines_decide_nothing(root, tmp_path, capsys):
+    """Catches the paper's letter, or GaussianAvatars' method, with effects of ours."""
+    for options in (["--schedule", "paper"], ["--strategy", "gaussian-avatars"]):
+        out = tmp_path / options[1]
+        assert main(["train", str(root), "--out", str(out), "--iterations", "2", *options]) == 0
+        run = read_run(out)
+        assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
+        again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
+        assert main([*again, "--effect", "strain-color=on"]) == 2
+        assert "--effect cannot be combined with" in capsys.readouterr().err
+
+
+def test_settings_that_ask_for_nothing(root):
+    """Catches `make_settings` whose settings are not final: benchmarks and tests rely on them."""
+    run = Run(root, None, "vhap", make_settings(iterations=5))
+    assert with_effect_plan(run, open_capture(root)) is run
+
+
+def test_a_damaged_plan(tmp_path):
+    """Catches a run.json whose plan is taken for what it is not."""
+    write_run(tmp_path, Run(Path("/capture"), None, "vhap", make_settings(iterations=5)))
+    whole = read_json(tmp_path / "run.json")
+    good = {"effect": "jaw", "choice": "auto", "on": True, "reason": "", "cost": ""}
+    for plan in (7, [7], [{**good, "on": "yes"}], [{**good, "choice": "maybe"}], [{"effect": "jaw"}]):
+        write_json(tmp_path / "run.json", {**whole, "effect_plan": plan})
+        with pytest.raises(StgaError, match=r"run\.json: "):
+            read_run(tmp_path)
+    for row in ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0]):
+        write_json(tmp_path / "run.json", {**whole, "settings": {**whole["settings"], "exposure": [row]}})
+        with pytest.raises(StgaError, match=r"run\.json: "):
+            read_run(tmp_path)

@@ -1,0 +1,373 @@
+"""Rules of effects, on scenes whose colors depend on known causes."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
+from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
+from stga_addon.training.effects import rules
+from stga_addon.training.effects.decisions import EFFECTS, parse_choices
+from stga_addon.training.effects.evidence import fit_cameras, stable_colors
+from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
+from stga_addon.training.effects.plan import plan_effects
+from stga_addon.training.effects.samples import MAX_VIEWS, sample_views, take_samples
+from stga_addon.training.settings import TrainingSettings, make_settings
+
+from .scenes import gloss, sliding, wrinkles
+
+
+def planned(capture, **choices):
+    """effect -> decision, and the settings that follow."""
+    names = {name.replace("_", "-"): choice for name, choice in choices.items()}
+    settings, plan = plan_effects(capture, make_settings(iterations=1, effects=names))
+    return {decision.effect: decision for decision in plan}, settings
+
+
+def on(plan):
+    return {name for name, decision in plan.items() if decision.on}
+
+
+def gains(decision):
+    """Of colors in frames, and in cameras, that were left out."""
+    return [float(part.split()[0]) for part in decision.reason.split("by ")[1:]]
+
+
+def test_plain(painted):
+    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there."""
+    plan, settings = planned(painted())
+    assert on(plan) == {"antialiasing", "background", "density"}
+    assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
+
+
+def test_color_that_follows_strain(painted):
+    """Catches wrinkles that are not seen, or are taken for the cameras' doing."""
+    plan, settings = planned(painted(paint=wrinkles))
+    assert on(plan) == {"antialiasing", "background", "density", "strain-color", "strain-position"}
+    assert settings.strain_color
+    unseen_frames, unseen_cameras = gains(plan["strain-color"])
+    assert unseen_frames > 4
+    assert unseen_cameras > 4
+
+
+def test_what_moves_over_triangles_with_strain(painted):
+    """Catches positions that follow the mesh alone where its surface slides, and that choice where it is refused."""
+    plan, settings = planned(painted(paint=sliding))
+    assert plan["strain-position"].on
+    assert settings.strain_position
+    assert min(gains(plan["strain-position"])) > 4
+    assert not planned(painted(paint=sliding), strain_position="off")[1].strain_position
+    with pytest.raises(StgaError, match="strain-position=on: is not possible, because the mesh has the same shape"):
+        planned(painted(timesteps=1, deformed=0.0), strain_position="on")
+
+
+def test_color_that_follows_the_view(painted):
+    """Catches gloss that is not seen, or is taken for the cameras' exposure."""
+    plan, settings = planned(painted(paint=gloss))
+    assert on(plan) == {"antialiasing", "background", "density", "view-color"}
+    assert settings.sh_degree == TrainingSettings.sh_degree
+
+
+def unlike_cameras():
+    rng = np.random.default_rng(5)
+    gain, offset = rng.uniform(0.92, 1.08, (8, 3)), rng.normal(0, 3, (8, 3))
+    return gain / gain.mean(0), offset - offset.mean(0)
+
+
+def test_cameras_of_different_exposure(painted):
+    """Catches gains and offsets that are not found, mixed up between cameras, or wrong by more than two levels."""
+    gain, offset = unlike_cameras()
+    plan, settings = planned(painted(gain=gain, offset=offset))
+    assert on(plan) == {"antialiasing", "background", "density", "exposure"}
+    rows = np.array(settings.exposure)
+    assert rows[:, 0].tolist() == list(range(8))
+    for level in (80, 120, 160):  # what the ball's colors are
+        truth, found = gain * level + offset, rows[:, 1:4] * level + rows[:, 4:]
+        assert abs(found - truth).max() < 2.0
+    assert abs(gain * 120 + offset - 120).max() > 8.0
+
+
+def test_one_camera(painted):
+    """Catches effects that one camera cannot tell anything about."""
+    plan, settings = planned(painted(cameras=1, paint=gloss))
+    assert on(plan) == {"antialiasing", "background", "density", "depth-limits"}
+    assert (settings.scale_limit, settings.stray_limit, settings.adam_epsilon) == (1.5, 0.5, 0.03)
+    for name in ("view-color", "exposure"):
+        with pytest.raises(StgaError, match=f"--effect {name}=on: is not possible, because a single camera"):
+            planned(painted(cameras=1, paint=gloss), **{name.replace("-", "_"): "on"})
+    assert settings.sh_steps == ()
+
+
+def test_one_frame(painted):
+    """Catches strain that is asked of a single frame, and a static capture that is refused as a whole."""
+    plan, _ = planned(painted(timesteps=1, deformed=0.0))
+    assert on(plan) == {"antialiasing", "background", "density"}
+    with pytest.raises(StgaError, match="strain-color=on: is not possible, because the mesh has the same shape"):
+        planned(painted(timesteps=1, deformed=0.0), strain_color="on")
+    with pytest.raises(StgaError, match="selection=on: is not possible, because no triangle moves"):
+        planned(painted(timesteps=1, deformed=0.0), selection="on")
+
+
+def test_background(painted):
+    """Catches a background that is guessed without masks, and a wrong color that splats are trained against."""
+    plan, settings = planned(painted(background=(0, 0, 0)))
+    assert plan["background"].on
+    assert settings.background == (0.0, 0.0, 0.0)
+    plan, settings = planned(painted(masks=False))
+    assert not plan["background"].on
+    assert not settings.random_background
+    with pytest.raises(StgaError, match="background=on: is not possible, because not every image has a mask"):
+        planned(painted(masks=False), background="on")
+
+
+def test_a_room_behind_the_head(painted):
+    """Catches a background of many colors that is exchanged as if it had one."""
+    facts = CaptureFacts(painted(), make_settings(iterations=1))
+    facts.samples = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
+    verdict = rules.background(facts)
+    assert (verdict.on, verdict.only) == (False, True)
+
+
+def test_something_beside_the_mesh(painted):
+    """Catches hair that gets no splats because the mesh ends below it."""
+    capture = painted()
+    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]  # the ball's top is cut off
+    plan, settings = planned(replace(capture, faces=low))
+    assert plan["hull-points"].on
+    assert settings.hull_points
+
+
+def test_something_beside_the_mesh_of_one_camera(painted):
+    """Catches hair that a single camera shows and nothing is trained for, and depth that is promised from it."""
+    capture = painted(cameras=1)
+    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]  # the ball's top is cut off
+    plan, settings = planned(replace(capture, faces=low))
+    assert settings.hull_points
+    assert "becomes a flat layer" in plan["hull-points"].reason
+
+
+def test_different_pixels(painted):
+    """Catches cameras whose pixels are of different size and are treated as alike."""
+    capture = painted()
+    views = [
+        replace(view, camera=replace(view.camera, fl_x=840.0, fl_y=840.0)) if view.camera_index == 0 else view
+        for view in capture.views["train"]
+    ]
+    facts = CaptureFacts(replace(capture, views={"train": tuple(views)}), make_settings(iterations=1, lattice=0))
+    assert facts.pixel_range == pytest.approx(2.0, abs=0.1)
+    assert rules.antialiasing(facts).on
+    assert not rules.antialiasing(CaptureFacts(painted(), make_settings(iterations=1, lattice=0))).on
+    assert rules.antialiasing(CaptureFacts(painted(), make_settings(iterations=1))).on
+
+
+def test_many_splats_a_pixel(painted):
+    """Catches density control where the first splats are already finer than the images."""
+    settings, plan = plan_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
+    assert not next(decision.on for decision in plan if decision.effect == "density")
+    assert settings.density_interval == 0
+
+
+def test_selection_follows_the_strategy(painted):
+    """Catches a strategy that was asked for and is dropped, or one that was not and is taken."""
+    settings, _ = plan_effects(painted(), make_settings("selective", iterations=1, effects={}))
+    assert settings.strategy == "selective"
+    _, settings = planned(painted(), selection="on")
+    assert settings.strategy == "selective"
+    settings, plan = plan_effects(
+        painted(timesteps=1, deformed=0.0), make_settings("selective", iterations=1, effects={})
+    )
+    assert settings.strategy == "global"
+    assert "2 mm" in next(decision.reason for decision in plan if decision.effect == "selection")
+
+
+def frame(**pose):
+    zero = {name: np.zeros(3) for name in ("rotation", "neck_pose", "jaw_pose", "translation")}
+    return FlameFrame(**{"expr": np.zeros(2), "eyes_pose": np.zeros(6), **zero, **pose})
+
+
+def with_frames(*frames):
+    """Facts of a FLAME capture that has these frames and no teeth."""
+    model = SimpleNamespace(v_template=np.zeros((10, 3)))
+    flame = SimpleNamespace(timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model)
+    capture = SimpleNamespace(views={"train": ()}, flame=flame, timesteps=flame.timesteps)
+    return CaptureFacts(capture, make_settings(iterations=1))
+
+
+def looked(facts, name):
+    return next(effect for effect in rules.EFFECTS if effect.name == name).rule(facts)
+
+
+@pytest.mark.parametrize(
+    ("name", "pose"),
+    [
+        ("neck", {"neck_pose": np.array([0.1, 0, 0])}),
+        ("jaw", {"jaw_pose": np.array([0.1, 0, 0])}),
+        ("eyes", {"eyes_pose": np.array([0, 0, 0, 0, 0.1, 0])}),
+    ],
+)
+def test_joints_that_move(name, pose):
+    """Catches a joint that is taken for another, and the second eye that is forgotten."""
+    facts = with_frames(frame(), frame(**pose))
+    moving = {joint for joint in ("neck", "jaw", "eyes") if looked(facts, joint).on}
+    assert moving == {name}
+    assert "5.7°" in looked(facts, name).reason
+
+
+def test_dynamic_offsets():
+    """Catches offsets that are switched off although the tracked mesh is made with them, and the other way round."""
+    assert looked(with_frames(frame()), "dynamic-offsets").on is False
+    found = looked(with_frames(frame(), frame(dynamic_offset=np.ones((10, 3)))), "dynamic-offsets")
+    assert (found.on, found.only) == (True, True)
+
+
+def off_track(capture, meters, device="cpu"):
+    """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
+    meshes = {timestep: capture.mesh(timestep) + np.array([meters, 0, 0]) for timestep in capture.timesteps}
+    facts = CaptureFacts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
+    facts.frames = [frame()]
+    return facts
+
+
+def test_mesh_and_mask_disagree(painted):
+    """Catches a tracking that is off and left so, and one that is refined although nothing says that it is off."""
+    assert not rules.tracking(off_track(painted(), 0.0)).on
+    found = rules.tracking(off_track(painted(), 0.012))  # five pixels
+    assert found.on
+    assert 0.5 < float(found.reason.split("%")[0]) < 5.0
+    unknown = rules.tracking(off_track(painted(masks=False), 0.012))
+    assert (unknown.on, unknown.only) == (False, False)
+    for impossible in (off_track(painted(timesteps=1), 0.012), off_track(painted(), 0.012, "cuda:0")):
+        verdict = rules.tracking(impossible)
+        assert (verdict.on, verdict.only) == (False, True)
+    assert "on the CPU only, not on cuda:0" in verdict.reason
+
+
+def test_a_capture_that_was_tracked_here(painted, tmp_path):
+    """Catches the effect left off where masks are filled and the tracking is known to be that of landmarks."""
+    facts = off_track(painted(), 0.0)
+    facts.capture = replace(facts.capture, root=tmp_path)
+    assert not rules.tracking(facts).on
+    (tmp_path / LANDMARKS_FOLDER).mkdir()
+    for name in (REPORT_FILE, f"{LANDMARKS_FOLDER}/{PLACES_FILE}"):
+        (tmp_path / name).touch()
+    assert rules.tracking(facts).on
+    facts.device = "gpu:0"
+    assert not rules.tracking(facts).on
+
+
+def test_what_a_mesh_sequence_has_not(painted):
+    """Catches an effect of FLAME's that is planned for, or forced on, a capture without its parameters."""
+    plan, _ = planned(painted())
+    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}
+    with pytest.raises(StgaError, match=r"--effect teeth=on: .* has none"):
+        planned(painted(), teeth="on")
+    with pytest.raises(StgaError, match=r"--effect jaw=on: .* no parameters of FLAME"):
+        planned(painted(), jaw="on")
+
+
+def test_overrides(painted):
+    """Catches a choice that does not reach the settings, or whose reason is lost."""
+    plan, settings = planned(painted(), strain_color="on", view_color="on", background="off", density="off")
+    assert (settings.strain_color, settings.sh_degree, settings.random_background) == (True, 3, False)
+    assert settings.density_interval == 0
+    assert plan["strain-color"].choice == "on"
+    assert "as asked" in str(plan["strain-color"])
+    assert "0.0 of 255 levels" in plan["strain-color"].reason
+
+
+def test_names():
+    """Catches an effect that the command line does not know, or knows in vain."""
+    assert tuple(effect.name for effect in rules.EFFECTS) == EFFECTS
+    assert parse_choices(["jaw=off", "hull-points=on"]) == {"jaw": "off", "hull-points": "on"}
+    for wrong in ("jaws=on", "jaw", "jaw=maybe"):
+        with pytest.raises(StgaError, match=f"'{wrong}' is not NAME=on"):
+            parse_choices([wrong])
+
+
+def test_samples(painted):
+    """Catches colors that are taken beside their triangle or from one that another hides."""
+    capture = painted()
+    samples = take_samples(capture)
+    assert samples.seen.any(0).mean() > 0.5
+    away = capture.neutral[capture.faces[samples.faces]].mean(1)
+    hidden = np.einsum("skd,kd->sk", samples.direction, away / 0.1) > 0.3
+    assert not (samples.seen & hidden).any()
+    other = take_samples(capture, seed=1)
+    known = samples.seen.any(0) & other.seen.any(0)
+    assert len(known) == len(capture.faces)
+    middle = np.nanmedian(samples.color[:, known], 0) - np.nanmedian(other.color[:, known], 0)
+    assert abs(middle).mean() < 2.0
+
+
+def test_hidden_triangles(painted):
+    """Catches colors of whatever stands in front, a hand or the nose, that are taken for the triangle's own."""
+    capture = painted()
+    plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])  # above the ball's equator
+    corners = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(capture.neutral)
+    neutral = np.concatenate([capture.neutral, plate])
+    front = replace(
+        capture,
+        views={"train": tuple(view for view in capture.views["train"] if view.camera_index == 4)},
+        neutral=neutral,
+        faces=np.concatenate([capture.faces, corners]),
+        mesh=lambda timestep: np.concatenate([capture.mesh(timestep), plate]),
+    )
+    samples = take_samples(front)
+    height = front.neutral[front.faces[samples.faces]].mean(1)[:, 1]
+    ball = samples.faces < len(capture.faces)
+    assert not samples.seen[:, ball & (height > 0.05)].any()
+    assert samples.seen[:, ball & (height < -0.05)].any()
+    alone = take_samples(replace(capture, views=front.views))
+    assert alone.seen[:, capture.neutral[capture.faces[alone.faces]].mean(1)[:, 1] > 0.05].any()
+
+
+def test_views_are_spread():
+    """Catches cameras or timesteps that are left out of a long sequence, and more views than there is time for."""
+    views = [SimpleNamespace(timestep=t, camera_index=c) for t in range(500) for c in range(16)]
+    chosen = sample_views(views)
+    assert len(chosen) == MAX_VIEWS == len({(view.timestep, view.camera_index) for view in chosen})
+    counts = np.bincount([view.camera_index for view in chosen], minlength=16)
+    assert counts.max() - counts.min() <= 1
+    assert {view.timestep for view in chosen} >= {0, 499}
+    few = [SimpleNamespace(timestep=0, camera_index=c) for c in range(3)]
+    assert len(sample_views(few)) == 3
+
+
+def test_two_cameras_that_are_alike(painted):
+    """Catches a fit that explains noise by cameras."""
+    samples = take_samples(painted())
+    found = fit_cameras(samples, stable_colors(samples.color.astype(float)))
+    assert abs(found.gain * 120 + found.offset - 120).max() < 1.5
+
+
+def test_each_timestep_is_posed_once(painted):
+    """Catches a long capture of which every timestep is posed, or one several times, to decide its effects."""
+    neutral = np.random.default_rng(0).normal(size=(TEMPLATE_VERTICES + TEETH_VERTICES, 3))
+    posed: list[int] = []
+
+    def expression_mesh(timestep, zero_pose):
+        posed.append(timestep)
+        return neutral + 0.01
+
+    flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral))
+    capture = replace(
+        painted(), timesteps=tuple(range(500)), neutral=neutral, expression_mesh=expression_mesh, flame=flame
+    )
+    facts = CaptureFacts(capture, make_settings(iterations=1))
+    assert facts.selected_share == 1
+    assert facts.lip_gap_mm == pytest.approx(0)
+    assert len(posed) == len(set(posed)) == MAX_TIMESTEPS
+    assert {0, 499} <= set(posed)
+
+
+def test_a_sample_without_motion_does_not_forbid_selection(painted):
+    """Catches a choice that is refused because the few timesteps that were posed happen not to move."""
+    capture = painted()
+    still = replace(capture, timesteps=tuple(range(500)), expression_mesh=lambda timestep, zero_pose: capture.neutral)
+    verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
+    assert (verdict.on, verdict.only) == (False, False)
+    assert "any of 64 frames" in verdict.reason
