@@ -5,11 +5,12 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.errors import StgaError
-from ..stga_addon.scene import tags
+from ..stga_addon.requests.results import Analyzed
+from ..stga_addon.requests.values import Analyze
+from ..stga_addon.training.effects.decisions import parse_choices
 from . import background, ids
-from .background import Command
-from .common import head_of, needs_head, reporting, scene_settings
+from .background import Question
+from .common import capture_source, head_of, needs_head, reporting, scene_settings
 
 
 class AnalyzeCapture(bpy.types.Operator):
@@ -25,8 +26,8 @@ class AnalyzeCapture(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        arguments = _arguments(head_of(context), scene_settings(context))
-        background.start(context, Command(arguments, _fill, "analysis_error"))
+        request = _request(head_of(context), scene_settings(context))
+        background.start(context, Question(request, _fill, "analysis_error"))
         return {"FINISHED"}
 
 
@@ -54,27 +55,19 @@ def chosen_effects(settings: Any) -> list[str]:
     return [f"{row.name}={row.choice}" for row in settings.effects if row.choice != "auto"]
 
 
-def _arguments(head: Any, settings: Any) -> list[str]:
-    point = head.get(tags.PRINCIPAL_POINT, "vhap")
-    arguments = ["info", head[tags.CAPTURE], "--json", "--presets", "--principal-point", point]
-    arguments += ["--device", settings.device]
-    if head.get(tags.FLAME_MODEL):
-        arguments += ["--flame", head[tags.FLAME_MODEL]]
-    return arguments + [part for effect in chosen_effects(settings) for part in ("--effect", effect)]
+def _request(head: Any, settings: Any) -> Analyze:
+    capture, flame, principal_point = capture_source(head)
+    effects = parse_choices(chosen_effects(settings))
+    return Analyze(capture, flame, principal_point, effects, settings.device, timed=True)
 
 
-def _fill(scene: Any, output: str) -> None:
+def _fill(scene: Any, found: Analyzed) -> None:
     """Fill the scene's table of effects."""
     settings = getattr(scene, ids.SETTINGS)
-    try:
-        found = json.loads(output)
-    except ValueError as error:
-        raise StgaError(f"Analysis printed something other than JSON ({error})") from error
-    decisions = found["plan"]
-    settings.preset_timing = json.dumps({row["preset"]: row["seconds"] for row in found.get("presets", ())})
+    settings.preset_timing = json.dumps(dict(found.seconds))
     settings.effects.clear()
-    for decision in decisions:
+    for decision in found.plan:
         row = settings.effects.add()
-        row.name = decision["effect"]
+        row.name = decision.effect
         for name in ("choice", "on", "reason", "cost"):
-            setattr(row, name, decision[name])
+            setattr(row, name, getattr(decision, name))

@@ -122,14 +122,16 @@ def flame_model_path(context: Any, given: str = "") -> Path | None:
     return file_path(path, "FLAME model") if path else None
 
 
+def capture_source(head: Any) -> tuple[Path, Path | None, str]:
+    """The capture that a head was imported from, its FLAME model and its convention of principal points, as
+    `open_capture` takes them."""
+    model = head.get(tags.FLAME_MODEL)
+    return Path(head[tags.CAPTURE]), Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
+
+
 def capture_of(head: Any) -> Capture:
     """Open the capture that a head was imported from. Raises StgaError where it has moved or changed."""
-    model = head.get(tags.FLAME_MODEL)
-    return open_capture(
-        Path(head[tags.CAPTURE]),
-        flame=Path(model) if model else None,
-        principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
-    )
+    return open_capture(*capture_source(head))
 
 
 def flame_of(capture: Capture, name: str) -> FlameSequence:

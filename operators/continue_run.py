@@ -1,28 +1,27 @@
 """Continues a trained avatar: refines a region of it, or extends it by a further take of the same head."""
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.training_job import REGION, TrainingJob, job_folder, write_job
+from ..stga_addon.requests.values import Extend as ExtendRequest
+from ..stga_addon.requests.values import Refine as RefineRequest
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_triangles
-from ..stga_addon.training.run.folder import next_folder
-from ..stga_addon.training.run.request import Extension, Refinement, Request
+from ..stga_addon.training.run.folder import AVATAR, next_folder
 from . import ids
-from .common import file_path, head_of, reporting, scene_settings
+from .common import capture_source, file_path, head_of, reporting, scene_settings
+from .request import python_of
 from .train import (
     adapter_property,
     device_of,
     device_property,
     may_train,
-    python_of,
     python_property,
-    start_job,
+    start_training,
     wait_property,
 )
 
@@ -85,10 +84,9 @@ class Refine(bpy.types.Operator):
         head, parent = head_of(context), file_path(self.directory, "run folder").resolve()
         run = next_folder(parent)
         weights = None if self.region else _painted_region(head, self.group)
-        region = self.region or str(job_folder(run) / REGION)
         frames = None if self.last < 0 else (max(self.first, 0), self.last)
-        wanted = Refinement(parent, region, frames, self.growth, **_budget(self))
-        return _start(self, context, run, wanted, weights)
+        request = RefineRequest(run, parent, self.region, weights, frames, self.growth, **_common(self, head))
+        return _start(self, context, request)
 
 
 class Extend(bpy.types.Operator):
@@ -126,11 +124,15 @@ class Extend(bpy.types.Operator):
         take = file_path(self.take, "take").resolve()
         if not take.is_dir():
             raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
-        return _start(self, context, next_folder(parent), Extension(parent, (take,), **_budget(self)), None)
+        request = ExtendRequest(next_folder(parent), parent, (take,), **_common(self, head_of(context)))
+        return _start(self, context, request)
 
 
-def _budget(operator: Any) -> dict[str, Any]:
-    return {"iterations": operator.iterations} if operator.iterations else {"seconds": operator.seconds}
+def _common(operator: Any, head: Any) -> dict[str, Any]:
+    """What both requests have: budget, FLAME model and device."""
+    budget = {"iterations": operator.iterations} if operator.iterations else {"seconds": operator.seconds}
+    _, flame, _ = capture_source(head)
+    return {**budget, "flame": flame, "device": device_of(operator)}
 
 
 def _painted_region(head: Any, group: str) -> np.ndarray:
@@ -149,27 +151,16 @@ def _painted_region(head: Any, group: str) -> np.ndarray:
     return weights
 
 
-def _start(operator: Any, context: Any, run: Path, wanted: Request, weights: "np.ndarray | None") -> set[str]:
+def _start(operator: Any, context: Any, request: RefineRequest | ExtendRequest) -> set[str]:
     """Start the worker; the splats that show the run before show the new one, so that its preview changes them."""
-    head, settings = head_of(context), scene_settings(context)
-    model = head.get(tags.FLAME_MODEL)
-    if not (wanted.parent / "avatar.npz").is_file():
-        raise StgaError(f"{wanted.parent}: holds no trained avatar; train one first")
-    job = TrainingJob(
-        Path(head[tags.CAPTURE]),
-        Path(model) if model else None,
-        head.get(tags.PRINCIPAL_POINT, "vhap"),
-        None,
-        device_of(operator),
-        wanted,
-    )
-    python = python_of(operator, context)
-    write_job(run, job, region=weights)
-    result = start_job(operator, context, run, python)
-    shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(wanted.parent)]
+    settings = scene_settings(context)
+    if not (request.parent / AVATAR).is_file():
+        raise StgaError(f"{request.parent}: holds no trained avatar; train one first")
+    result = start_training(operator, context, request, python_of(operator, context))
+    shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(request.parent)]
     if not shown and settings.splats is not None:
         shown = [settings.splats]
     for thing in shown:
-        thing[tags.RUN] = str(run)
-    settings.run_folder = str(run)
+        thing[tags.RUN] = str(request.run)
+    settings.run_folder = str(request.run)
     return result

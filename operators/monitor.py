@@ -5,7 +5,7 @@ timer.
 """
 
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +20,8 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.requests import monitor_state as states
+from ..stga_addon.requests.folder import PREVIEW, request_folder
 from ..stga_addon.requests.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
-from ..stga_addon.requests.training_job import PREVIEW, job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
@@ -42,6 +42,8 @@ _curves: dict[Path, Curve | None] = {}
 """Run folder -> its curve as last read."""
 _snapshots: dict[Path, WorkerSnapshot] = {}
 """Status folders of workers that belong to no scene: those of the training environment."""
+_followers: dict[Path, Callable[[], bool]] = {}
+"""Status folder -> called when its worker has ended, again until it returns True."""
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Status folder -> worker that this Blender started, whose exit code is known."""
 
@@ -59,7 +61,7 @@ def training_of(scene: Any) -> MonitorState:
     if state.run is None:
         return state
     folder = _locate(scene, state.run)
-    return replace(state, folder=folder, snapshot=inspect_status(job_folder(folder)))
+    return replace(state, folder=folder, snapshot=inspect_status(request_folder(folder)))
 
 
 def curve(folder: Path) -> Curve | None:
@@ -70,7 +72,7 @@ def curve(folder: Path) -> Curve | None:
 def start_training(scene: Any, run: Path, process: "Popen[bytes] | None") -> None:
     """Monitor a run that was started for the scene; process: its worker, None where this process trains."""
     if process is not None:
-        _processes[job_folder(run)] = process
+        _processes[request_folder(run)] = process
     _handle(scene, states.Started(run))
     check_now(scene)
 
@@ -84,7 +86,7 @@ def dismiss_training(scene: Any) -> None:
     """Forget the scene's training."""
     state = training_of(scene)
     if state.folder is not None:
-        _processes.pop(job_folder(state.folder), None)
+        _processes.pop(request_folder(state.folder), None)
         _curves.pop(state.folder, None)
     _handle(scene, states.Dismissed())
 
@@ -96,12 +98,22 @@ def check_now(scene: Any) -> None:
     _start_timer()
 
 
-def monitor_worker(folder: Path, process: "Popen[bytes] | None" = None) -> None:
-    """Monitor a worker that belongs to no scene until it ends."""
+def monitor_worker(
+    folder: Path, process: "Popen[bytes] | None" = None, when_ended: Callable[[], bool] | None = None
+) -> None:
+    """Monitor a worker until it ends; then call `when_ended`, again until it returns True, unless Blender renders."""
     if process is not None:
         _processes[folder] = process
+    if when_ended is not None:
+        _followers[folder] = when_ended
     _snapshots[folder] = inspect_status(folder)
     _start_timer()
+
+
+def forget_worker(folder: Path) -> None:
+    """No longer monitor a worker."""
+    for known in (_snapshots, _followers, _processes):
+        known.pop(folder, None)
 
 
 def snapshot(folder: Path) -> WorkerSnapshot:
@@ -124,7 +136,7 @@ def has_timer() -> bool:
 def tick() -> float | None:
     """Check every scene and worker; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
     intervals = [_check_safely(scene) for scene in bpy.data.scenes if scene.library is None]
-    for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive]:
+    for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive or folder in _followers]:
         intervals.append(_check_worker_safely(folder))
     return min((interval for interval in intervals if interval is not None), default=None)
 
@@ -150,7 +162,22 @@ def _check_worker_safely(folder: Path) -> float | None:
         _snapshots[folder] = WorkerSnapshot()
     if _snapshots[folder] != before:
         redraw()
-    return CHECK_INTERVAL_S if _snapshots[folder].state.is_alive else None
+    if not _snapshots[folder].state.is_alive:
+        _call_follower(folder)
+    return CHECK_INTERVAL_S if folder in _followers or _snapshots[folder].state.is_alive else None
+
+
+def _call_follower(folder: Path) -> None:
+    """Call what waits for the end of the worker, unless Blender renders: its thread reads what would be changed."""
+    if folder not in _followers or bpy.app.is_job_running("RENDER"):
+        return
+    try:
+        if not _followers[folder]():
+            return
+    except Exception:
+        traceback.print_exc()
+    _followers.pop(folder, None)
+    redraw()
 
 
 def _read_scene(scene: Any) -> MonitorState:
@@ -180,16 +207,16 @@ def _stored(scene: Any) -> tuple[Path | None, bool]:
 def _locate(scene: Any, run: Path) -> Path:
     """The run's folder; where it is gone, the scene's run folder, which may have moved along with the .blend file."""
     beside = Path(bpy.path.abspath(getattr(scene, ids.SETTINGS).run_folder))
-    return next((folder for folder in (run, beside) if job_folder(folder).is_dir()), run)
+    return next((folder for folder in (run, beside) if request_folder(folder).is_dir()), run)
 
 
 def _read_status(scene: Any, show_result: bool | None = None) -> states.StatusRead:
     settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
     assert run is not None
     folder = _locate(scene, run)
-    files = RunFiles(_stamp(job_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
+    files = RunFiles(_stamp(request_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
     shown = settings.show_result if show_result is None else show_result
-    return states.StatusRead(folder, inspect_status(job_folder(folder)), files, settings.live_preview, shown)
+    return states.StatusRead(folder, inspect_status(request_folder(folder)), files, settings.live_preview, shown)
 
 
 def _stamp(path: Path) -> states.Stamp | None:
@@ -370,5 +397,5 @@ def unregister() -> None:
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     _loader.close()
-    for known in (_states, _curves, _snapshots, _processes):
+    for known in (_states, _curves, _snapshots, _followers, _processes):
         known.clear()

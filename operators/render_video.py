@@ -1,6 +1,5 @@
 """Renders a video of the shown splats: Blender records what each image shows, a worker renders and encodes it."""
 
-import subprocess
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -16,20 +15,23 @@ from ..stga_addon.capture.camera import Camera
 from ..stga_addon.capture.camera_path import TURNTABLE_S, to_and_fro
 from ..stga_addon.errors import StgaError
 from ..stga_addon.raster.posed_splats import PosedSplats
-from ..stga_addon.requests.training_job import worker_arguments
-from ..stga_addon.requests.video_job import Recorder, VideoJob, remove_video_job
+from ..stga_addon.render.recording import Recorder, check_output
+from ..stga_addon.requests.folder import FILES
+from ..stga_addon.requests.values import RenderRecording
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
 from ..stga_addon.scene.render.engine import srgb_background
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.timeline import frames_per_second
-from ..stga_addon.worker.launch import start_worker
-from ..stga_addon.worker.status import WorkerState, inspect_worker, request_cancel
+from ..stga_addon.worker.status import refuse_running_worker, remove_status_folder, request_cancel
 from . import ids, monitor
 from .common import file_path, is_head, reporting, scene_settings
 from .environment import has_training_python, training_python
 from .render_engine import render_device
+from .request import start
+from .request import wait as wait_for
 
+RECORDING = "recording.bin"
 RECORDING_INTERVAL_S = 0.001
 """Between two recorded images, so that Blender handles its events."""
 
@@ -195,11 +197,11 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
 
     def _render(self, context: Any, wait: bool = False) -> set[str]:
         """Start the worker; `wait`: until it ends. Raises StgaError where it failed then."""
-        video = self._recording.finish()
-        process = start_worker(video.folder, self._python, worker_arguments(video.folder))
+        video, request = self._recording.finish()
+        process = start(video.folder, request, self._python)
         monitor.monitor_worker(video.folder, process)
         if wait:
-            _wait(video, process)
+            wait_for(video.folder, process)
             self.report({"INFO"}, f"Rendered {video.output}")
         return {"FINISHED"}
 
@@ -245,7 +247,7 @@ class DismissVideo(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        remove_video_job(_videos.pop(context.scene.session_uid).folder)
+        _remove(_videos.pop(context.scene.session_uid).folder)
         return {"FINISHED"}
 
 
@@ -261,15 +263,22 @@ class _Recording:
     def __init__(self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None) -> None:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
-        self._cache, self._layers = SplatCache(), dict[int, list[PosedSplats]]()
-        job = VideoJob(
-            output, len(frames), frames_per_second(context.scene), srgb_background(context.scene), render_device()
+        self._view_layer = context.view_layer
+        self._cache, self._posed = SplatCache(), (-1, list[PosedSplats]())
+        check_output(output)
+        folder, self._recorder = _start_recording()
+        self._request = RenderRecording(
+            self._recorder.path,
+            output,
+            len(frames),
+            frames_per_second(context.scene),
+            srgb_background(context.scene),
+            render_device(),
         )
-        folder, self._recorder = _start_recording(job)
         self.video = Video(output, folder, len(frames))
         last = _videos.get(context.scene.session_uid)
         if last is not None:
-            remove_video_job(last.folder)
+            _remove(last.folder)
         _videos[context.scene.session_uid] = self.video
 
     def is_wanted(self) -> bool:
@@ -280,30 +289,30 @@ class _Recording:
         """Record an image; whether there are more. Raises StgaError, as where the head is gone."""
         index = self.video.recorded
         frame = self._frames[index]
-        if frame not in self._layers:
-            self._scene.frame_set(frame)
-            if self._cameras is None:
-                self._layers.clear()  # each frame comes once
-            layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
-            self._layers[frame] = [layer.posed() for layer in layers]
-        own = self._cameras is None
-        camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[index]
-        self._recorder.add(self._layers[frame], camera)
+        # The recorded scene, which the window may no longer show.
+        with bpy.context.temp_override(scene=self._scene, view_layer=self._view_layer):
+            if frame != self._posed[0]:
+                self._scene.frame_set(frame)
+                layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
+                self._posed = frame, [layer.posed() for layer in layers]
+            own = self._cameras is None
+            camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[index]
+        self._recorder.add(self._posed[1], camera)
         self.video.recorded += 1
         return self.video.is_recording
 
-    def finish(self) -> Video:
-        """End the recording; the job is ready for its worker. Raises StgaError on a full disk."""
+    def finish(self) -> tuple[Video, RenderRecording]:
+        """End the recording; the request is ready for its worker. Raises StgaError on a full disk."""
         self._restore()
         self._recorder.close()
-        return self.video
+        return self.video, self._request
 
     def discard(self) -> None:
         """End the recording and remove its files."""
         self._restore()
         with suppress(StgaError):  # a full disk
             self._recorder.close()
-        remove_video_job(self.video.folder)
+        _remove(self.video.folder)
         for scene, video in list(_videos.items()):
             if video is self.video:
                 del _videos[scene]
@@ -314,29 +323,29 @@ class _Recording:
             self._scene.frame_set(frame, subframe=subframe)
 
 
-def _start_recording(job: VideoJob) -> tuple[Path, Recorder]:
-    """A temporary folder for the job, and what records into it. Raises StgaError, and leaves no folder then."""
+def _start_recording() -> tuple[Path, Recorder]:
+    """A temporary folder for the request, and what records into it. Raises StgaError, and leaves no folder then."""
     try:
         folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
     except OSError as error:
         raise StgaError(f"{tempfile.gettempdir()}: cannot be written ({error.strerror or error})") from error
     try:
-        return folder, Recorder(folder, job)
+        return folder, Recorder(folder / RECORDING)
     except StgaError:
-        remove_video_job(folder)
+        _remove(folder)
         raise
 
 
-def _wait(video: Video, process: "subprocess.Popen[bytes]") -> None:
-    process.wait()
-    last = inspect_worker(video.folder, process)
-    if last.state != WorkerState.FINISHED:
-        raise StgaError(last.status.error or "The video was cancelled")
+def _remove(folder: Path) -> None:
+    """Remove a recording, its request and its status; the video stays. Raises StgaError while its worker works."""
+    refuse_running_worker(folder)
+    (folder / RECORDING).unlink(missing_ok=True)
+    remove_status_folder(folder, FILES)
 
 
 def unregister() -> None:
     """Forget the videos, and remove the jobs of those that are finished; other workers go on."""
     for video in _videos.values():
         with suppress(StgaError):  # its worker is running
-            remove_video_job(video.folder)
+            _remove(video.folder)
     _videos.clear()

@@ -1,20 +1,19 @@
 """Selects, frame by frame, the triangles that extending a run by this take would train, before anything is trained."""
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.files import read_npz
+from ..stga_addon.requests.results import Selected
+from ..stga_addon.requests.values import SelectForTake
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import write_selection
 from . import background, ids, monitor
-from .background import Command
-from .common import file_path, head_of, is_head, needs_own_head, reporting
+from .background import Question
+from .common import capture_source, file_path, head_of, is_head, needs_own_head, reporting
 from .select import count_selected
 
 
@@ -37,20 +36,13 @@ class SelectExtension(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         head, run = head_of(context), file_path(self.directory, "run folder")
-        folder = TemporaryDirectory(prefix="stga_")
-        found = Path(folder.name) / "selection.npz"
+        take, flame, _ = capture_source(head)
 
-        take = head[tags.CAPTURE]
+        def show(scene: Any, found: Selected) -> None:
+            _show(scene, str(take), dict(found.selection))
 
-        def show(scene: Any, output: str) -> None:
-            with folder:
-                selection = {int(timestep): faces for timestep, faces in read_npz(found).items()}
-            _show(scene, take, selection)
-
-        arguments = ["extend", str(run), take, "--select-only", str(found)]
-        if head.get(tags.FLAME_MODEL):
-            arguments += ["--flame", head[tags.FLAME_MODEL]]
-        background.start(context, Command(arguments, show, "extension_error", changes_head=True))
+        request = SelectForTake(run, take, flame)
+        background.start(context, Question(request, show, "extension_error", changes_head=True))
         return {"FINISHED"}
 
 

@@ -1,27 +1,23 @@
 """Tracks a head through footage in a worker process beside Blender, and imports what it tracked."""
 
-import subprocess
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
-import numpy as np
 from bpy.app.handlers import persistent
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.tracking_job import TrackingJob, remove_tracking_job, write_tracking_job
-from ..stga_addon.requests.training_job import job_folder, worker_arguments
+from ..stga_addon.requests.folder import remove_request, request_folder
+from ..stga_addon.requests.values import SolveAgain, Track
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.tracking.folder import is_flame
-from ..stga_addon.worker.launch import start_worker
-from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, inspect_worker, request_cancel
+from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, request_cancel
 from . import ids, monitor
 from .common import file_path, reporting, scene_settings
 from .environment import training_python
 from .export_head_model import write_shape_key_model
+from .request import start, wait
 
-CHECK_INTERVAL_S = 0.5
 HEAD_MODEL = "head_model.npz"
 """In the capture's folder: the shape keys that it was tracked with."""
 
@@ -117,9 +113,10 @@ class TrackFootage(bpy.types.Operator):
         def optional(value: str, what: str) -> Path | None:
             return file_path(value, what).resolve() if value else None
 
-        job = TrackingJob(
+        request = Track(
             footage.resolve(),
             model,
+            out,
             optional(self.cameras, "cameras"),
             optional(self.landmarks, "landmarks"),
             optional(self.detector, "detector"),
@@ -128,7 +125,7 @@ class TrackFootage(bpy.types.Operator):
             self.stop or None,
             self.step,
         )
-        return start_tracking(self, context, out, job, python)
+        return start_tracking(self, context, out, request, python)
 
 
 class CancelTracking(bpy.types.Operator):
@@ -147,7 +144,7 @@ class CancelTracking(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        folder = job_folder(tracked_folder(context.scene))
+        folder = request_folder(tracked_folder(context.scene))
         request_cancel(folder)
         monitor.monitor_worker(folder)
         return {"FINISHED"}
@@ -170,33 +167,26 @@ class DismissTracking(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         settings = scene_settings(context)
-        remove_tracking_job(Path(settings.tracking_capture))
+        remove_request(request_folder(Path(settings.tracking_capture)))
         settings.tracking_capture, settings.tracking_error = "", ""
         return {"FINISHED"}
 
 
-def start_tracking(
-    operator: Any,
-    context: Any,
-    out: Path,
-    job: TrackingJob,
-    python: str,
-    keys: Mapping[int, np.ndarray] | None = None,
-) -> set[str]:
-    """Start a worker for the job, whose capture is imported when it is done; without a window, wait for that.
+def start_tracking(operator: Any, context: Any, out: Path, request: Track | SolveAgain, python: str) -> set[str]:
+    """Start a worker for the request, whose capture is imported when it is done; without a window, wait for that.
 
     Raises StgaError, without a window also with the worker's error.
     """
-    write_tracking_job(out, job, keys)
-    process = start_worker(job_folder(out), python, worker_arguments(out))
+    folder = request_folder(out)
+    process = start(folder, request, python)
     settings = scene_settings(context)
-    settings.tracking_capture, settings.tracking_model = str(out), str(job.model)
+    settings.tracking_capture, settings.tracking_model = str(out), str(request.model)
     settings.tracking_pending, settings.tracking_error = True, ""
-    monitor.monitor_worker(job_folder(out), process)
+    monitor.monitor_worker(folder, process)
     if not bpy.app.background:
-        _start_timer()
+        _follow(context.scene)
         return {"FINISHED"}
-    _wait(out, process)
+    wait(folder, process)
     _import(context.scene)
     if settings.tracking_error:
         raise StgaError(settings.tracking_error)
@@ -213,7 +203,7 @@ def tracking_snapshot(scene: Any) -> WorkerSnapshot:
     """Status of the scene's last tracking as the timer last saw it."""
     if not getattr(scene, ids.SETTINGS).tracking_capture:
         return WorkerSnapshot()
-    return monitor.snapshot(job_folder(tracked_folder(scene)))
+    return monitor.snapshot(request_folder(tracked_folder(scene)))
 
 
 def is_tracking(scene: Any) -> bool:
@@ -228,24 +218,19 @@ def needs_idle_tracking(operator: Any, context: Any) -> bool:
     return True
 
 
-def tick() -> float | None:
-    """Import what workers have tracked; seconds until the next call, as bpy.app.timers expects."""
-    pending = [
-        scene for scene in bpy.data.scenes if scene.library is None and getattr(scene, ids.SETTINGS).tracking_pending
-    ]
-    if bpy.app.is_job_running("RENDER"):
-        return CHECK_INTERVAL_S
-    for scene in pending:
-        folder = job_folder(tracked_folder(scene))
-        state = monitor.inspect_status(folder).state
-        if state.is_alive:
-            continue
-        getattr(scene, ids.SETTINGS).tracking_pending = False
-        if state == WorkerState.FINISHED:
-            _import(scene)
-        monitor.monitor_worker(folder)
-    waiting = any(getattr(scene, ids.SETTINGS).tracking_pending for scene in pending)
-    return CHECK_INTERVAL_S if waiting else None
+def _follow(scene: Any) -> None:
+    """Import what the scene's worker tracks when it has ended."""
+    uid, folder = scene.session_uid, request_folder(tracked_folder(scene))
+
+    def when_ended() -> bool:
+        for each in bpy.data.scenes:
+            if each.session_uid == uid and getattr(each, ids.SETTINGS).tracking_pending:
+                getattr(each, ids.SETTINGS).tracking_pending = False
+                if monitor.inspect_status(folder).state == WorkerState.FINISHED:
+                    _import(each)
+        return True
+
+    monitor.monitor_worker(folder, when_ended=when_ended)
 
 
 def _import(scene: Any) -> None:
@@ -261,29 +246,16 @@ def _import(scene: Any) -> None:
         settings.tracking_error = str(error).strip().removeprefix("Error: ")
 
 
-def _wait(out: Path, process: "subprocess.Popen[bytes]") -> None:
-    process.wait()
-    last = inspect_worker(job_folder(out), process)
-    if last.state != WorkerState.FINISHED:
-        raise StgaError(last.status.error or "Tracking was cancelled")
-
-
-def _start_timer() -> None:
-    if monitor.has_timer() and not bpy.app.timers.is_registered(tick):
-        bpy.app.timers.register(tick, first_interval=CHECK_INTERVAL_S, persistent=True)
-
-
 @persistent
 def _after_load(_: Any) -> None:
-    _start_timer()
+    for scene in bpy.data.scenes:
+        if scene.library is None and getattr(scene, ids.SETTINGS).tracking_pending and monitor.has_timer():
+            _follow(scene)
 
 
 def register() -> None:
     bpy.app.handlers.load_post.append(_after_load)
-    _start_timer()
 
 
 def unregister() -> None:
     bpy.app.handlers.load_post.remove(_after_load)
-    if bpy.app.timers.is_registered(tick):
-        bpy.app.timers.unregister(tick)

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.tracking_job import TrackingJob
+from ..stga_addon.requests.values import SolveAgain as SolveAgainRequest
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.flame_rig import rig_of
@@ -109,9 +109,9 @@ class SolveAgain(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
-        job = TrackingJob(None, Path(head[tags.FLAME_MODEL]))
-        python = training_python(context)
-        return start_tracking(self, context, Path(head[tags.CAPTURE]), job, python, tracking_keys(head))
+        capture = Path(head[tags.CAPTURE])
+        request = SolveAgainRequest(capture, Path(head[tags.FLAME_MODEL]), tracking_keys(head))
+        return start_tracking(self, context, capture, request, training_python(context))
 
 
 def tracking_keys(head: Any) -> dict[int, np.ndarray]:

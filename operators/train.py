@@ -1,32 +1,25 @@
 """Trains the avatar in a worker process beside Blender, and cancels or dismisses that training."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.training_job import (
-    TrainingJob,
-    job_folder,
-    remove_job,
-    run_training_job,
-    worker_arguments,
-    write_job,
-)
-from ..stga_addon.scene import tags
+from ..stga_addon.requests.folder import remove_request, request_folder
+from ..stga_addon.requests.results import Written
+from ..stga_addon.requests.values import Extend, Refine, Resume, Train
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effects.decisions import parse_choices
+from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, make_settings
-from ..stga_addon.worker.environment import missing_packages, stored_adapters
-from ..stga_addon.worker.launch import start_worker
-from ..stga_addon.worker.status import failure_report, inspect_worker, request_cancel
+from ..stga_addon.worker.environment import stored_adapters
+from ..stga_addon.worker.status import request_cancel
 from . import ids, monitor
-from .common import file_path, head_of, needs_head, reporting
-from .environment import environment_folder, training_python
+from .common import capture_source, file_path, head_of, needs_head, reporting
+from .environment import environment_folder
+from .request import perform_here, python_of, start, wait, waits
 
 
 def strategy_property() -> Any:
@@ -155,24 +148,25 @@ class Train(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        head = head_of(context)
-        run = file_path(self.directory, "run folder").resolve()
-        python = python_of(self, context)
-        write_job(run, self._job(head), training_selection(head))
-        return start_job(self, context, run, python)
+        request = self._request(head_of(context))
+        return start_training(self, context, request, python_of(self, context))
 
-    def _job(self, head: Any) -> TrainingJob:
-        budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-        settings = None
-        if not self.resume:
-            effects = None if self.strategy == "gaussian-avatars" else parse_choices(self.effects.split())
-            preset = None if self.preset == "none" else self.preset
-            settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
-        capture, model = Path(head[tags.CAPTURE]), head.get(tags.FLAME_MODEL)
+    def _request(self, head: Any) -> Train | Resume:
+        run = file_path(self.directory, "run folder").resolve()
+        capture, flame, principal_point = capture_source(head)
         if not capture.is_dir():
             raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
-        flame, principal_point = Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
-        return TrainingJob(capture, flame, principal_point, settings, device_of(self))
+        if self.resume:
+            # The head may be that of any take.
+            moved = None if read_run(run).takes else capture
+            return Resume(run, moved, flame, principal_point, device_of(self), training_selection(head))
+        effects = None if self.strategy == "gaussian-avatars" else parse_choices(self.effects.split())
+        preset = None if self.preset == "none" else self.preset
+        budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
+        settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
+        return Train(
+            run, capture, settings, flame, principal_point, device=device_of(self), selection=training_selection(head)
+        )
 
 
 def device_of(operator: Any) -> str:
@@ -180,26 +174,22 @@ def device_of(operator: Any) -> str:
     return f"gpu:{operator.adapter}" if operator.device == "gpu" and operator.adapter else str(operator.device)
 
 
-def python_of(operator: Any, context: Any) -> str | None:
-    """The interpreter that is to train; None: that of Blender. Raises StgaError where there is none."""
-    if (operator.wait or bpy.app.background) and not operator.python and not missing_packages():
-        return None
-    return training_python(context, operator.python)
-
-
-def start_job(operator: Any, context: Any, run: Path, python: str | None) -> set[str]:
-    """Start the job that was written into the run's folder; python: see `python_of`."""
+def start_training(
+    operator: Any, context: Any, request: Train | Resume | Refine | Extend, python: str | None
+) -> set[str]:
+    """Start a worker for a training and monitor it, or wait for it; python: as of `python_of`. Raises StgaError."""
+    folder, run = request_folder(request.run), request.run
     if python is None:
         monitor.start_training(context.scene, run, None)
-        avatar = _train_here(context, run)
+        result = perform_here(context, folder, request)
     else:
-        process = start_worker(job_folder(run), python, worker_arguments(run))
+        process = start(folder, request, python)
         monitor.start_training(context.scene, run, process)
-        if not (operator.wait or bpy.app.background):
+        if not waits(operator):
             return {"FINISHED"}
-        avatar = _wait(run, process)
+        result = wait(folder, process)
     monitor.finish_training(context.scene)
-    operator.report({"INFO"}, f"Trained {avatar}")
+    operator.report({"INFO"}, f"Trained {result.path if isinstance(result, Written) else run}")
     return {"FINISHED"}
 
 
@@ -219,7 +209,7 @@ class CancelTraining(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        request_cancel(job_folder(_folder(context.scene)))
+        request_cancel(request_folder(_folder(context.scene)))
         monitor.check_now(context.scene)
         return {"FINISHED"}
 
@@ -243,7 +233,7 @@ class DismissTraining(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        remove_job(_folder(context.scene))
+        remove_request(request_folder(_folder(context.scene)))
         monitor.dismiss_training(context.scene)
         return {"FINISHED"}
 
@@ -254,27 +244,3 @@ def _folder(scene: Any) -> Path:
     if folder is None:
         raise StgaError("Nothing was trained in this scene yet")
     return folder
-
-
-def _train_here(context: Any, run: Path) -> Path:
-    manager = context.window_manager
-
-    def show(progress: Any) -> bool:
-        manager.progress_update(100 * progress.share)
-        return False
-
-    manager.progress_begin(0, 100)
-    try:
-        return run_training_job(run, also=show)
-    finally:
-        manager.progress_end()
-
-
-def _wait(run: Path, process: "subprocess.Popen[bytes]") -> Path:
-    """Wait for the worker. Raises StgaError with its error where it failed; the traceback goes to the console."""
-    process.wait()
-    last = inspect_worker(job_folder(run), process)
-    if last.state.failed:
-        print(failure_report(job_folder(run), last), file=sys.stderr)
-        raise StgaError(last.status.error)
-    return run / "avatar.npz"

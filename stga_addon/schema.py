@@ -1,88 +1,116 @@
-"""Validation of dataclasses whose fields state their allowed values."""
+"""Dataclasses whose fields state their allowed values: validation, and JSON in both directions."""
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+import re
+import types
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import field
-from types import NoneType
-from typing import Any, get_args, get_origin, get_type_hints
+from functools import cache
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from .errors import StgaError, shorten
 
 MAX_COUNT = (1 << 31) - 1
 """Largest whole number that kernels can count to."""
+KIND = "kind"
+"""Key that names the dataclass where a field may hold one of several."""
+ARRAY = "array"
+"""Key of an array's place in JSON: its name among the arrays beside it."""
+
+Arrays = dict[str, np.ndarray]
 
 
 def setting(
-    default: Any,
+    default: Any = dataclasses.MISSING,
     minimum: float = -math.inf,
     maximum: float = math.inf,
     above: float = -math.inf,
     choices: Collection[str] | None = None,
+    accepts: Callable[[Any], bool] | None = None,
+    expected: str = "",
 ) -> Any:
-    """A dataclass field with its allowed values, for `validate`; the bounds hold for each number of a tuple.
+    """A dataclass field with its allowed values; the bounds hold for each number of a tuple.
 
     minimum, maximum  inclusive; above: exclusive lower bound
+    accepts           whether a value of the right type is allowed, and `expected`: what it accepts, for the message
     """
-    return field(default=default, metadata={"minimum": minimum, "maximum": maximum, "above": above, "choices": choices})
+    limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices}
+    return field(default=default, metadata={**limits, "accepts": accepts, "expected": expected})
 
 
-def build(kind: Any, values: Any, where: str) -> Any:
-    """A dataclass from plain values, nested ones included; lists become tuples.
+# Validation
 
-    Raises StgaError beginning with `where` unless `values` has exactly its fields.
+
+def validate(value: Any, prefix: str = "") -> None:
+    """Raise StgaError naming the first field of a dataclass, nested ones included, that is not allowed.
+
+    A field is allowed by its type hint and the limits of `setting`; what fields must have in common, a dataclass says
+    in a method `check()` that raises StgaError.
     """
-    hints = get_type_hints(kind)
-    if not isinstance(values, dict) or values.keys() != hints.keys():
-        names = hints.keys() ^ (values.keys() if isinstance(values, dict) else {})
-        raise StgaError(f"{where}: fields are missing or unknown ({', '.join(sorted(map(str, names)))[:200]})")
-    parts = {
-        name: build(hint, values[name], f"{where}.{name}") if dataclasses.is_dataclass(hint) else _frozen(values[name])
-        for name, hint in hints.items()
-    }
-    return kind(**parts)
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
-
-
-def validate_fields(part: Any, prefix: str = "") -> None:
-    """Raise StgaError naming the first field of a dataclass that is of another type or outside its allowed values."""
-    hints = get_type_hints(type(part))
-    for spec in dataclasses.fields(part):
-        value, hint = getattr(part, spec.name), hints[spec.name]
-        expected = _expected(value, hint, spec.metadata)
+    hints = _hints(type(value))  # type: ignore[arg-type]
+    for spec in dataclasses.fields(value):
+        found, hint = getattr(value, spec.name), hints[spec.name]
+        expected = _expected(found, hint, spec.metadata)
         if expected is not None:
-            raise StgaError(complaint(prefix + spec.name, expected, value))
-        if dataclasses.is_dataclass(hint):
-            validate_fields(value, f"{prefix}{spec.name}.")
+            raise StgaError(complaint(prefix + spec.name, expected, found))
+        for name, part in _parts(spec.name, found):
+            validate(part, f"{prefix}{name}.")
+    if hasattr(value, "check"):
+        value.check()
 
 
 def complaint(name: str, expected: str, value: Any) -> str:
-    """The message for a setting with a value that is not allowed."""
+    """The message for a field with a value that is not allowed."""
     return f"setting {name}: expected {expected}, got {shorten(value)}"
+
+
+def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
+    """The dataclasses that a field holds, with their names."""
+    if dataclasses.is_dataclass(value):
+        return [(name, value)]
+    items = value if isinstance(value, tuple) else ()
+    return [(f"{name}.{row}", item) for row, item in enumerate(items) if dataclasses.is_dataclass(item)]
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:
+    """The alternatives of a type hint; None is `types.NoneType`."""
+    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
 def _expected(value: Any, hint: Any, limits: Mapping[str, Any]) -> str | None:
     """What `value` should have been by its type and its limits; None where it is allowed."""
-    kinds = [kind for kind in get_args(hint) if kind is not NoneType] if NoneType in get_args(hint) else [hint]
-    kind = kinds[0]
-    if value is None and NoneType in get_args(hint):
+    kinds = _kinds(hint)
+    if value is None and types.NoneType in kinds:
         return None
-    if get_origin(kind) is tuple:
+    found = [_expected_kind(value, kind, limits) for kind in kinds if kind is not types.NoneType]
+    if None not in found:
+        return " or ".join(dict.fromkeys(map(str, found)))
+    accepts = limits.get("accepts")
+    return None if accepts is None or accepts(value) else str(limits["expected"])
+
+
+def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | None:
+    origin = get_origin(kind) or kind
+    if origin is tuple:
         return _expected_items(value, get_args(kind), limits)
+    if origin in (dict, Mapping):
+        return _expected_mapping(value, get_args(kind), limits)
     if kind in (int, float):
         return _expected_number(value, kind, limits)
     choices = limits.get("choices")
     if kind is str and choices is not None:
         return None if isinstance(value, str) and value in choices else f"one of {', '.join(choices)}"
-    plain = get_origin(kind) or kind
-    if not isinstance(value, plain):
-        return {str: "a text", bool: "True or False"}.get(plain, f"an object of {plain.__name__}")
-    if plain is Mapping and not all(isinstance(text, str) for pair in value.items() for text in pair):
-        return "texts by name"
-    return None
+    names = {str: "a text", bool: "True or False", Path: "a path", np.ndarray: "an array"}
+    return None if isinstance(value, origin) else names.get(origin, f"an object of {origin.__name__}")
 
 
 def _expected_items(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
@@ -91,6 +119,13 @@ def _expected_items(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any
         return "a tuple" if size is None else f"a tuple of {size}"
     found = (_expected(item, hints[0], limits) for item in value)
     return next((f"a tuple, each item {text}" for text in found if text is not None), None)
+
+
+def _expected_mapping(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
+    if not isinstance(value, Mapping):
+        return "an object of Mapping"
+    fits = all(isinstance(key, hints[0]) and _expected(item, hints[1], limits) is None for key, item in value.items())
+    return None if fits else "texts by name" if hints == (str, str) else "values by name"
 
 
 def _expected_number(value: Any, kind: type, limits: Mapping[str, Any]) -> str | None:
@@ -108,3 +143,96 @@ def _expected_number(value: Any, kind: type, limits: Mapping[str, Any]) -> str |
 
 
 _UNBOUNDED = {"minimum": -math.inf, "maximum": math.inf, "above": -math.inf}
+
+
+# JSON
+
+
+def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None) -> Any:
+    """A dataclass as plain values of JSON, which `from_json` reads back.
+
+    Paths become texts, tuples lists, and a dataclass where a field allows several an object with its `kind`. Arrays
+    are put into `arrays`, which must then be kept beside the JSON. kinds: type hint of `value`; default: its type.
+    """
+    return _plain(value, kinds or type(value), arrays, "")
+
+
+def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
+    if dataclasses.is_dataclass(value):
+        hints = _hints(type(value))  # type: ignore[arg-type]
+        fields = {
+            spec.name: _plain(getattr(value, spec.name), hints[spec.name], arrays, _joined(name, spec.name))
+            for spec in dataclasses.fields(value)
+        }
+        several = sum(dataclasses.is_dataclass(kind) for kind in _kinds(hint)) > 1
+        return {KIND: type(value).__name__, **fields} if several else fields
+    if isinstance(value, np.ndarray):
+        assert arrays is not None, f"{name}: an array, and nothing to keep it in"
+        arrays[name] = value
+        return {ARRAY: name}
+    if isinstance(value, Path):
+        return str(value)
+    (kind,) = [kind for kind in _kinds(hint) if kind is not types.NoneType][:1]
+    items = get_args(kind) or (Any, Any)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, items[1], arrays, _joined(name, str(key))) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(item, items[0], arrays, _joined(name, str(row))) for row, item in enumerate(value)]
+    return value
+
+
+def _joined(name: str, part: str) -> str:
+    return f"{name}.{part}" if name else part
+
+
+def from_json(kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.ndarray] | None = None) -> Any:
+    """A dataclass (or one of several: a union) from plain values of JSON and the arrays beside them.
+
+    Raises StgaError naming the field, after `where`, unless each object has exactly the fields of its dataclass and
+    `validate` allows them.
+    """
+    value = _parsed(kind, values, where, arrays or {})
+    validate(value)
+    return value
+
+
+def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The value in the types of the hint where it has their form; else as it is, for `validate` to name."""
+    kinds = [kind for kind in _kinds(hint) if kind is not types.NoneType]
+    classes = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
+    if isinstance(value, dict) and ARRAY in value and np.ndarray in kinds:
+        return arrays.get(value[ARRAY]) if isinstance(value[ARRAY], str) else None
+    if classes and (value is not None or len(kinds) == len(_kinds(hint))):
+        return _parsed_dataclass(classes, value, where, arrays)
+    if isinstance(value, str) and Path in kinds and str not in kinds:
+        return Path(value)
+    if isinstance(value, list):
+        items = next((get_args(kind) for kind in kinds if get_origin(kind) is tuple), (Any,))
+        return tuple(_parsed(items[0], item, _joined(where, str(row)), arrays) for row, item in enumerate(value))
+    mappings = [get_args(kind) for kind in kinds if get_origin(kind) in (dict, Mapping)]
+    if isinstance(value, dict) and mappings:
+        return _parsed_mapping(mappings[0], value, where, arrays)
+    return value
+
+
+def _parsed_mapping(hints: Any, value: dict[str, Any], where: str, arrays: Mapping[str, np.ndarray]) -> Any:
+    for key in value:
+        if hints[0] is int and not re.fullmatch(r"-?\d{1,15}", key, re.ASCII):
+            raise StgaError(complaint(where, "whole numbers as names", key))
+    return {hints[0](key): _parsed(hints[1], item, _joined(where, key), arrays) for key, item in value.items()}
+
+
+def _parsed_dataclass(classes: list[Any], value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
+    kind = classes[0]
+    if len(classes) > 1:
+        names = {cls.__name__: cls for cls in classes}
+        named = value.get(KIND) if isinstance(value, dict) else None
+        if not isinstance(named, str) or named not in names:
+            raise StgaError(complaint(_joined(where, KIND), f"one of {', '.join(names)}", named))
+        kind, value = names[named], {name: item for name, item in value.items() if name != KIND}
+    hints = _hints(kind)
+    if not isinstance(value, dict) or value.keys() != hints.keys():
+        differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
+        fields = ", ".join(sorted(map(str, differing)))[:200]
+        raise StgaError(f"{where}{': ' if where else ''}fields are missing or unknown ({fields})")
+    return kind(**{name: _parsed(hint, value[name], _joined(where, name), arrays) for name, hint in hints.items()})

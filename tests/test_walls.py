@@ -18,7 +18,7 @@ HEAVY = {"torch", "numba", "wgpu"}
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
-    {"files", "format", "schema"},
+    {"files", "format", "progress", "schema"},
     {"worker"},
     {"flame"},
     {"capture"},
@@ -30,6 +30,7 @@ LAYERS = (
     {"training"},
     {"report"},
     {"requests"},
+    {"perform"},
     {"scene"},
     {"cli"},
     {"development"},
@@ -45,7 +46,7 @@ LIGHT = (
     "avatar.file",
     "export.ply",
     "selection",
-    "requests.training_job",
+    "requests.folder",
 )
 
 

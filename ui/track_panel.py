@@ -10,7 +10,7 @@ from ..operators.common import is_head, scene_settings
 from ..operators.environment import has_training_python
 from ..operators.track import tracked_folder, tracking_snapshot
 from ..operators.track_correct import tracking_keys
-from ..stga_addon.requests.training_job import job_folder
+from ..stga_addon.requests.folder import request_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.shape_keys import has_shape_keys
 from ..stga_addon.tracking.folder import SHEET_FILE
@@ -116,7 +116,7 @@ def _draw_end(layout: Any, context: Any, now: WorkerSnapshot) -> None:
     row = box.row()
     if now.state.failed:
         row.label(text="Tracking failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.log_tail, job_folder(tracked_folder(context.scene)))
+        draw_failure(box, context, now.status.error, now.log_tail, request_folder(tracked_folder(context.scene)))
     elif now.state == WorkerState.CANCELLED:
         row.label(text="Cancelled; Track continues", icon="INFO")
     else:

@@ -10,8 +10,8 @@ from ..operators.analyze import chosen_effects
 from ..operators.common import is_head, package, scene_settings
 from ..operators.environment import has_training_python
 from ..stga_addon.format import format_duration
+from ..stga_addon.requests.folder import request_folder
 from ..stga_addon.requests.monitor_state import MonitorState
-from ..stga_addon.requests.training_job import job_folder
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
@@ -111,7 +111,7 @@ def _draw_end(layout: Any, context: Any, training: MonitorState) -> None:
         draw_failure(box, context, f"{folder}: does not exist; choose its new folder and press Resume", (), None)
     elif state.failed:
         row.label(text="Training failed", icon="ERROR")
-        draw_failure(box, context, status.error, training.snapshot.log_tail, job_folder(folder))
+        draw_failure(box, context, status.error, training.snapshot.log_tail, request_folder(folder))
     else:
         done = {WorkerState.FINISHED: "Trained", WorkerState.CANCELLED: "Cancelled, avatar kept"}[state]
         row.label(text=done, icon="CHECKMARK")

@@ -17,8 +17,9 @@ from ..files import read_json, write_json
 from ..format import format_duration
 from ..requests.open_head import OpenHead
 from .arguments import usable_path
-from .track import add_footage, track_footage
-from .train import add_training, prepare, train_with_bar
+from .carry_out import carry_out
+from .track import add_footage, tracking_request
+from .train import add_training, training_request
 
 NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a report and a .blend file"
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
@@ -40,8 +41,7 @@ def run(options: Namespace) -> None:
     capture, run_folder = options.out / CAPTURE, options.out / RUN
     _track(options, capture)
     tracked = perf_counter()
-    training = training_options(options, capture, run_folder)
-    train_with_bar(run_folder, *prepare(training), training.resume, falls_back=training.device == "auto")
+    carry_out(training_request(training_options(options, capture, run_folder)))
     trained = perf_counter()
     blend = None if options.no_blend else _write_blend(options.out)
     print()
@@ -103,7 +103,7 @@ def _track(options: Namespace, capture: Path) -> None:
         new = not options.out.exists()
         write_json(path, inputs)
         try:
-            track_footage(options, capture)
+            carry_out(tracking_request(options, capture))
         except StgaError:
             if not capture.exists():  # nothing was tracked yet, so that the inputs may be mended
                 path.unlink()

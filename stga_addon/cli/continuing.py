@@ -1,13 +1,13 @@
 """What the commands that continue a finished run have in common."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
 from ..format import format_duration
+from ..requests.values import Resume
+from ..training.run.folder import has_run, next_folder, read_run
 from .arguments import add_device, duration, usable_path, whole_number
-from .train import train_run
 
 BEGUN_WITH = {
     "takes": "CAPTURE",
@@ -32,42 +32,29 @@ def add_continued_run(parser: ArgumentParser, default_seconds: float) -> None:
     add_device(parser)
 
 
-def continuation_folder(options: Namespace) -> tuple[Path, str]:
-    """The folder of the run to be made, and the device that trains it; both are printed.
-
-    Raises StgaError where the folder holds a run already.
-    """
-    from ..training.run.folder import next_folder, read_run
-    from ..training.run.open_run import device_of
-
+def continued_run(options: Namespace, default_seconds: float) -> dict[str, Any]:
+    """What `Refine` and `Extend` share, by field. Raises StgaError where --out holds a run already."""
     folder = options.out or next_folder(options.run_folder)
-    if (folder / "run.json").exists():
+    if has_run(folder):
         raise StgaError(f"{folder}: already holds a run; choose another --out, or give --resume and this folder")
-    device, why = device_of(read_run(options.run_folder), options.device)
-    print(f"{why}\nrun: {folder}")
-    return folder, device
+    seconds = None if options.iterations is not None else options.budget or default_seconds
+    return {
+        "run": folder,
+        "parent": options.run_folder,
+        "growth": options.growth,
+        "seconds": seconds,
+        "iterations": options.iterations,
+        "seed": options.seed,
+        "flame": options.flame,
+        "device": options.device,
+    }
 
 
-def budget_of(options: Namespace, default_seconds: float) -> dict[str, Any]:
-    """Budget and seed, as fields of what is asked for."""
-    if options.iterations is not None:
-        return {"iterations": options.iterations, "seed": options.seed}
-    return {"seconds": options.budget or default_seconds, "seed": options.seed}
-
-
-def resume_continuation(options: Namespace) -> None:
-    """Continue a run that was stopped. Raises StgaError for an option that would have no effect."""
-    from dataclasses import replace
-
-    from ..training.run.open_run import device_of, open_run
-
+def resumed_continuation(options: Namespace) -> Resume:
+    """Raises StgaError for an option that would have no effect, or a run that continues none."""
     for name, shown in BEGUN_WITH.items():
         if getattr(options, name, None):
             raise StgaError(f"{shown}: cannot be combined with --resume, which continues the run in RUN as it began")
-    opened = open_run(options.run_folder, flame=options.flame)
-    if opened.run.continuation is None:
+    if read_run(options.run_folder).continuation is None:
         raise StgaError(f"{options.run_folder}: does not continue another run; resume it with `stga train --resume`")
-    device, why = device_of(opened.run, options.device)
-    print(why)
-    run = replace(opened.run, device=device)
-    train_run(options.run_folder, run, opened.capture, None, resume=True, falls_back=options.device == "auto")
+    return Resume(options.run_folder, flame=options.flame, device=options.device)

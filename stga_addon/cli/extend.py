@@ -1,20 +1,15 @@
 """Extend a finished avatar by further takes of the same head, in a run of its own."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from ..errors import StgaError
 from ..files import write_npz
 from ..requests.open_head import OpenHead
+from ..requests.results import Selected
+from ..requests.values import Extend, SelectForTake
 from .arguments import real_number, usable_path
-from .continuing import add_continued_run, budget_of, continuation_folder, resume_continuation
-from .train import train_run
-
-if TYPE_CHECKING:
-    from ..training.run.request import Extension
+from .carry_out import carry_out
+from .continuing import add_continued_run, continued_run, resumed_continuation
 
 NAME, HELP = "extend", "extend a finished avatar by further takes of the same head"
 DEFAULT_SECONDS = 60.0
@@ -39,41 +34,24 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..training.effects.plan import with_effects_of_takes
-    from ..training.run.continuation import prepare_extension
-    from ..training.run.request import Extension
-
     if options.resume:
-        resume_continuation(options)
+        carry_out(resumed_continuation(options))
         return
     if not options.takes:
         raise StgaError("CAPTURE: is missing; expected one or more takes to extend the run by")
-    wanted = Extension(options.run_folder, tuple(options.takes), options.growth, **budget_of(options, DEFAULT_SECONDS))
     if options.select_only:
-        _write_selection(options.select_only, wanted, options.flame)
+        _write_selection(options)
         return
-    folder, device = continuation_folder(options)
-    prepared = prepare_extension(wanted, device, options.flame)
-    assert prepared.selection is not None
-    share = np.any(list(prepared.selection.values()), axis=0).mean()
-    print(f"takes: {1 + len(prepared.run.takes)}; the new ones need {share:.0%} of the triangles")
-    run = with_effects_of_takes(prepared.run, prepared.capture)
-    for before, now in zip(prepared.run.effect_plan, run.effect_plan, strict=True):
-        if now.on != before.on:
-            print(f"{now.effect}  {now}")
-    train_run(folder, run, prepared.capture, prepared.selection, resume=False, falls_back=options.device == "auto")
+    carry_out(Extend(captures=tuple(options.takes), **continued_run(options, DEFAULT_SECONDS)))
 
 
-def _write_selection(path: Path, wanted: "Extension", flame: Path | None) -> None:
+def _write_selection(options: Namespace) -> None:
     """Write and print which triangles of each frame of the take would be trained."""
-    from ..training.run.continuation import prepare_extension
-
-    if len(wanted.captures) != 1:
-        raise StgaError(f"--select-only: expected one CAPTURE, got {len(wanted.captures)}")
-    prepared = prepare_extension(wanted, "cpu", flame)
-    assert prepared.selection is not None
-    start = prepared.run.takes[-1].start
-    selection = {timestep - start: faces for timestep, faces in prepared.selection.items()}
-    write_npz(path, {f"{timestep:05d}": faces for timestep, faces in selection.items()}, compressed=True)
-    for timestep, faces in selection.items():
+    if len(options.takes) != 1:
+        raise StgaError(f"--select-only: expected one CAPTURE, got {len(options.takes)}")
+    found = carry_out(SelectForTake(options.run_folder, options.takes[0], options.flame))
+    assert isinstance(found, Selected)
+    arrays = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
+    write_npz(options.select_only, arrays, compressed=True)
+    for timestep, faces in found.selection.items():
         print(f"{timestep:5d}  {faces.mean():6.1%}")

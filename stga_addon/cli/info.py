@@ -2,13 +2,15 @@
 
 import json
 from argparse import ArgumentParser, Namespace
-from typing import Any
 
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
-from ..training.effects.decisions import effect_plan_to_json, parse_choices
-from ..training.settings import make_settings
+from ..requests.results import Analyzed
+from ..requests.values import Analyze
+from ..schema import to_json
+from ..training.effects.decisions import parse_choices
 from .arguments import add_capture, add_device, add_effects
+from .carry_out import carry_out
 from .inputs import open_named_capture
 from .table import print_table
 
@@ -25,25 +27,18 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     from ..capture.summary import summarize_capture
-    from ..render.device import choose_device
-    from ..training.effects.plan import describe_effects, plan_effects
+    from ..training.effects.plan import describe_effects
 
     if options.presets and not options.json:
         raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
-    capture = open_named_capture(options)
-    plan: tuple[Any, ...] = ()
-    if capture.views.get("train"):
-        device, _ = choose_device(options.device)
-        _, plan = plan_effects(capture, make_settings(iterations=1, effects=parse_choices(options.effect)), device)
-    if options.json:
-        found: dict[str, Any] = {"plan": effect_plan_to_json(plan)}
-        if options.presets and plan:
-            from ..report.preset_timing import time_presets
-
-            found["presets"] = [preset.as_json() for preset in time_presets(capture, device=device)]
-        print(json.dumps(found))
+    capture = None if options.json else open_named_capture(options)
+    point, effects = options.principal_point or "vhap", parse_choices(options.effect)
+    found = carry_out(Analyze(options.capture, options.flame, point, effects, options.device, options.presets))
+    assert isinstance(found, Analyzed)
+    if capture is None:
+        print(json.dumps(to_json(found)))
         return
     print_table(summarize_capture(capture))
-    if plan:
+    if found.plan:
         print()
-        print_table(describe_effects(plan))
+        print_table(describe_effects(found.plan))

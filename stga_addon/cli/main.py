@@ -20,7 +20,7 @@ COMMANDS = (
     ".train",
     ".refine",
     ".extend",
-    ".job",
+    ".perform",
     ".render",
     ".eval",
     ".select",

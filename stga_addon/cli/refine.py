@@ -4,9 +4,10 @@ from argparse import ArgumentParser, Namespace
 
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
+from ..requests.values import Refine
 from .arguments import frame_span, real_number
-from .continuing import add_continued_run, budget_of, continuation_folder, resume_continuation
-from .train import train_run
+from .carry_out import carry_out
+from .continuing import add_continued_run, continued_run, resumed_continuation
 
 NAME, HELP = "refine", "train one region of a finished avatar further"
 DEFAULT_SECONDS = 20.0
@@ -26,17 +27,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..training.run.continuation import prepare_refinement
-    from ..training.run.request import Refinement
-
     if options.resume:
-        resume_continuation(options)
+        carry_out(resumed_continuation(options))
         return
-    if options.region is None:
+    if not options.region:
         raise StgaError("--region: is missing; expected the name of a region or a file of triangle weights")
-    folder, device = continuation_folder(options)
-    wanted = Refinement(
-        options.run_folder, options.region, options.frames, options.growth, **budget_of(options, DEFAULT_SECONDS)
-    )
-    prepared, falls_back = prepare_refinement(wanted, device, options.flame), options.device == "auto"
-    train_run(folder, prepared.run, prepared.capture, prepared.selection, resume=False, falls_back=falls_back)
+    carry_out(Refine(region=options.region, frames=options.frames, **continued_run(options, DEFAULT_SECONDS)))

@@ -3,14 +3,12 @@
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
+from ..requests.values import Track
 from .arguments import real_number, usable_path, whole_number
-
-if TYPE_CHECKING:
-    from ..tracking.track import TrackingReport
+from .carry_out import carry_out
 
 NAME, HELP = "track", "track a head through footage, and write a capture"
 
@@ -55,29 +53,22 @@ def add_footage(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace) -> None:
-    result = track_footage(options, options.out)
-    for warning in result.warnings:
-        print(f"warning: {warning}")
-    print(f"reprojection error: {result.median_px:.2f} px (median); by camera and timestep in tracking.json")
-    print(f"capture: {options.out}")
+    carry_out(tracking_request(options, options.out))
 
 
-def track_footage(options: Namespace, out: Path) -> "TrackingReport":
-    """Track what `add_footage`'s options name into the folder `out`, with a bar for each stage. Raises StgaError."""
-    from ..tracking.footage.open import open_footage
-    from ..tracking.footage.sequences import FrameRange
-    from ..tracking.track import track
-
+def tracking_request(options: Namespace, out: Path) -> Track:
+    """What `add_footage`'s options ask for, into the folder `out`. Raises StgaError where the detector that is to be
+    downloaded has no file."""
     if options.download_detector:
         from ..tracking.detector_file import download_task
 
         if options.detector is None:
             raise StgaError("--download-detector: give the file to write with --detector")
         download_task(options.detector)
-    frames = FrameRange(options.start, options.stop, options.step, dict(options.offset))
-    footage = open_footage(options.footage, options.cameras, frames, options.focal)
-    with _Bar() as bar:
-        return track(footage, options.model, out, options.landmarks, options.detector, options.meshes, bar.report)
+    return Track(
+        options.footage, options.model, out, options.cameras, options.landmarks, options.detector, options.focal,
+        options.start, options.stop, options.step, dict(options.offset), options.meshes,
+    )  # fmt: skip
 
 
 def _offset(text: str) -> tuple[str, int]:
@@ -85,29 +76,3 @@ def _offset(text: str) -> tuple[str, int]:
     if not separator or not re.fullmatch(r"-?\d{1,9}", frames):
         raise ArgumentTypeError(f"expected a camera and a number of frames, as in left=-3, not {text!r}")
     return name, int(frames)
-
-
-class _Bar:
-    """A bar for each stage."""
-
-    def __enter__(self) -> "_Bar":
-        self._stage = ""
-        self._bar: Any = None
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def report(self, stage: str, done: int, total: int) -> None:
-        if stage != self._stage:
-            self._close()
-            self._stage = stage
-            from tqdm import tqdm
-
-            self._bar = tqdm(desc=stage, total=total, dynamic_ncols=True)
-        if self._bar is not None:
-            self._bar.update(done - self._bar.n)
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()

@@ -2,25 +2,20 @@
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from ..capture.model import Capture
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
+from ..requests.values import Resume, Train
 from ..selection import SelectionOptions
 from ..training.effects.decisions import parse_choices
-from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, make_settings
+from ..training.run.folder import Run, has_run, read_run
+from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, TrainingSettings, make_settings
 from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number
-from .inputs import open_named_capture
-from .table import print_table
-
-if TYPE_CHECKING:
-    from ..training.run.folder import Run
+from .carry_out import carry_out
 
 NAME, HELP = "train", "train an avatar from a capture"
+DEFAULT_SECONDS = 120.0
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -61,91 +56,48 @@ def add_training(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace) -> None:
-    run, capture, selection = prepare(options)
-    train_run(options.out, run, capture, selection, options.resume, falls_back=options.device == "auto")
+    carry_out(training_request(options))
 
 
-def prepare(options: Namespace) -> tuple["Run", Capture, dict[int, np.ndarray] | None]:
-    """The run that the options name, its capture and the open head's selection; prints why which device trains.
-
-    Raises StgaError.
-    """
-    from ..render.device import choose_device
-    from ..training.effects.plan import with_effect_plan
-    from ..training.run.open_run import device_of, open_run
-
-    if not options.capture.is_dir():
-        raise StgaError(f"{options.capture}: is not a folder; expected that of a capture")
-    if options.resume:
-        opened = open_run(options.out, options.capture, options.flame, options.principal_point)
-        run, capture = opened.run, opened.capture
-        _refuse_changes(options, run)
-        device, why = device_of(run, options.device)
-        run = replace(run, device=device)
-    else:
-        if (options.out / "run.json").exists():
-            raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
-        device, why = choose_device(options.device)
-        capture = open_named_capture(options)
-        run = with_effect_plan(_new_run(options, capture, device), capture, device)
+def training_request(options: Namespace) -> Train | Resume:
+    """Raises StgaError for options that do not go together, or that differ from those that a run began with."""
     selection = None if options.head is None else options.head.selection()
-    print(why)
-    return run, capture, None if selection is None else dict(selection)
+    if options.resume:
+        _refuse_changes(options, read_run(options.out))
+        return Resume(
+            options.out, options.capture, options.flame, options.principal_point, options.device, selection
+        )  # fmt: skip
+    if has_run(options.out):
+        raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
+    settings = _settings(options)
+    untimed = options.preset is not None and options.budget is None and options.iterations is None
+    return Train(
+        options.out, options.capture, settings, options.flame, options.principal_point or "vhap", untimed,
+        options.device, selection,
+    )  # fmt: skip
 
 
-def train_run(
-    folder: Path,
-    run: "Run",
-    capture: Capture,
-    selection: dict[int, np.ndarray] | None,
-    resume: bool,
-    falls_back: bool,
-) -> None:
-    """Train a run into its folder with a progress bar, and print its summary."""
-    from ..report.run_summary import report_run
-
-    avatar = train_with_bar(folder, run, capture, selection, resume, falls_back)
-    for line in report_run(folder):
-        print(line)
-    print(f"avatar: {avatar}")
-    if run.settings.tracking:
-        print(f"refined meshes: {folder / 'tracking.npz'} (in Blender: Apply Motion, Own Offsets)")
-
-
-def train_with_bar(
-    folder: Path,
-    run: "Run",
-    capture: Capture,
-    selection: dict[int, np.ndarray] | None,
-    resume: bool,
-    falls_back: bool,
-) -> Path:
-    """Train a run into its folder with a progress bar; returns the avatar's path.
-
-    falls_back: see `run.loop.train`.
-
-    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
-    """
-    from ..report.run_summary import CurveUpdater
-    from ..training.effects.plan import describe_effects
-    from ..training.run.loop import train
-    from ..training.run.progress import Progress
-    from ..training.run.progress_bar import ProgressBar
-
-    for warning in capture.warnings:
-        print(f"warning: {warning}")
-    print_table(describe_effects(run.effect_plan))
-    draw = CurveUpdater(folder)
-    with ProgressBar() as bar:
-
-        def report(progress: Progress) -> bool:
-            draw()
-            return bar.report(progress)
-
-        return train(capture, folder, run, selection, resume, report, falls_back)
+def _settings(options: Namespace) -> TrainingSettings:
+    changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": bool(options.stop_when_flat)}
+    if options.iterations is not None:
+        changes["iterations"] = options.iterations
+    else:
+        changes["seconds"] = options.budget or DEFAULT_SECONDS
+    for name in ("seed", "strategy"):
+        if getattr(options, name) is not None:
+            changes[name] = getattr(options, name)
+    choices = parse_choices(options.effect)
+    if choices or (options.schedule != "paper" and options.strategy != "gaussian-avatars"):
+        changes["effects"] = choices
+    settings = make_settings(schedule=options.schedule or "default", preset=options.preset, **changes)
+    if options.threshold is None:
+        return settings
+    if settings.strategy != "selective":
+        raise StgaError("--threshold: has no effect without --strategy selective, or --schedule paper")
+    return replace(settings, selection=replace(settings.selection, threshold=options.threshold))
 
 
-def _refuse_changes(options: Namespace, run: Any) -> None:
+def _refuse_changes(options: Namespace, run: Run) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
     settings = run.settings
     began_with = {
@@ -167,37 +119,3 @@ def _refuse_changes(options: Namespace, run: Any) -> None:
     for name, choice in parse_choices(options.effect).items():
         if name not in decided or choice not in ("auto", "on" if decided[name].on else "off"):
             raise StgaError(f"--effect {name}={choice}: differs from what was decided for this run; use another --out")
-
-
-def _new_run(options: Namespace, capture: Capture, device: str) -> Any:
-    from ..training.run.folder import Run
-
-    changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": bool(options.stop_when_flat)}
-    if options.seed is not None:
-        changes["seed"] = options.seed
-    if options.iterations is not None:
-        changes["iterations"] = options.iterations
-    elif options.budget is not None:
-        changes["seconds"] = options.budget
-    else:
-        changes["seconds"] = 120.0 if options.preset is None else _preset_seconds(capture, options.preset, device)
-    if options.strategy is not None:
-        changes["strategy"] = options.strategy
-    flame = None if options.flame is None else options.flame.resolve()
-    choices = parse_choices(options.effect)
-    if choices or (options.schedule != "paper" and options.strategy != "gaussian-avatars"):
-        changes["effects"] = choices
-    settings = make_settings(schedule=options.schedule or "default", preset=options.preset, **changes)
-    if options.threshold is not None:
-        settings = replace(settings, selection=replace(settings.selection, threshold=options.threshold))
-    return Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings, device=device)
-
-
-def _preset_seconds(capture: Capture, preset: str, device: str) -> float:
-    """Seconds that a preset takes on this machine's device, which are printed."""
-    from ..format import format_duration
-    from ..report.preset_timing import time_presets
-
-    (timing,) = time_presets(capture, [preset], device=device)
-    print(f"{preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
-    return timing.seconds

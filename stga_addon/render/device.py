@@ -13,6 +13,7 @@ GPU = "gpu:"
 """Before the adapter's name in a device."""
 DEVICES = ("auto", "cpu", "gpu")
 """Choices of `choose_device`, beside "gpu:NAME"."""
+EXPECTED_DEVICE = "auto, cpu, gpu or gpu:NAME"
 MAX_DEVICE_LENGTH = 255
 
 

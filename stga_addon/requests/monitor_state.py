@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ..training.run.folder import AVATAR
 from ..worker.status import WorkerSnapshot, WorkerState
-from .training_job import PREVIEW, job_folder
+from .folder import PREVIEW, request_folder
 
 CHECK_INTERVAL_S = 0.5
 SLICE_INTERVAL_S = 0.02
 """While splats are built in slices, so that Blender never blocks for long."""
-AVATAR = "avatar.npz"
 
 Stamp = tuple[int, int]
 """Modification time in nanoseconds and size in bytes of a file."""
@@ -230,7 +230,7 @@ def _status_read(state: MonitorState, event: StatusRead) -> Outcome:
             state = replace(state, result_shown=True)
             effects.append(StoreTraining(state.run, True))
     elif has_preview and event.live_preview:
-        state = replace(state, loading=job_folder(folder) / PREVIEW, shown_preview=files.preview)
+        state = replace(state, loading=request_folder(folder) / PREVIEW, shown_preview=files.preview)
     if state.loading is not None:
         effects.append(LoadAvatar(state.loading))
     return state, tuple(effects)

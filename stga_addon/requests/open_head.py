@@ -1,6 +1,5 @@
 """Running a CLI command on the open .blend file: its head as a folder that another Python reads."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,8 +9,9 @@ import numpy as np
 from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..errors import StgaError, shorten
+from ..errors import StgaError
 from ..files import read_json, read_npz, write_json, write_npz
+from ..schema import from_json, setting, to_json
 
 FOLDER = "STGA_HEAD"
 """The environment variable that names the folder."""
@@ -36,14 +36,23 @@ class OpenHead:
     played: Callable[[Capture], Capture]
 
 
+@dataclass(frozen=True)
+class _Stored:
+    """What head.json holds; fields as of `OpenHead`."""
+
+    capture: Path
+    flame: Path | None
+    avatar: Path | None
+    principal_point: str = setting(choices=PRINCIPAL_POINTS)
+    fps: float = setting(above=0)
+
+
 def write_head(folder: Path, head: OpenHead, played: bool) -> None:
     """Write the head into the folder; `played`: with the meshes that it plays in the scene's frames.
 
     Raises StgaError where the capture cannot be read, or the folder not be written.
     """
-    paths = {"capture": head.capture, "flame": head.flame, "avatar": head.avatar}
-    values = {name: None if path is None else str(path) for name, path in paths.items()}
-    write_json(folder / HEAD, {**values, "principal_point": head.principal_point, "fps": head.fps})
+    write_json(folder / HEAD, to_json(_Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)))
     selection = head.selection()
     if selection is not None:
         write_npz(folder / SELECTION, {str(timestep): faces for timestep, faces in selection.items()})
@@ -55,16 +64,10 @@ def write_head(folder: Path, head: OpenHead, played: bool) -> None:
 def read_head(folder: Path) -> OpenHead:
     """The head that `write_head` wrote. Raises StgaError where there is none or it is damaged."""
     path = folder / HEAD
-    values = read_json(path)
-    if not isinstance(values, dict) or values.get("principal_point") not in PRINCIPAL_POINTS:
-        raise StgaError(f"{path}: is not the head of an open .blend file (principal_point is missing)")
-    if not isinstance(values.get("fps"), float) or not 0 < values["fps"] < math.inf:
-        raise StgaError(f"{path}: fps is {shorten(values.get('fps'))}, expected a number above 0")
-    for name, needed in (("capture", True), ("flame", False), ("avatar", False)):
-        value = values.get(name)
-        if not isinstance(value, str) and (needed or value is not None):
-            raise StgaError(f"{path}: {name} is {shorten(value)}, expected a path")
-    flame, avatar = (Path(values[name]) if values.get(name) else None for name in ("flame", "avatar"))
+    try:
+        stored: _Stored = from_json(_Stored, read_json(path))
+    except StgaError as error:
+        raise StgaError(f"{path}: is not the head of an open .blend file ({error})") from error
 
     def selection() -> dict[int, np.ndarray] | None:
         return _by_timestep(folder / SELECTION) if (folder / SELECTION).exists() else None
@@ -73,7 +76,9 @@ def read_head(folder: Path) -> OpenHead:
         meshes = _by_timestep(folder / PLAYED)
         return replace(capture, timesteps=tuple(sorted(meshes)), mesh=meshes.__getitem__, flame=None)
 
-    return OpenHead(Path(values["capture"]), flame, values["principal_point"], avatar, values["fps"], selection, played)
+    return OpenHead(
+        stored.capture, stored.flame, stored.principal_point, stored.avatar, stored.fps, selection, played
+    )  # fmt: skip
 
 
 def _by_timestep(path: Path) -> dict[int, np.ndarray]:

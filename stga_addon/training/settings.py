@@ -1,6 +1,5 @@
 """Settings of a training run, their presets and their validation."""
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +8,7 @@ from typing import Any
 from ..avatar.embedding import CONVENTIONS
 from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
-from ..schema import MAX_COUNT, build, complaint, setting, validate_fields
+from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
 from .effects.decisions import CHOICES, EFFECTS
 
@@ -143,6 +142,23 @@ class TrainingSettings:
     tracking: bool = False
     effects: Mapping[str, str] | None = None
 
+    def check(self) -> None:
+        """Raise StgaError for settings at odds with each other, and for rows and names that types do not tell."""
+        if (self.seconds is None) == (self.iterations is None):
+            raise StgaError("the budget must be given either in seconds or in iterations")
+        if self.preset not in (None, *PRESETS):
+            raise StgaError(complaint("preset", f"one of {', '.join(PRESETS)}", self.preset))
+        for row in self.exposure:
+            if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
+                expected = "rows of a camera index, three gains above 0, three offsets"
+                raise StgaError(complaint("exposure", expected, row))
+        effects = self.effects or {}
+        if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
+            raise StgaError(complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects)))
+        if effects and (self.schedule == "paper" or self.strategy == "gaussian-avatars"):
+            other = "--schedule paper" if self.schedule == "paper" else "--strategy gaussian-avatars"
+            raise StgaError(f"--effect cannot be combined with {other}")
+
 
 INRIA_ADAM_EPSILON = 1e-9
 """3D Gaussian Splatting's ε of 1e-15, at an image of 600 by 550."""
@@ -225,35 +241,5 @@ def make_settings(
     if strategy == "gaussian-avatars":
         base.update(GAUSSIAN_AVATARS_SETTINGS)
     settings = TrainingSettings(**{**base, **changes})
-    validate(settings)
-    return settings
-
-
-def validate(settings: TrainingSettings) -> None:
-    """Raise StgaError naming a setting of another type than its field, out of its bounds, or at odds with another."""
-    validate_fields(settings)
-    if (settings.seconds is None) == (settings.iterations is None):
-        raise StgaError("the budget must be given either in seconds or in iterations")
-    if settings.preset not in (None, *PRESETS):
-        raise StgaError(complaint("preset", f"one of {', '.join(PRESETS)}", settings.preset))
-    for row in settings.exposure:
-        if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
-            raise StgaError(complaint("exposure", "rows of a camera index, three gains above 0, three offsets", row))
-    effects = settings.effects or {}
-    if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
-        raise StgaError(complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects)))
-    if effects and (settings.schedule == "paper" or settings.strategy == "gaussian-avatars"):
-        other = "--schedule paper" if settings.schedule == "paper" else "--strategy gaussian-avatars"
-        raise StgaError(f"--effect cannot be combined with {other}")
-
-
-def to_json(settings: TrainingSettings) -> dict[str, Any]:
-    """Plain values, for the run folder and the avatar file; `from_json` reads them back."""
-    return dataclasses.asdict(settings)
-
-
-def from_json(values: Any) -> TrainingSettings:
-    """TrainingSettings from `to_json`. Raises StgaError where a field is unknown, missing or not allowed."""
-    settings: TrainingSettings = build(TrainingSettings, values, "settings")
     validate(settings)
     return settings

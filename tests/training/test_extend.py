@@ -19,16 +19,18 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
+from stga_addon.perform.training import Prepared, prepare
+from stga_addon.progress import ignore
+from stga_addon.requests.values import Extend
 from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, ExtendStrategy
 from stga_addon.training.run import continuation
-from stga_addon.training.run.continuation import START_SHARE, prepare_extension
+from stga_addon.training.run.continuation import START_SHARE
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.open_run import open_run
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import EXTEND_REPLAY_SHARE, continued_order
-from stga_addon.training.run.request import Extension
 from stga_addon.training.schedule import learning_rates
 
 from .test_run import assert_same_state
@@ -62,8 +64,13 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
+def prepare_extension(parent: Path, takes: tuple[Path, ...], growth: float = 0.0, iterations: int = 1) -> Prepared:
+    request = Extend(parent / "unused", parent, takes, growth, iterations=iterations, device="cpu")
+    return prepare(request, ignore, lambda line: None)
+
+
 def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0) -> Path:
-    prepared = prepare_extension(Extension(parent, (take,), growth, iterations=ITERATIONS), "cpu")
+    prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
 
     def report(progress: Progress) -> bool:
         return progress.iteration == stop
@@ -84,8 +91,8 @@ def test_the_run_remembers_its_takes(takes: tuple[Path, Path], parent: Path, tmp
     assert opened.run.continuation is not None
     assert (opened.run.continuation.first, opened.run.continuation.last) == (4, 7)
     with pytest.raises(StgaError, match="is a take of this run already"):
-        prepare_extension(Extension(out, (moved,), iterations=1), "cpu")
-    again = prepare_extension(Extension(out, (takes[1],), iterations=1), "cpu")
+        prepare_extension(out, (moved,), iterations=1)
+    again = prepare_extension(out, (takes[1],), iterations=1)
     assert [take.start for take in again.run.takes] == [4, 8]
     path = moved / "transforms_train.json"
     values = json.loads(path.read_text())
@@ -97,7 +104,7 @@ def test_the_run_remembers_its_takes(takes: tuple[Path, Path], parent: Path, tmp
 
 def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path) -> None:
     """Catches a selection by motion alone, which would not learn a changed skin, and one of the whole head."""
-    prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
+    prepared = prepare_extension(parent, (takes[1],), iterations=1)
     capture = prepared.capture
     height = capture.mesh(4)[capture.faces].mean(1)[:, 1]
     front = capture.neutral[capture.faces].mean(1)[:, 2] > 0.03
@@ -110,7 +117,7 @@ def test_selection_is_written_without_training(takes: tuple[Path, Path], parent:
     """Catches a selection at the joined takes' timesteps instead of the new take's own, and a run that is begun."""
     path = tmp_path / "selection.npz"
     assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
-    expected = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu").selection
+    expected = prepare_extension(parent, (takes[1],), iterations=1).selection
     written = read_npz(path)
     assert list(written) == ["00000", "00001", "00003"]
     assert all(np.array_equal(written[f"{timestep - 4:05d}"], faces) for timestep, faces in expected.items())
@@ -147,7 +154,7 @@ def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Pa
     capture = open_capture(takes[0])
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
     train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
-    prepared = prepare_extension(Extension(tmp_path / "run", (takes[1],), iterations=6), "cpu")
+    prepared = prepare_extension(tmp_path / "run", (takes[1],), iterations=6)
     run = replace(prepared.run, settings=replace(prepared.run.settings, strain_color=True, strain_position=True))
     train(prepared.capture, tmp_path / "new", run, prepared.selection)
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
@@ -163,7 +170,7 @@ def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Pa
 
 def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
     """Catches an extension that forgets because it sees the new take only, or that sees old views at one end only."""
-    prepared = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu")
+    prepared = prepare_extension(parent, (takes[1],), iterations=1)
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
     is_old = [view.timestep < 4 for view in views]
@@ -174,7 +181,7 @@ def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
 def test_strain_color_begins_with_its_first_rate(takes: tuple[Path, Path], parent: Path) -> None:
     """Catches strain coefficients as slow as colors that the old takes have trained, and other rates that jump."""
     original = read_run(parent).settings.rates
-    extended = prepare_extension(Extension(parent, (takes[1],), iterations=1), "cpu").run.settings.rates
+    extended = prepare_extension(parent, (takes[1],), iterations=1).run.settings.rates
     middle = learning_rates(original, START_SHARE)
     assert learning_rates(extended, 0.0) == pytest.approx({**middle, "strain_color": original.strain_color})
 
@@ -209,5 +216,5 @@ def test_takes_that_do_not_fit(
     }
     take = tmp_path / "missing" if change == "folder" else takes[1]
     with pytest.raises(StgaError, match=sentences[change]):
-        prepare_extension(Extension(parent, (take,), iterations=1), "cpu")
+        prepare_extension(parent, (take,), iterations=1)
     assert read_run(parent).takes == ()

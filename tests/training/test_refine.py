@@ -14,16 +14,18 @@ from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.region import write_region
 from stga_addon.errors import StgaError
+from stga_addon.perform.training import Prepared, prepare
+from stga_addon.progress import ignore
+from stga_addon.requests.values import Refine
 from stga_addon.training.optimize.state import TrainState, tensors_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import late_rates, prepare_refinement, starting_state
+from stga_addon.training.run.continuation import late_rates, starting_state
 from stga_addon.training.run.folder import Continuation, Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.run.replay import continued_order, distinct_timesteps, replayed_views, views_of_region
-from stga_addon.training.run.request import Refinement
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates
 
@@ -62,9 +64,13 @@ def opening(toy: Capture) -> Callable[..., Any]:
     return lambda folder, flame=None: OpenedRun(read_run(folder), capture, (capture,))
 
 
+def prepare_refinement(parent: Path, region: str, frames: tuple[int, int] | None = None, **changes: Any) -> Prepared:
+    request = Refine(parent / "unused", parent, region, frames=frames, iterations=ITERATIONS, device="cpu", **changes)
+    return prepare(request, ignore, lambda line: None)
+
+
 def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> Path:
-    wanted = Refinement(parent, "mouth", iterations=ITERATIONS, **{"growth": 0.5, **changes})
-    prepared = prepare_refinement(wanted, "cpu")
+    prepared = prepare_refinement(parent, "mouth", **{"growth": 0.5, **changes})
 
     def report(progress: Progress) -> bool:
         return progress.iteration == stop
@@ -123,7 +129,7 @@ def test_the_run_before_is_left_alone(parent: Path, tmp_path: Path) -> None:
 
 def test_the_avatar_before_is_the_first_evaluation(parent: Path, toy: Capture, tmp_path: Path) -> None:
     """Catches a report without what it is compared with, and a region that is not measured apart."""
-    prepared = prepare_refinement(Refinement(parent, "mouth", (1, 3), iterations=ITERATIONS), "cpu")
+    prepared = prepare_refinement(parent, "mouth", (1, 3))
     train(toy, tmp_path / "refined", prepared.run, prepared.selection)
     first, *_, last = read_metrics(tmp_path / "refined")
     assert (first["iteration"], last["iteration"]) == (0, ITERATIONS)
@@ -136,12 +142,12 @@ def test_a_region_that_no_camera_faces_is_refused(parent: Path, toy: Capture, tm
     away = np.asarray(toy.neutral)[toy.faces].mean(1)[:, 2] < -0.09
     write_region(tmp_path / "away.npz", away)
     with pytest.raises(StgaError, match=r"region '.*away\.npz': faces no training camera from timestep 0 to 4"):
-        prepare_refinement(Refinement(parent, str(tmp_path / "away.npz"), iterations=ITERATIONS), "cpu")
+        prepare_refinement(parent, str(tmp_path / "away.npz"))
 
 
 def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
     """Catches a refinement of another avatar than the one that its run.json names."""
-    prepared = prepare_refinement(Refinement(parent, "mouth", iterations=ITERATIONS), "cpu")
+    prepared = prepare_refinement(parent, "mouth")
     (parent / "avatar.npz").write_bytes(b"")
     with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
         train(prepared.capture, tmp_path / "refined", prepared.run, prepared.selection)
@@ -155,7 +161,7 @@ def test_colors_of_another_range_of_strain_are_not_continued(parent: Path, limit
     wider = avatar.strain_range.copy()
     wider[0, 1, 0] = 0.0
     write_avatar(parent / "avatar.npz", replace(avatar, strain_range=wider if limited else None))
-    prepared = prepare_refinement(Refinement(parent, "mouth", iterations=ITERATIONS), "cpu")
+    prepared = prepare_refinement(parent, "mouth")
     assert prepared.run.continuation is not None
     with pytest.raises(StgaError, match="as in an earlier version"):
         starting_state(prepared.run.continuation, prepared.run.settings, len(prepared.capture.faces))

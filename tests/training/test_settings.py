@@ -8,15 +8,14 @@ from typing import Any
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.schema import from_json, to_json
 from stga_addon.selection import SelectionOptions
 from stga_addon.training.settings import (
     SCHEDULES,
     STRATEGIES,
     Rates,
     TrainingSettings,
-    from_json,
     make_settings,
-    to_json,
 )
 
 
@@ -25,7 +24,7 @@ from stga_addon.training.settings import (
 def test_json_round_trip(strategy: str, schedule: str) -> None:
     """Catches a field that changes its value or kind (a tuple into a list) in run.json, so a resumed run differs."""
     settings = make_settings(strategy, schedule, seconds=90.5, background=(0.0, 0.5, 1.0), seed=7)
-    again = from_json(json.loads(json.dumps(to_json(settings))))
+    again = from_json(TrainingSettings, json.loads(json.dumps(to_json(settings))))
     assert again == settings
     assert [type(v) for v in vars(again).values()] == [type(v) for v in vars(settings).values()]
 
@@ -34,7 +33,7 @@ def test_nested_settings_round_trip() -> None:
     """Catches nested settings that come back with their defaults."""
     chosen = SelectionOptions(threshold=0.5, zero_pose="all", regions=("nose",))
     settings = make_settings(iterations=5, selection=chosen, rates=Rates(xyz=1.0))
-    assert from_json(json.loads(json.dumps(to_json(settings)))) == settings
+    assert from_json(TrainingSettings, json.loads(json.dumps(to_json(settings)))) == settings
 
 
 @pytest.mark.parametrize(
@@ -43,7 +42,7 @@ def test_nested_settings_round_trip() -> None:
 def test_unknown_or_missing_fields(change: dict[str, Any]) -> None:
     """Catches a misspelt field that is dropped without a message."""
     with pytest.raises(StgaError, match=next(iter(change))):
-        from_json({**to_json(TrainingSettings(iterations=5)), **change})
+        from_json(TrainingSettings, {**to_json(TrainingSettings(iterations=5)), **change})
 
 
 @pytest.mark.parametrize(
@@ -108,7 +107,7 @@ def test_one_schema_for_new_and_stored_settings(name: str, value: Any) -> None:
     if isinstance(value, list):
         return  # JSON's lists become tuples
     with pytest.raises(StgaError, match=name):
-        from_json({**stored, name: plain})
+        from_json(TrainingSettings, {**stored, name: plain})
 
 
 @pytest.mark.parametrize("change", [{"threshold": math.nan}, {"threshold": -1.0}, {"zero_pose": "neck"}])
@@ -116,7 +115,7 @@ def test_stored_selection_is_validated(change: dict[str, Any]) -> None:
     """Catches a stored selection rule that could not have been made."""
     stored = to_json(make_settings(iterations=5))
     with pytest.raises(StgaError, match=next(iter(change))):
-        from_json({**stored, "selection": {**stored["selection"], **change}})
+        from_json(TrainingSettings, {**stored, "selection": {**stored["selection"], **change}})
 
 
 def test_paper_schedule() -> None:

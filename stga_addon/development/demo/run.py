@@ -14,18 +14,17 @@ from ...avatar.file import Avatar, read_avatar
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
+from ...cli.carry_out import carry_out
 from ...cli.export_web import capture_views
 from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
 from ...files import replacing, write_json
 from ...render.render import render_avatar, to_uint8
+from ...requests.values import Train
 from ...selection import SelectionOptions, select_capture
-from ...training.effects.plan import with_effect_plan
 from ...training.evaluate.metrics import evaluate_avatar
-from ...training.run.folder import Run
-from ...training.run.loop import train
-from ...training.run.progress_bar import ProgressBar
+from ...training.run.folder import AVATAR, RUN
 from ...training.settings import make_settings
 from .capture import CaptureOptions, make_capture
 from .pictures import selection_picture, side_by_side
@@ -102,16 +101,13 @@ def _train(
 ) -> Avatar:
     # The tracking of a synthetic capture is exact, and Blender shows it unrefined.
     settings = make_settings(**budget, seed=SEED, effects={"tracking": "off"})
-    run = with_effect_plan(Run(capture.root, model.resolve(), "vhap", settings, device=device), capture, device)
     folder = out / "run"
-    if (folder / "run.json").exists():
-        (folder / "run.json").unlink()  # the demo always starts a new run
-    with ProgressBar() as bar:
-        path = train(capture, folder, run, selection, report=bar.report)
-    avatar = read_avatar(path)
-    with replacing(out / "avatar.npz") as partial:
+    (folder / RUN).unlink(missing_ok=True)  # the demo always starts a new run
+    carry_out(Train(folder, capture.root, settings, model, device=device, selection=selection))
+    path = folder / AVATAR
+    with replacing(out / AVATAR) as partial:
         partial.write_bytes(path.read_bytes())
-    return avatar
+    return read_avatar(path)
 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from ...errors import StgaError
+from ...schema import complaint
 
 CHOICES = ("auto", "on", "off")
 EFFECTS = (
@@ -47,6 +47,11 @@ class EffectDecision:
     reason: str
     cost: str
 
+    def check(self) -> None:
+        """Raise StgaError for a choice that is none."""
+        if self.choice not in CHOICES:
+            raise StgaError(complaint("choice", f"one of {', '.join(CHOICES)}", self.choice))
+
     def __str__(self) -> str:
         asked = "" if self.choice == "auto" else ", as asked"
         return f"{'on' if self.on else 'off'}{asked}: {self.reason}" + (f" [{self.cost}]" if self.on else "")
@@ -63,21 +68,3 @@ def parse_choices(texts: Sequence[str]) -> dict[str, str]:
             )
         choices[name] = choice
     return choices
-
-
-def effect_plan_to_json(plan: Sequence[EffectDecision]) -> list[dict[str, Any]]:
-    return [dict(vars(decision)) for decision in plan]
-
-
-def effect_plan_from_json(values: Any) -> tuple[EffectDecision, ...]:
-    """Raises TypeError or ValueError for anything but what `effect_plan_to_json` gave."""
-    if not isinstance(values, list):
-        raise TypeError("plan is no list")
-    plan = tuple(EffectDecision(**value) for value in values)
-    for decision in plan:
-        texts = (decision.effect, decision.choice, decision.reason, decision.cost)
-        if not all(isinstance(text, str) for text in texts) or not isinstance(decision.on, bool):
-            raise TypeError(f"plan holds {decision!r}")
-        if decision.choice not in CHOICES:
-            raise ValueError(f"plan: choice is {decision.choice!r}")
-    return plan

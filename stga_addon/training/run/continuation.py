@@ -1,18 +1,15 @@
 """Continuing a finished run in another folder: refining a region of its avatar, or extending it by further takes."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from ...avatar.file import Avatar, read_avatar
 from ...capture.model import Capture, View, evenly_spread
-from ...capture.open import open_capture
-from ...capture.region import find_region
-from ...capture.takes import first_timesteps, join_takes, require_same_head
 from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
+from ...schema import validate
 from ...selection import select_capture
 from ..evaluate.evaluation_views import (
     MAX_EVALUATION_VIEWS,
@@ -23,7 +20,6 @@ from ..evaluate.evaluation_views import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
-from ..optimize.flame_refinement import with_refined_tracking
 from ..optimize.state import (
     TrainState,
     new_state,
@@ -31,13 +27,11 @@ from ..optimize.state import (
     with_strain_coefficients,
     with_strain_position,
 )
-from ..settings import Rates, TrainingSettings, validate
+from ..settings import Rates, TrainingSettings
 from .checkpoint import read_checkpoint
-from .folder import CHECKPOINT, Continuation, Run, Take
-from .identity import file_digest, identity_of
-from .open_run import OpenedRun, open_run
-from .replay import is_faced, replayed_views
-from .request import Extension, Refinement, Request
+from .folder import CHECKPOINT, Continuation, Run
+from .identity import file_digest
+from .replay import replayed_views
 from .strain_range import require_color_range
 
 START_SHARE = 0.5
@@ -50,81 +44,6 @@ COMPARED_VIEWS = 36
 """Views of the old takes, and of the new ones, in which residuals are compared."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A run that can be trained: its capture of all takes, and timestep -> triangles to train, where they are given."""
-
-    run: Run
-    capture: Capture
-    selection: dict[int, np.ndarray] | None
-
-
-def prepare(wanted: Request, device: str, flame: Path | None = None) -> Prepared:
-    """Check what is asked for, and decide what is trained. Raises StgaError."""
-    if isinstance(wanted, Refinement):
-        return prepare_refinement(wanted, device, flame)
-    return prepare_extension(wanted, device, flame)
-
-
-def prepare_refinement(wanted: Refinement, device: str, flame: Path | None = None) -> Prepared:
-    """Check what is asked for. Raises StgaError where the run, the region or the frames do not exist, or no camera sees
-    the region."""
-    opened = open_run(wanted.parent, flame=flame)
-    capture = with_refined_tracking(opened.capture, wanted.parent)
-    region = find_region(capture, wanted.region)
-    face = read_avatar(wanted.parent / "avatar.npz").splats.face
-    count = int(region[face].sum())
-    if not count:
-        raise StgaError(f"region '{wanted.region}': the avatar has no splats there")
-    settings = continued_settings(
-        opened.run.settings, "refine", wanted.growth * count / len(face), wanted.seconds, wanted.iterations, wanted.seed
-    )
-    frames = wanted.frames or (min(capture.timesteps), max(capture.timesteps))
-    views = [view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]]
-    if not views:
-        raise StgaError(f"{wanted.parent}: its capture has no training views from timestep {frames[0]} to {frames[1]}")
-    if not is_faced(capture, views, region):
-        raise StgaError(f"region '{wanted.region}': faces no training camera from timestep {frames[0]} to {frames[1]}")
-    run = replace(
-        opened.run,
-        settings=settings,
-        device=device,
-        identity=None,
-        continuation=Continuation(wanted.parent.resolve(), file_digest(wanted.parent / "avatar.npz"), *frames),
-    )
-    return Prepared(run, capture, {capture.timesteps[0]: region})
-
-
-def prepare_extension(wanted: Extension, device: str, flame: Path | None = None) -> Prepared:
-    """Check the takes, and select what they need: the triangles that move, and those that look different than before.
-
-    Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
-    in the run already.
-    """
-    opened = open_run(wanted.parent, flame=flame)
-    run, new = opened.run, [_open_new_take(opened, path) for path in wanted.captures]
-    everything = [*opened.takes, *new]
-    capture = with_refined_tracking(join_takes(everything), wanted.parent)
-    starts = first_timesteps(everything)[len(opened.takes) :]
-    added = [
-        Take(take.root, start, identity_of(take, run.flame, run.principal_point, run.settings))
-        for take, start in zip(new, starts, strict=True)
-    ]
-    continuation = Continuation(
-        wanted.parent.resolve(), file_digest(wanted.parent / "avatar.npz"), starts[0], max(capture.timesteps)
-    )
-    selection = select_for_takes(continuation, capture, run.settings)
-    face = read_avatar(wanted.parent / "avatar.npz").splats.face
-    share = float(np.any(list(selection.values()), axis=0)[face].mean())
-    settings = continued_settings(
-        run.settings, "extend", wanted.growth * share, wanted.seconds, wanted.iterations, wanted.seed
-    )
-    run = replace(
-        run, settings=settings, device=device, identity=None, takes=(*run.takes, *added), continuation=continuation
-    )
-    return Prepared(run, capture, selection)
 
 
 def select_for_takes(continuation: Continuation, capture: Capture, settings: TrainingSettings) -> dict[int, np.ndarray]:
@@ -145,17 +64,6 @@ def select_for_takes(continuation: Continuation, capture: Capture, settings: Tra
     timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
     moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
     return {timestep: faces | differs for timestep, faces in moving.items()}
-
-
-def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
-    run = opened.run
-    take = open_capture(path, run.flame, run.principal_point)
-    require_same_head(opened.capture, take)
-    if not take.views.get("train"):
-        raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
-    if any(take.root == old.root for old in opened.takes):
-        raise StgaError(f"{take.root}: is a take of this run already")
-    return take
 
 
 def starting_state(continuation: Continuation, settings: TrainingSettings, triangles: int) -> TrainState:

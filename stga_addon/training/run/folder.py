@@ -12,21 +12,21 @@ residuals.npz   of a finished run: error of the avatar on each triangle
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
 from ...files import read_json, remove_leftovers, write_json
-from ...render.device import is_device
+from ...render.device import EXPECTED_DEVICE, is_device
+from ...schema import complaint, from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
-from ..effects.decisions import EffectDecision, effect_plan_from_json, effect_plan_to_json
-from ..settings import TrainingSettings, from_json, to_json
-from .identity import Identity, identity_from_json
+from ..effects.decisions import EffectDecision
+from ..settings import TrainingSettings
+from .identity import Identity
 
 FORMAT, VERSION = "stga-run", 3
-CHECKPOINT, SELECTION = "checkpoint.npz", "selection.npz"
+RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,11 @@ class Continuation:
     first: int
     last: int
 
+    def check(self) -> None:
+        """Raise StgaError where there is no timestep from first to last."""
+        if self.first > self.last:
+            raise StgaError(f"continuation: its last timestep {self.last} is before its first, {self.first}")
+
     def includes(self, timestep: int) -> bool:
         return self.first <= timestep <= self.last
 
@@ -74,63 +79,42 @@ class Run:
     principal_point: str
     settings: TrainingSettings
     effect_plan: tuple[EffectDecision, ...] = ()
-    device: str = "cpu"
+    device: str = setting("cpu", accepts=is_device, expected=EXPECTED_DEVICE)
     identity: Identity | None = field(default=None, compare=False)
     takes: tuple[Take, ...] = ()
     continuation: Continuation | None = None
 
+    def check(self) -> None:
+        """Raise StgaError for a convention of principal points that is none."""
+        if self.principal_point not in PRINCIPAL_POINTS:
+            expected = f"one of {', '.join(PRINCIPAL_POINTS)}"
+            raise StgaError(complaint("principal_point", expected, self.principal_point))
+
 
 def write_run(folder: Path, run: Run) -> None:
-    write_json(
-        folder / "run.json",
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "capture": str(run.capture),
-            "flame": None if run.flame is None else str(run.flame),
-            "principal_point": run.principal_point,
-            "device": run.device,
-            "settings": to_json(run.settings),
-            "effect_plan": effect_plan_to_json(run.effect_plan),
-            "identity": None if run.identity is None else asdict(run.identity),
-            "takes": [{**asdict(take), "capture": str(take.capture)} for take in run.takes],
-            "continuation": _continuation_to_json(run.continuation),
-        },
-    )
+    write_json(folder / RUN, {"format": FORMAT, "version": VERSION, **to_json(run)})
+
+
+def has_run(folder: Path) -> bool:
+    return (folder / RUN).exists()
 
 
 def read_run(folder: Path) -> Run:
     """Raises StgaError where the folder holds no run, a damaged one or one of another version."""
-    path = folder / "run.json"
+    path = folder / RUN
     if not path.exists():
-        raise StgaError(f"{folder}: holds no run (run.json is missing)")
+        raise StgaError(f"{folder}: holds no run ({RUN} is missing)")
     values = read_json(path)
-    if not isinstance(values, dict) or values.get("format") != FORMAT:
+    if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
-    if values.get("version") != VERSION:
-        found = shorten(values.get("version"))
-        raise StgaError(f"{path}: has run format version {found}, this add-on reads {VERSION}")
+    version = values.pop("version", None)
+    if version != VERSION:
+        raise StgaError(f"{path}: has run format version {shorten(version)}, this add-on reads {VERSION}")
     try:
-        flame, device, principal_point = values["flame"], values["device"], values["principal_point"]
-        if principal_point not in PRINCIPAL_POINTS:
-            raise ValueError(f"principal_point is {shorten(principal_point)}")
-        if not is_device(device):
-            raise ValueError(f"device is {shorten(device)}")
-        return Run(
-            Path(values["capture"]),
-            None if flame is None else Path(flame),
-            principal_point,
-            from_json(values["settings"]),
-            effect_plan_from_json(values["effect_plan"]),
-            device,
-            identity_from_json(values["identity"]),
-            tuple(_take_from_json(take) for take in values["takes"]),
-            _continuation_from_json(values["continuation"]),
-        )
+        run: Run = from_json(Run, values)
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
+    return run
 
 
 def next_folder(run: Path) -> Path:
@@ -143,27 +127,6 @@ def next_folder(run: Path) -> Path:
         folder = run.with_name(f"{name}_{number}")
         if not folder.exists():
             return folder
-
-
-def _take_from_json(values: Any) -> Take:
-    identity = identity_from_json(values["identity"])
-    if identity is None or type(values["start"]) is not int:
-        raise ValueError(f"takes holds {shorten(values)}")
-    return Take(Path(values["capture"]), values["start"], identity)
-
-
-def _continuation_to_json(continuation: Continuation | None) -> dict[str, Any] | None:
-    return None if continuation is None else {**vars(continuation), "parent": str(continuation.parent)}
-
-
-def _continuation_from_json(values: Any) -> Continuation | None:
-    if values is None:
-        return None
-    continuation = Continuation(**{**values, "parent": Path(values["parent"])})
-    span = continuation.first, continuation.last
-    if not isinstance(continuation.avatar, str) or not all(type(n) is int for n in span) or span[0] > span[1]:
-        raise ValueError(f"continuation is {shorten(values)}")
-    return continuation
 
 
 @contextmanager

@@ -2,16 +2,16 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...capture.camera import Camera
 from ...capture.model import Capture, View
 from ...errors import StgaError
-from ..settings import TrainingSettings, to_json
+from ...schema import to_json
+from ..settings import TrainingSettings
 
 QUANTUM = 1e-6 * 0.5**0.5
 """Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines compute other last
@@ -70,16 +70,6 @@ def difference(trained: Identity, given: Identity) -> str | None:
         "neutral": "has another neutral mesh",
     }
     return next((phrase for name, phrase in phrases.items() if getattr(trained, name) != getattr(given, name)), None)
-
-
-def identity_from_json(values: Any) -> Identity | None:
-    """Raises TypeError for anything but None and the fields of `Identity` as texts."""
-    if values is None:
-        return None
-    identity = Identity(**values)
-    if not all(isinstance(getattr(identity, field.name), str) for field in fields(Identity)):
-        raise TypeError("identity holds something else than texts")
-    return identity
 
 
 def _digest(data: bytes) -> str:

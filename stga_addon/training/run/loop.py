@@ -20,6 +20,7 @@ from ...capture.model import Capture, evenly_spread
 from ...errors import DeviceError, StgaError
 from ...files import replacing
 from ...format import format_duration
+from ...schema import to_json
 from ...selection import select_capture
 from ..effects.decisions import TRACKING
 from ..evaluate import lpips
@@ -33,7 +34,6 @@ from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
-from ..settings import to_json
 from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
 from .continuation import continued_evaluation_views, starting_state
 from .folder import CHECKPOINT, SELECTION, Run, locked, read_run, write_run

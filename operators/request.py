@@ -1,0 +1,78 @@
+"""Requests from Blender: starting a worker for one, waiting for it, and what is done when it has ended."""
+
+import sys
+from pathlib import Path
+from subprocess import Popen
+from typing import Any
+
+import bpy
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.folder import check_request, read_result, worker_arguments, write_request
+from ..stga_addon.requests.results import Result
+from ..stga_addon.requests.values import Request
+from ..stga_addon.worker.environment import missing_packages
+from ..stga_addon.worker.launch import start_worker
+from ..stga_addon.worker.status import WorkerState, failure_report, inspect_worker
+from .environment import training_python
+
+
+def start(folder: Path, request: Request, python: str) -> "Popen[bytes]":
+    """Write the request into the folder and start a worker for it.
+
+    Raises StgaError for what is known to fail, while another worker is in the folder, or where the interpreter cannot
+    be started.
+    """
+    check_request(request)
+    write_request(folder, request)
+    return start_worker(folder, python, worker_arguments(folder))
+
+
+def wait(folder: Path, process: "Popen[bytes]") -> Result:
+    """Wait for the worker; what it found. Raises StgaError with its error where it failed (the traceback goes to the
+    console), or where it was cancelled."""
+    process.wait()
+    last = inspect_worker(folder, process)
+    if last.state.failed:
+        print(failure_report(folder, last), file=sys.stderr)
+        raise StgaError(last.status.error)
+    if last.state == WorkerState.CANCELLED:
+        raise StgaError("It was cancelled")
+    return read_result(folder)
+
+
+def waits(operator: Any) -> bool:
+    """Whether an operator with `wait_property`, or any without a window, returns only when the work is done."""
+    return bool(operator.wait or bpy.app.background)
+
+
+def python_of(operator: Any, context: Any) -> str | None:
+    """The interpreter that is to carry out a request; None: that of Blender, where it waits and has the packages.
+
+    Raises StgaError where there is none.
+    """
+    if waits(operator) and not operator.python and not missing_packages():
+        return None
+    return training_python(context, operator.python)
+
+
+def perform_here(context: Any, folder: Path, request: Request) -> Result | None:
+    """Carry out the request in Blender's own Python, with Blender's progress at the pointer; None: it was cancelled.
+
+    Raises what the work raises.
+    """
+    from ..stga_addon.perform.perform import perform_in_folder
+
+    manager = context.window_manager
+
+    def show(progress: Any) -> bool:
+        manager.progress_update(100 * progress.share)
+        return False
+
+    check_request(request)
+    write_request(folder, request)
+    manager.progress_begin(0, 100)
+    try:
+        return perform_in_folder(folder, also=show)
+    finally:
+        manager.progress_end()

@@ -1,0 +1,68 @@
+"""Carrying out a request on the command line: progress on a terminal, and what there is to say."""
+
+import math
+import sys
+from typing import TYPE_CHECKING, Any
+
+from ..progress import Progress
+from ..requests.results import Result
+from ..requests.values import Request
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+
+
+def carry_out(request: Request) -> Result:
+    """Carry out the request with a progress bar, and print what it says. Raises as `perform` does."""
+    from ..perform.perform import perform
+
+    with ProgressBar() as bar:
+        result = perform(request, bar.report, bar.say)
+    for line in getattr(result, "lines", ()):
+        print(line)
+    return result
+
+
+class ProgressBar:
+    """A bar over the share of the work on stderr, with its stage and figures."""
+
+    def __enter__(self) -> "ProgressBar":
+        self._bar: tqdm[Any] | None = None
+        self._stage = ""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def report(self, progress: Progress) -> bool:
+        if self._bar is None:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
+        self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
+        self._stage = progress.stage
+        self._bar.set_postfix_str("; ".join(filter(None, [_figures(progress), progress.detail])), refresh=False)
+        self._bar.update(progress.share - self._bar.n)
+        return False
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        if self._bar is None:
+            print(line)
+            return
+        self._bar.clear()
+        print(line, flush=True)
+        sys.stderr.flush()
+
+
+def _figures(progress: Progress) -> str:
+    """The figures of a training in a line, without those that are not known yet."""
+    figures = progress.figures()
+    texts = {"per_second": "{:.1f} it/s", "loss": "loss {:.4f}", "psnr": "PSNR {:.2f}", "splats": "{:.0f} splats"}
+    if not figures.get("iteration"):
+        return ""
+    known = {name: figures[name] for name in texts if not math.isnan(figures.get(name, math.nan))}
+    return ", ".join(texts[name].format(value) for name, value in known.items())

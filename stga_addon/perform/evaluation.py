@@ -1,0 +1,51 @@
+"""Evaluation of a finished run on a split."""
+
+from ..avatar.file import read_avatar
+from ..errors import StgaError
+from ..files import write_json
+from ..progress import Progress, Report, Say
+from ..requests.results import Written
+from ..requests.values import Evaluate
+from ..training.evaluate.lpips import MIN_SIDE_PX
+from ..training.evaluate.metrics import Quality, evaluate_avatar
+from ..training.optimize.flame_refinement import with_refined_tracking
+from ..training.run.folder import AVATAR
+from ..training.run.open_run import open_run
+
+
+def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
+    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder. Raises StgaError."""
+    folder, split = request.run, request.split
+    if not folder.is_dir():
+        raise StgaError(f"{folder}: is not a folder; expected that of a run")
+    report(Progress(stage="Evaluating"))
+    capture = with_refined_tracking(open_run(folder, flame=request.flame).capture, folder)
+    views = capture.views.get(split, ())
+    if not views:
+        raise StgaError(f"{capture.root}: has no views in the split '{split}'")
+    quality = evaluate_avatar(read_avatar(folder / AVATAR), capture, split, perceptual=True)
+    path = folder / f"quality_{split}.json"
+    write_json(path, {"views": len(views), **quality.as_json()})
+    return Written(path, (f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)))
+
+
+def _details(quality: Quality) -> list[str]:
+    lines = [
+        f"  {name}: {_describe(quality.regions[region])}"
+        for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region"))
+        if region in quality.regions
+    ]
+    if quality.psnr_unmatched is not None:
+        lines.append(f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB")
+    if quality.lpips is None:
+        weights = "its weights, whose file STGA_LPIPS names (docs/dependencies.md),"
+        lines += [
+            f"LPIPS was not measured: it needs {weights}",
+            f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels",
+        ]
+    return lines
+
+
+def _describe(quality: Quality) -> str:
+    lpips = "" if quality.lpips is None else f", LPIPS {quality.lpips:.4f}"
+    return f"PSNR {quality.psnr:.3f} dB, SSIM {quality.ssim:.4f}{lpips}"

@@ -1,0 +1,86 @@
+"""Carrying out requests: the only place that knows which work a request is, and that loads it."""
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from ..errors import StgaError
+from ..progress import Cancelled, Progress, Report, Say, ignore
+from ..requests.folder import PREVIEW, has_request, read_request, write_result
+from ..requests.results import Result
+from ..requests.values import (
+    Analyze,
+    Evaluate,
+    Extend,
+    Refine,
+    RenderRecording,
+    Request,
+    Resume,
+    SelectForTake,
+    SolveAgain,
+    Track,
+    Train,
+)
+from ..worker.status import StatusWriter, status_writer
+
+PREVIEW_INTERVAL_S = 4.0
+"""Seconds between two previews of a training."""
+WORK: dict[type[Any], tuple[str, str]] = {
+    Train: (".training", "perform_training"),
+    Resume: (".training", "perform_training"),
+    Refine: (".training", "perform_training"),
+    Extend: (".training", "perform_training"),
+    SelectForTake: (".training", "select_for_take"),
+    Track: (".tracking", "perform_tracking"),
+    SolveAgain: (".tracking", "solve_again"),
+    RenderRecording: (".recording", "render_recording"),
+    Analyze: (".analysis", "analyze"),
+    Evaluate: (".evaluation", "evaluate_run"),
+}
+"""Request -> the module that carries it out, loaded when it is needed, and its function."""
+
+
+def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
+    """Carry out a request; returns what it found.
+
+    say: told in lines what was decided and found.
+    Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the report stopped work that
+    has nothing to keep; KeyboardInterrupt after Ctrl-C.
+    """
+    module, function = WORK[type(request)]
+    work: Callable[[Request, Report, Say], Result] = getattr(import_module(module, __package__), function)
+    return work(request, report, say)
+
+
+def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore) -> Result | None:
+    """Carry out the request in a folder, with its status, previews and result there; None where it was cancelled.
+
+    also: reported to as well. Raises as `perform` does; the message is in the final status, too.
+    """
+    if not has_request(folder):  # before anything is written into a folder that may be of something else
+        raise StgaError(f"{folder}: holds no request")
+    with status_writer(folder) as writer:
+        writer.update(0.0, "Starting")
+        try:
+            result = perform(read_request(folder), _StatusReport(writer, also), say)
+        except Cancelled:
+            return None
+        write_result(folder, result)
+        return result
+
+
+class _StatusReport:
+    """Writes the status, and a preview every few seconds, into the folder of a request."""
+
+    def __init__(self, writer: StatusWriter, also: Report) -> None:
+        self._writer, self._also = writer, also
+        self._previewed_s = monotonic()
+
+    def __call__(self, progress: Progress) -> bool:
+        stop = self._writer.update(progress.share, progress.stage, progress.detail, progress.figures)
+        if progress.preview is not None and monotonic() - self._previewed_s > PREVIEW_INTERVAL_S:
+            progress.preview(self._writer.folder / PREVIEW)
+            self._previewed_s = monotonic()
+        return self._also(progress) or stop

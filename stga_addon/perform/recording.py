@@ -1,0 +1,33 @@
+"""Rendering and encoding of images that Blender has recorded."""
+
+from contextlib import AbstractContextManager
+from typing import Any
+
+from ..progress import Cancelled, Progress, Report, Say
+from ..render.compose import Composer
+from ..render.recording import finished, is_video, recorded_images
+from ..render.video import sequence_writer, video_writer
+from ..requests.results import Written
+from ..requests.values import RenderRecording
+
+
+def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
+    """Render the recorded images and write them; the recording is removed.
+
+    A cancelled video is not written; images of a sequence that are finished stay. Raises StgaError.
+    """
+    try:
+        composer = Composer(request.device)
+        with _output(request) as write:
+            for index, image in enumerate(recorded_images(request.recording, request.images, composer)):
+                write(finished(image, request.background, is_video(request.output)))
+                share = (index + 1) / max(request.images, 1)
+                if report(Progress(share, "Rendering", f"Image {index + 1} of {request.images}")):
+                    raise Cancelled
+    finally:
+        request.recording.unlink(missing_ok=True)
+    return Written(request.output)
+
+
+def _output(request: RenderRecording) -> AbstractContextManager[Any]:
+    return video_writer(request.output, request.fps) if is_video(request.output) else sequence_writer(request.output)

@@ -1,0 +1,59 @@
+"""Tracking as requests ask for it."""
+
+from collections.abc import Callable
+
+from ..progress import Cancelled, Progress, Report, Say
+from ..requests.results import Written
+from ..requests.values import SolveAgain, Track
+from ..tracking.correct import correct_capture
+from ..tracking.footage.open import open_footage
+from ..tracking.footage.sequences import FrameRange
+from ..tracking.track import track
+
+STAGES = {
+    "Opening the footage": (0.0, 0.0),
+    "Head model": (0.0, 0.05),
+    "Landmarks": (0.05, 0.6),
+    "Fit": (0.6, 0.75),
+    "Surface": (0.75, 0.9),
+    "Contact sheet": (0.9, 0.92),
+    "Images": (0.92, 0.97),
+    "Heads": (0.97, 1.0),
+}
+"""Stage of `tracking.track` -> the share of the progress that it begins and ends with."""
+
+
+def perform_tracking(request: Track, report: Report, say: Say) -> Written:
+    """Track the head into a capture. Raises StgaError; cancelled, it leaves the landmarks of whole cameras, with which
+    the same request continues."""
+    steps = _steps(report)
+    steps("Opening the footage", 0, 1)
+    frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}))
+    footage = open_footage(request.footage, request.cameras, frames, request.focal)
+    found = track(footage, request.model, request.out, request.landmarks, request.detector, request.meshes, steps)
+    error = f"Reprojection error {found.median_px:.1f} px (median)"
+    report(Progress(1.0, "Tracked", error))
+    lines = [
+        *(f"warning: {warning}" for warning in found.warnings),
+        f"reprojection error: {found.median_px:.2f} px (median); by camera and timestep in tracking.json",
+        f"capture: {request.out}",
+    ]
+    return Written(request.out, tuple(lines))
+
+
+def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
+    """Solve the capture again around the keys. Raises StgaError."""
+    correct_capture(request.capture, request.model, request.keys, report=_steps(report))
+    return Written(request.capture)
+
+
+def _steps(report: Report) -> Callable[[str, int, int], None]:
+    """A report of steps done in a stage; raises Cancelled where the report says to stop."""
+
+    def report_steps(stage: str, done: int, total: int) -> None:
+        begin, end = STAGES.get(stage, (0.0, 0.9))
+        share = begin + (end - begin) * done / max(total, 1)
+        if report(Progress(share, stage, f"{done} of {total}" if total > 1 else "")):
+            raise Cancelled
+
+    return report_steps

@@ -1,0 +1,250 @@
+"""Training as requests ask for it: a new run, one that is resumed, refined or extended."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..avatar.file import read_avatar, write_avatar
+from ..capture.model import Capture
+from ..capture.open import open_capture
+from ..capture.region import SELECTED_WEIGHT, find_region
+from ..capture.takes import first_timesteps, join_takes, require_same_head
+from ..errors import StgaError
+from ..format import format_duration
+from ..progress import Progress, Report, Say
+from ..render.device import choose_device
+from ..report.preset_timing import time_presets
+from ..report.run_summary import CurveUpdater, report_run
+from ..requests.results import Selected, Written
+from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
+from ..training.effects.decisions import TRACKING
+from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
+from ..training.optimize.flame_refinement import with_refined_tracking
+from ..training.run.continuation import continued_settings, select_for_takes
+from ..training.run.folder import AVATAR, Continuation, Run, Take, has_run, read_run
+from ..training.run.identity import file_digest, identity_of
+from ..training.run.loop import train
+from ..training.run.open_run import OpenedRun, device_of, open_run
+from ..training.run.progress import Progress as TrainingProgress
+from ..training.run.replay import is_faced
+
+Selection = dict[int, np.ndarray]
+"""timestep -> (F,) bool: triangles to train."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that can be trained into its folder.
+
+    capture    of all its takes
+    selection  what each timestep trains, where that is given
+    resumes    whether the folder holds the run already
+    falls_back see `training.run.loop.train`
+    """
+
+    folder: Path
+    run: Run
+    capture: Capture
+    selection: Selection | None
+    resumes: bool
+    falls_back: bool
+
+
+def perform_training(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Written:
+    """Train the run that is asked for; returns the path of its avatar and its summary.
+
+    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
+    """
+    prepared = prepare(request, report, say)
+    for warning in prepared.capture.warnings:
+        say(f"warning: {warning}")
+    for line in _table(describe_effects(prepared.run.effect_plan)):
+        say(line)
+    draw = CurveUpdater(prepared.folder)
+
+    def report_training(progress: TrainingProgress) -> bool:
+        draw()
+        return report(_as_progress(progress))
+
+    avatar = train(
+        prepared.capture, prepared.folder, prepared.run, prepared.selection, prepared.resumes, report_training,
+        prepared.falls_back,
+    )  # fmt: skip
+    lines = [*report_run(prepared.folder), f"avatar: {avatar}"]
+    if prepared.run.settings.tracking:
+        lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
+    return Written(avatar, tuple(lines))
+
+
+def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
+    """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
+    if not isinstance(request, Resume) and has_run(request.run):
+        raise StgaError(f"{request.run}: already holds a run; resume it (--resume), or choose another folder (--out)")
+    match request:
+        case Train():
+            prepared = _new_run(request, report, say)
+        case Resume():
+            prepared = _resumed_run(request, say)
+        case Refine():
+            prepared = _refinement(request, report, say)
+        case Extend():
+            prepared = _extension(request, report, say)
+    return replace(prepared, falls_back=request.device == "auto")
+
+
+def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
+    """timestep of the take -> (F,) bool: what extending the run by it would train. Raises StgaError."""
+    report(Progress(stage="Comparing the avatar with the images"))
+    wanted = Extend(request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame)
+    _, _, selection, run = _joined_takes(wanted)
+    start = run.takes[-1].start
+    return Selected({timestep - start: faces for timestep, faces in selection.items()})
+
+
+def _table(rows: list[tuple[str, str]]) -> list[str]:
+    width = max((len(label) for label, _ in rows), default=0)
+    return [f"{label:<{width}}  {value}" for label, value in rows]
+
+
+def _as_progress(progress: TrainingProgress) -> Progress:
+    avatar = progress.avatar
+
+    def preview(path: Path) -> None:
+        assert avatar is not None
+        with suppress(StgaError):  # training continues without a preview, and reports a full disk itself
+            write_avatar(path, avatar())
+
+    shown = None if avatar is None else preview
+    return Progress(progress.share, progress.message, progress.forecast_text, progress.figures, shown)
+
+
+def _new_run(request: Train, report: Report, say: Say) -> Prepared:
+    if not request.capture.is_dir():
+        raise StgaError(f"{request.capture}: is not a folder; expected that of a capture")
+    device, why = choose_device(request.device)
+    capture = open_capture(request.capture, request.flame, request.principal_point)
+    settings = request.settings
+    if request.preset_time:
+        report(Progress(stage="Timing the preset"))
+        (timing,) = time_presets(capture, [str(settings.preset)], device=device)
+        say(f"{timing.preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
+        settings = replace(settings, seconds=timing.seconds, iterations=None)
+    report(Progress(stage="Analyzing the capture"))
+    flame = None if request.flame is None else request.flame.resolve()
+    run = Run(capture.root, flame, request.principal_point, settings, device=device)
+    run = with_effect_plan(run, capture, device)
+    say(why)
+    return Prepared(request.run, run, capture, _given(request.selection), resumes=False, falls_back=False)
+
+
+def _resumed_run(request: Resume, say: Say) -> Prepared:
+    opened = open_run(request.run, request.capture, request.flame, request.principal_point)
+    device, why = device_of(opened.run, request.device)
+    say(why)
+    run, selection = replace(opened.run, device=device), _given(request.selection)
+    return Prepared(request.run, run, opened.capture, selection, resumes=True, falls_back=False)
+
+
+def _given(selection: Mapping[int, np.ndarray] | None) -> Selection | None:
+    return None if selection is None else dict(selection)
+
+
+def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
+    """Raises StgaError where the run, the region or the frames do not exist, or no camera sees the region."""
+    device = _continuing_device(request, say)
+    report(Progress(stage="Opening the run"))
+    opened = open_run(request.parent, flame=request.flame)
+    capture = with_refined_tracking(opened.capture, request.parent)
+    region, name = _region(request, capture), request.region or "painted"
+    face = read_avatar(request.parent / AVATAR).splats.face
+    count = int(region[face].sum())
+    if not count:
+        raise StgaError(f"region '{name}': the avatar has no splats there")
+    settings = continued_settings(
+        opened.run.settings, "refine", request.growth * count / len(face), request.seconds, request.iterations,
+        request.seed,
+    )  # fmt: skip
+    frames = request.frames or (min(capture.timesteps), max(capture.timesteps))
+    views = [view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]]
+    between = f"from timestep {frames[0]} to {frames[1]}"
+    if not views:
+        raise StgaError(f"{request.parent}: its capture has no training views {between}")
+    if not is_faced(capture, views, region):
+        raise StgaError(f"region '{name}': faces no training camera {between}")
+    continuation = _continuation(request.parent, frames)
+    run = replace(opened.run, settings=settings, device=device, identity=None, continuation=continuation)
+    return Prepared(request.run, run, capture, {capture.timesteps[0]: region}, resumes=False, falls_back=False)
+
+
+def _region(request: Refine, capture: Capture) -> np.ndarray:
+    """(F,) bool."""
+    if request.weights is None:
+        return find_region(capture, request.region)
+    if request.weights.shape != (len(capture.faces),):
+        found = request.weights.shape
+        raise StgaError(f"weights: expected one for each triangle ({len(capture.faces)},), got {found}")
+    return np.asarray(request.weights >= SELECTED_WEIGHT)
+
+
+def _extension(request: Extend, report: Report, say: Say) -> Prepared:
+    device = _continuing_device(request, say)
+    report(Progress(stage="Comparing the avatar with the images"))
+    opened, capture, selection, run = _joined_takes(request)
+    needed = np.any(list(selection.values()), axis=0)
+    face = read_avatar(request.parent / AVATAR).splats.face
+    growth = request.growth * float(needed[face].mean())
+    settings = continued_settings(
+        opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
+    )
+    before = replace(run, settings=settings, device=device)
+    say(f"takes: {1 + len(before.takes)}; the new ones need {needed.mean():.0%} of the triangles")
+    run = with_effects_of_takes(before, capture)
+    for old, new in zip(before.effect_plan, run.effect_plan, strict=True):
+        if new.on != old.on:
+            say(f"{new.effect}  {new}")
+    return Prepared(request.run, run, capture, selection, resumes=False, falls_back=False)
+
+
+def _joined_takes(request: Extend) -> tuple[OpenedRun, Capture, Selection, Run]:
+    """The run, its capture joined with the new takes, what these train, and the run with them.
+
+    Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
+    in the run already.
+    """
+    opened = open_run(request.parent, flame=request.flame)
+    run, new = opened.run, [_open_new_take(opened, path) for path in request.captures]
+    everything = [*opened.takes, *new]
+    capture = with_refined_tracking(join_takes(everything), request.parent)
+    starts = first_timesteps(everything)[len(opened.takes) :]
+    added = [
+        Take(take.root, start, identity_of(take, run.flame, run.principal_point, run.settings))
+        for take, start in zip(new, starts, strict=True)
+    ]
+    continuation = _continuation(request.parent, (starts[0], max(capture.timesteps)))
+    selection = select_for_takes(continuation, capture, run.settings)
+    run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
+    return opened, capture, selection, run
+
+
+def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
+    run = opened.run
+    take = open_capture(path, run.flame, run.principal_point)
+    require_same_head(opened.capture, take)
+    if not take.views.get("train"):
+        raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
+    if any(take.root == old.root for old in opened.takes):
+        raise StgaError(f"{take.root}: is a take of this run already")
+    return take
+
+
+def _continuation(parent: Path, frames: tuple[int, int]) -> Continuation:
+    return Continuation(parent.resolve(), file_digest(parent / AVATAR), *frames)
+
+
+def _continuing_device(request: Refine | Extend, say: Say) -> str:
+    device, why = device_of(read_run(request.parent), request.device)
+    say(f"{why}\nrun: {request.run}")
+    return device

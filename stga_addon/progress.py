@@ -1,0 +1,37 @@
+"""Progress of work, whatever it is, and how it is reported and cancelled."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far the work is.
+
+    share     0 to 1
+    stage     what is being done; detail: more about it
+    figures   gives named numbers that depend on the kind of work, NaN where one is not known yet
+    preview   writes the result so far into a file; None before there is one
+    """
+
+    share: float = 0.0
+    stage: str = ""
+    detail: str = ""
+    figures: Callable[[], Mapping[str, float]] = dict
+    preview: Callable[[Path], None] | None = None
+
+
+Report = Callable[[Progress], bool]
+"""Called now and then; returns True to stop and keep what there is."""
+Say = Callable[[str], None]
+"""Called with a line for people."""
+
+
+class Cancelled(Exception):
+    """The work was asked to stop, and has nothing more to give."""
+
+
+def ignore(progress: Progress) -> bool:
+    """A report that nobody reads."""
+    return False
