@@ -27,7 +27,8 @@ from PIL import Image
 
 from stga_addon.cli.main import main
 from stga_addon.report import preset_timing
-from stga_addon.requests.training_job import TrainingJob, write_job
+from stga_addon.requests.folder import write_request
+from stga_addon.requests.values import Train
 from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")
@@ -127,7 +128,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert call(["train", *options, *strategy, "--out", case / name])[0] == 0
     shutil.copytree(case / "run", case / "unfinished")
     (case / "unfinished/avatar.npz").unlink()
-    write_job(case / "job", TrainingJob(capture, None, "vhap", read_run(case / "run").settings))
+    settings = read_run(case / "run").settings
+    write_request(case / "job", Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}))
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
     (case / "head").mkdir()
     head = {

@@ -74,7 +74,7 @@ def splats() -> int:
 
 
 def job_folder() -> Path:
-    return monitor.job_folder(monitor.training_of(bpy.context.scene).folder)
+    return monitor.request_folder(monitor.training_of(bpy.context.scene).folder)
 
 
 def first() -> Iterator[Callable[[], bool]]:

@@ -208,7 +208,7 @@ def test_takes_that_do_not_fit(
             return replace(capture, neutral=capture.neutral * 1.1)
         return replace(capture, views={}) if change == "images" else capture
 
-    monkeypatch.setattr(continuation, "open_capture", changed)
+    monkeypatch.setattr("stga_addon.perform.training.open_capture", changed)
     sentences = {
         "shape": "must be of the same head",
         "images": "has no training views",

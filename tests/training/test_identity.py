@@ -18,8 +18,10 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
+from stga_addon.perform.perform import perform
 from stga_addon.render import device as device_choice
-from stga_addon.requests.training_job import TrainingJob, run_training_job, write_job
+from stga_addon.requests.folder import request_folder, write_request
+from stga_addon.requests.values import Resume
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import open_run as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -184,10 +186,9 @@ def test_every_command_checks_the_identity(copy: Path, toy: Capture, tmp_path: P
     move_cameras(other)
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
     assert main(["train", str(other), "--out", str(copy), "--resume"]) == 2
-    write_job(copy, TrainingJob(toy.root, None, "opencv", None))
-    assert main(["job", str(copy)]) == 2
-    write_job(copy, TrainingJob(other, None, "vhap", None))
-    assert main(["job", str(copy)]) == 2
+    for request in (Resume(copy, toy.root, principal_point="opencv"), Resume(copy, other)):
+        write_request(request_folder(copy), request)
+        assert main(["perform", str(request_folder(copy))]) == 2
     assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
     cameras = str(other / "transforms_test.json")
@@ -277,8 +278,7 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_resumed_job_keeps_the_device(copy: Path, toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a worker that always trains on what this machine offers."""
     monkeypatch.setattr(device_choice, "_fastest", lambda: ("gpu:Card", "why"))
-    write_job(copy, TrainingJob(toy.root, None, "vhap", None))
-    run_training_job(copy)
+    perform(Resume(copy))
     assert read_run(copy).device == "cpu"
 
 

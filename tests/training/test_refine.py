@@ -52,7 +52,7 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the finished run, whose density control comes often when it is refined."""
     monkeypatch.setattr(module, "DENSITY_INTERVAL", 4)
-    monkeypatch.setattr(module, "open_run", opening(toy))
+    monkeypatch.setattr("stga_addon.perform.training.open_run", opening(toy))
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
@@ -188,7 +188,7 @@ def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent: Path, toy: 
 def test_what_is_refused(parent: Path, changes: dict[str, Any], sentence: str) -> None:
     """Catches a traceback, or a folder begun, for what cannot be refined."""
     with pytest.raises(StgaError, match=sentence):
-        prepare_refinement(replace(Refinement(parent, "mouth", iterations=1), **changes), "cpu")
+        prepare_refinement(parent, **{"region": "mouth", **changes})
 
 
 def test_late_rates_are_the_rest_of_the_schedule() -> None:

@@ -1,4 +1,4 @@
-"""Video jobs without Blender: recorded layers, rendered by the function that the worker calls."""
+"""Recordings without Blender: layers that are written down, and rendered as a request asks for."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +11,28 @@ from stga_addon.avatar.embedding import WORLD
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
-from stga_addon.files import write_json
+from stga_addon.perform.perform import perform_in_folder
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
 from stga_addon.render.protocol import pack_layers, unpack_layers
-from stga_addon.requests.video_job import IMAGES, VIDEO, Recorder, VideoJob, finished, read_video_job, run_video_job
+from stga_addon.render.recording import Recorder, check_output, finished
+from stga_addon.requests.folder import write_request
+from stga_addon.requests.values import RenderRecording
 from stga_addon.worker.status import inspect_worker, request_cancel
 
+IMAGES = "recording.bin"
 CAMERA = look_at((0, 0, 2), (0, 0, 0), 32, 24, 40.0)
+
+
+def record(folder: Path, output: Path, images: list[list[PosedSplats]], count: int | None = None) -> None:
+    """Record images and ask for them; count: how many, if others than there are."""
+    folder.mkdir()
+    recorder = Recorder(folder / IMAGES)
+    for layers in images:
+        recorder.add(layers, CAMERA)
+    recorder.close()
+    background = (1.0, 0.5, 0.0) if len(images) > 1 else None
+    write_request(folder, RenderRecording(folder / IMAGES, output, count or len(images), 25.0, background))
 
 
 def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> PosedSplats:
@@ -54,11 +68,8 @@ def test_images_are_those_recorded(tmp_path: Path) -> None:
     """Catches images of other splats, poses or cameras than recorded, and a recording left on the disk."""
     folder, out = tmp_path / "job", tmp_path / "out"
     images = [[layer(0)], [replace(layer(0), to_world=moved(0.3))], [layer(1), layer(0)]]
-    recorder = Recorder(folder, VideoJob(out, len(images), 25.0, (1.0, 0.5, 0.0)))
-    for layers in images:
-        recorder.add(layers, CAMERA)
-    recorder.close()
-    run_video_job(folder)
+    record(folder, out, images)
+    perform_in_folder(folder)
     assert inspect_worker(folder).state == "finished"
     assert not (folder / IMAGES).exists()
     for index, layers in enumerate(images):
@@ -71,11 +82,9 @@ def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
     """Catches half a video under the name of a whole one, and a cancel that counts as a failure."""
     pytest.importorskip("av")
     folder = tmp_path / "job"
-    recorder = Recorder(folder, VideoJob(tmp_path / "video.mp4", 1, 25.0, None))
-    recorder.add([layer(0)], CAMERA)
-    recorder.close()
+    record(folder, tmp_path / "video.mp4", [[layer(0)]])
     request_cancel(folder)
-    run_video_job(folder)
+    perform_in_folder(folder)
     assert inspect_worker(folder).state == "cancelled"
     assert [path.name for path in tmp_path.iterdir()] == ["job"]
 
@@ -88,43 +97,12 @@ def test_backgrounds() -> None:
     assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
 
 
-VALID = {
-    "format": "stga-video", "version": 1, "output": "v.mp4", "images": 1, "fps": 1, "background": None, "device": "cpu"
-}  # fmt: skip
-
-
-def test_a_whole_job_is_read(tmp_path: Path) -> None:
-    """Catches a damaged job below that is refused for something else than its one damaged field."""
-    write_json(tmp_path / VIDEO, VALID)
-    assert read_video_job(tmp_path) == VideoJob(Path("v.mp4"), 1, 1.0, None, "cpu")
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        [],
-        {"format": "stga-job", "version": 1},
-        {"format": "stga-video", "version": 1},
-        VALID | {"images": "x"},
-        VALID | {"background": [1, 2]},
-        VALID | {"device": "x"},
-    ],
-)
-def test_damaged_jobs(tmp_path: Path, values: object) -> None:
-    """Catches a traceback for a file that was edited or is of another version."""
-    write_json(tmp_path / VIDEO, values)
-    with pytest.raises(StgaError, match=VIDEO):
-        read_video_job(tmp_path)
-
-
 def test_a_truncated_recording(tmp_path: Path) -> None:
     """Catches a traceback where the disk was full while Blender recorded."""
     folder = tmp_path / "job"
-    recorder = Recorder(folder, VideoJob(tmp_path / "out", 2, 25.0, None))
-    recorder.add([layer(0)], CAMERA)
-    recorder.close()
+    record(folder, tmp_path / "out", [[layer(0)]], count=2)
     with pytest.raises(StgaError, match="cannot be read as the images of a video"):
-        run_video_job(folder)
+        perform_in_folder(folder)
     assert inspect_worker(folder).state == "failed"
     assert not (folder / IMAGES).exists()
 
@@ -132,7 +110,7 @@ def test_a_truncated_recording(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_a_full_disk_while_recording(tmp_path: Path) -> None:
     """Catches a recording whose end never reached the disk and that counts as whole, and a traceback."""
-    recorder = Recorder(tmp_path / "job", VideoJob(tmp_path / "out", 1, 25.0, None))
+    recorder = Recorder(tmp_path / IMAGES)
     recorder._stream.close()
     recorder._stream = Path("/dev/full").open("wb")  # noqa: SIM115
     with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
@@ -148,5 +126,4 @@ def test_an_output_that_cannot_be_written(tmp_path: Path, output: str) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(StgaError, match="cannot be written"):
-        Recorder(tmp_path / "job", VideoJob(tmp_path / output, 1, 25.0, None))
-    assert not (tmp_path / "job").exists()
+        check_output(tmp_path / output)
