@@ -70,9 +70,21 @@ def test_impossible_choice_is_a_sentence(chosen):
     assert "Traceback" not in chosen.analysis_error
 
 
+WORKER = """
+import json, pathlib, shutil, sys, time
+FOLDER = pathlib.Path(sys.argv[-1])
+def end(state, error=""):
+    (FOLDER / "status.json").write_text(json.dumps({"state": state, "error": error}))
+def answer(**values):
+    header = {"format": "stga-request", "version": 1}
+    (FOLDER / "result.json").write_text(json.dumps({**header, **values}))
+    end("finished")
+"""
+
+
 def write_interpreter(path: Path, body: str) -> str:
-    """A program that stands in for the Python of the training environment."""
-    path.write_text(f"#!{sys.executable}\nimport json, sys, time\n{body}\n")
+    """A program that stands in for the Python of the training environment, given the folder of a request."""
+    path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
     path.chmod(0o755)
     return str(path)
 
@@ -93,7 +105,8 @@ def analyze(extension, monkeypatch, tmp_path):
 
 def tick_until_done(extension) -> None:
     for _ in range(300):
-        if extension.operators.background.tick() is None:
+        extension.operators.monitor.tick()
+        if not extension.operators.background.running(bpy.context.scene):
             return
         time.sleep(0.02)
     raise AssertionError("the analysis did not end")
@@ -102,7 +115,7 @@ def tick_until_done(extension) -> None:
 def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
     """Catches a worker that waits for ever because nobody reads its pipes before it ends: they hold some 64 kB."""
     rows = {"effect": "jaw", "choice": "auto", "on": True, "reason": "x" * 200_000, "cost": ""}
-    analyze(f"sys.stderr.write('warning ' * 100_000); print(json.dumps({{'plan': [{rows}], 'presets': []}}))")
+    analyze(f"sys.stderr.write('warning ' * 100_000); answer(kind='Analyzed', plan=[{rows}], seconds={{}})")
     assert not bpy.ops.stga.analyze_capture.poll()
     tick_until_done(extension)
     assert [row.name for row in chosen.effects] == ["jaw"]
@@ -112,10 +125,11 @@ def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
 @pytest.mark.parametrize(
     ("body", "sentence"),
     [
-        ("sys.exit(3)", r"The command exited unexpectedly \(exit code 3\)"),
-        ("sys.exit('stga: no memory')", "no memory"),
-        ("print('no JSON')", "Analysis printed something other than JSON"),
-        ("print('{}')", r"Unexpected error \(KeyError"),
+        ("sys.exit(3)", r"Worker exited with status 3: its log is empty"),
+        ("end('failed', 'no memory')", "no memory"),
+        ("end('finished')", r".*result\.json: cannot be read"),
+        ("answer(kind='Analyzed')", r".*result\.json: fields are missing or unknown"),
+        ("answer(kind='Written', path='x', lines=[])", r"Unexpected error \(AttributeError"),
     ],
 )
 def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentence):
@@ -135,5 +149,5 @@ def test_analysis_can_be_cancelled(chosen, extension, analyze):
     assert bpy.ops.stga.cancel_analysis() == {"FINISHED"}
     assert time.monotonic() - begin < 60
     assert bpy.ops.stga.analyze_capture.poll()
-    assert extension.operators.background.tick() is None
+    assert extension.operators.monitor.tick() is None
     assert chosen.analysis_error == ""

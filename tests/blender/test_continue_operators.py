@@ -2,7 +2,6 @@
 
 import sys
 import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +11,11 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
-from stga_addon.files import read_npz, write_npz  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 
 from .test_analyze_operator import tick_until_done, write_interpreter  # noqa: E402
 from .test_operators import write_ball_avatar  # noqa: E402
+from .test_train_operators import ask_only  # noqa: E402
 
 
 @pytest.fixture
@@ -32,12 +31,9 @@ def head(extension, tmp_path):
 
 
 @pytest.fixture
-def jobs(extension, monkeypatch):
-    """Operators that write the job and train nothing."""
-    train = extension.operators.train
-    monkeypatch.setattr(train, "_train_here", lambda context, run: run / "avatar.npz")
-    monkeypatch.setattr(train, "missing_packages", list)
-    return extension.stga_addon.requests.training_job
+def asked(extension, monkeypatch):
+    """What operators that train ask for; nothing is trained."""
+    return ask_only(monkeypatch, extension)
 
 
 @pytest.fixture
@@ -48,21 +44,21 @@ def run(tmp_path):
     return folder
 
 
-def test_painted_group_becomes_the_region(head, jobs, run):
+def test_painted_group_becomes_the_region(head, asked, run):
     """Catches a region of other triangles than those painted, and settings of the panel that are lost."""
     chosen = {"device": "gpu", "adapter": "Card (Vulkan)", "seconds": 7, "growth": 0.5}
     assert bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, **chosen) == {"FINISHED"}
     new = run.with_name("run_2")
-    wanted = jobs.read_job(new).continues
-    assert jobs.read_job(new).device == "gpu:Card (Vulkan)"
-    assert (wanted.parent, wanted.frames, wanted.seconds, wanted.growth) == (run, (1, 3), 7, 0.5)
-    weights = read_npz(Path(wanted.region))["weights"]
+    (wanted,) = asked
+    assert (wanted.run, wanted.parent, wanted.device) == (new, run, "gpu:Card (Vulkan)")
+    assert (wanted.frames, wanted.seconds, wanted.growth) == ((1, 3), 7, 0.5)
+    weights = wanted.weights
     assert weights[:40] == pytest.approx(0.8)
     assert (weights >= 0.5).sum() < 80
     assert bpy.context.scene.stga.run_folder == str(new)
 
 
-def test_faces_selected_in_edit_mode_become_the_region(head, jobs, run):
+def test_faces_selected_in_edit_mode_become_the_region(head, asked, run):
     """Catches a selection as it was before Edit Mode, and a vertex group used although faces are selected."""
     head.hide_set(False)
     bpy.context.view_layer.objects.active = head
@@ -71,22 +67,21 @@ def test_faces_selected_in_edit_mode_become_the_region(head, jobs, run):
     bpy.context.tool_settings.mesh_select_mode = (False, False, True)
     bpy.ops.object.mode_set(mode="EDIT")
     assert bpy.ops.stga.refine(directory=str(run), seconds=3) == {"FINISHED"}
-    weights = read_npz(Path(jobs.read_job(run.with_name("run_2")).continues.region))["weights"]
-    assert np.flatnonzero(weights).tolist() == [3, 5, 8]
+    assert np.flatnonzero(asked[-1].weights).tolist() == [3, 5, 8]
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_splats_of_the_run_before_show_the_new_one(head, jobs, run, extension):
+def test_splats_of_the_run_before_show_the_new_one(head, asked, run, extension):
     """Catches a preview in a second object over the first one."""
     assert bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz")) == {"FINISHED"}
     shown = bpy.context.scene.stga.splats
     assert bpy.ops.stga.refine(directory=str(run), region="mouth", seconds=3) == {"FINISHED"}
     new = run.with_name("run_2")
-    assert jobs.read_job(new).continues.region == "mouth"
+    assert asked[-1].region == "mouth"
     assert shown[extension.stga_addon.scene.tags.RUN] == str(new)
 
 
-def test_mistakes_are_sentences(head, jobs, run, tmp_path):
+def test_mistakes_are_sentences(head, asked, run, tmp_path):
     """Catches tracebacks, and folders begun for what cannot be trained."""
     for operator, arguments, sentence in (
         (bpy.ops.stga.refine, {"group": "chin"}, "has no vertex group 'chin'"),
@@ -117,14 +112,20 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
         bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run.parent))
 
 
+def answer(extension, tmp_path, selection) -> str:
+    """The body of a stand-in for a worker that selects these triangles."""
+    given = tmp_path / "given"
+    given.mkdir(exist_ok=True)
+    requests = extension.stga_addon.requests
+    requests.folder.write_result(given, requests.results.Selected(selection))
+    return f"shutil.copytree({str(given)!r}, FOLDER, dirs_exist_ok=True)\nend('finished')"
+
+
 def test_what_an_extension_would_train_is_selected(head, run, extension, monkeypatch, tmp_path):
     """Catches a selection of other frames or triangles than the worker found, and a failure that shows nowhere."""
     selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
     selection[3] = ~selection[3]
-    given = tmp_path / "given.npz"
-    write_npz(given, {f"{timestep:05d}": faces for timestep, faces in selection.items()})
-    body = f"import shutil\nshutil.copy({str(given)!r}, sys.argv[-1])"
-    program = write_interpreter(tmp_path / "python", body)
+    program = write_interpreter(tmp_path / "python", answer(extension, tmp_path, selection))
     monkeypatch.setattr(extension.operators.background, "training_python", lambda context: program)
     settings = bpy.context.scene.stga
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
@@ -134,7 +135,7 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, monkeyp
         assert shown[timestep].mean() < 0.9 or timestep
     assert not shown[1].any()
     assert [row.frame for row in settings.selected_frames if row.triangles] == [0, 3]
-    program = write_interpreter(tmp_path / "python", "sys.exit('stga: no such run')")
+    program = write_interpreter(tmp_path / "python", "end('failed', 'no such run')")
     with pytest.raises(RuntimeError, match="no such run"):
         bpy.ops.stga.select_extension(directory=str(run))
     assert settings.extension_error == "no such run"
@@ -145,11 +146,9 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    write_npz(tmp_path / "given.npz", {"00000": np.ones(len(head.data.polygons), bool)})
-    wait = f"import pathlib, shutil\nwhile not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
-    program = write_interpreter(
-        tmp_path / "python", wait + f"shutil.copy({str(tmp_path / 'given.npz')!r}, sys.argv[-1])"
-    )
+    given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
+    wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
+    program = write_interpreter(tmp_path / "python", wait + given)
     background, settings = extension.operators.background, bpy.context.scene.stga
     monkeypatch.setattr(background, "training_python", lambda context: program)
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
@@ -170,10 +169,8 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
 
 def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypatch, tmp_path):
     """Catches a result lost because the head is edited, a failure held back, and an old error beside a new command."""
-    write_npz(tmp_path / "given.npz", {"00000": np.ones(len(head.data.polygons), bool)})
-    program = write_interpreter(
-        tmp_path / "python", f"import shutil\nshutil.copy({str(tmp_path / 'given.npz')!r}, sys.argv[-1])"
-    )
+    given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
+    program = write_interpreter(tmp_path / "python", given)
     background, settings = extension.operators.background, bpy.context.scene.stga
     monkeypatch.setattr(background, "training_python", lambda context: program)
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
@@ -182,16 +179,16 @@ def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypa
     settings.extension_error = "of last time"
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     assert settings.extension_error == ""
-    background._running[bpy.context.scene.session_uid][1]._thread.join(60)
+    background._asked[bpy.context.scene.session_uid].process.wait(60)
+    assert extension.operators.monitor.tick() is not None
     assert background.is_waiting(bpy.context.scene)
-    assert background.tick() is not None
     assert "stga_0" not in head.vertex_groups
     bpy.ops.object.mode_set(mode="OBJECT")
     tick_until_done(extension)
     assert settings.extension_error == ""
     assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
     bpy.ops.object.mode_set(mode="EDIT")
-    write_interpreter(tmp_path / "python", "sys.exit('stga: no such run')")
+    write_interpreter(tmp_path / "python", "end('failed', 'no such run')")
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     tick_until_done(extension)
     assert settings.extension_error == "no such run"

@@ -63,10 +63,11 @@ def trained(extension, tmp_path, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.select(threshold=0.0005)
-    run, job, monitor = tmp_path / "run", extension.stga_addon.requests.training_job, extension.operators.monitor
+    run, requests, monitor = tmp_path / "run", extension.stga_addon.requests, extension.operators.monitor
+    folder = requests.folder.request_folder(run)
     settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-    job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
-    with extension.stga_addon.worker.status.status_writer(job.job_folder(run)) as writer:
+    requests.folder.write_request(folder, requests.values.Train(run, tmp_path / "capture", settings))
+    with extension.stga_addon.worker.status.status_writer(folder) as writer:
         monitor.start_training(bpy.context.scene, run, None)
         writer.update(0.5, "Training")
         (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines()))

@@ -148,7 +148,8 @@ def test_finished_jobs_end_with_the_add_on(shown, temporary):
     """Catches temporary folders of videos that nobody dismissed."""
     operator = sys.modules["stga_checkout.operators.render_video"]
     folder = temporary / "stga_video_kept"
-    operator.Recorder(folder, operator.VideoJob(shown / "turn.mp4", 1, 25.0, None)).close()
+    folder.mkdir()
+    operator.Recorder(folder / operator.RECORDING).close()
     operator._videos[bpy.context.scene.session_uid] = operator.Video(shown / "turn.mp4", folder, 1, 1)
     operator.unregister()
     assert not folder.exists()

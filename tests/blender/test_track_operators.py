@@ -14,6 +14,7 @@ from tracking.test_head_model import blender_head  # noqa: E402
 from tracking.test_track import record  # noqa: E402
 
 from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
+from stga_addon.perform.perform import perform_in_folder  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.tracking.head_model import HeadModel, read_head_model  # noqa: E402
@@ -35,6 +36,13 @@ def track(take, out, **more):
     return bpy.ops.stga.track_footage(
         **{name: str(path) for name, path in (paths | more).items()}, python=sys.executable
     )
+
+
+def asked(extension, take, out):
+    """Ask for the tracking of the take, without a worker."""
+    requests = extension.stga_addon.requests
+    wanted = requests.values.Track(take / "footage", take / "head.npz", out, landmarks=take / "points")
+    requests.folder.write_request(requests.folder.request_folder(out), wanted)
 
 
 def mesh_at(frame):
@@ -152,25 +160,24 @@ def test_a_capture_of_another_tracker_is_not_solved_again(extension, tmp_path):
 
 def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
     """Catches a result that never arrives where Blender was closed, or its file saved, while the worker ran."""
-    job = extension.stga_addon.requests.tracking_job
     out, settings = tmp_path / "capture", bpy.context.scene.stga
-    job.write_tracking_job(out, job.TrackingJob(take / "footage", take / "head.npz", landmarks=take / "points"))
+    asked(extension, take, out)
     settings.tracking_capture, settings.tracking_model = str(out), str(take / "head.npz")
     settings.tracking_pending = True
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    job.run_tracking_job(out)
+    perform_in_folder(out / "job")
+    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert extension.operators.track.tick() is None
+    assert extension.operators.monitor.tick() is None
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert not bpy.context.scene.stga.tracking_pending
 
 
 def test_cancelled_tracking_writes_no_capture(extension, take, tmp_path):
     """Catches a cancelled job that goes on, or is reported as finished."""
-    job, status = extension.stga_addon.requests.tracking_job, extension.stga_addon.worker.status
-    out = tmp_path / "capture"
-    job.write_tracking_job(out, job.TrackingJob(take / "footage", take / "head.npz", landmarks=take / "points"))
+    status, out = extension.stga_addon.worker.status, tmp_path / "capture"
+    asked(extension, take, out)
     status.request_cancel(out / "job")
-    job.run_tracking_job(out)
+    perform_in_folder(out / "job")
     assert status.inspect_worker(out / "job").state == status.WorkerState.CANCELLED
     assert not (out / "transforms_train.json").exists()

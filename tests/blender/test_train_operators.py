@@ -30,19 +30,28 @@ def head(extension, tmp_path):
 
 @pytest.fixture
 def worker(extension, head, tmp_path):
-    """A stand-in for a worker of the scene's job: the test says what it does."""
+    """A stand-in for a worker of the scene's training: the test says what it does."""
     from contextlib import ExitStack
 
-    job, monitor = extension.stga_addon.requests.training_job, extension.operators.monitor
+    requests, monitor = extension.stga_addon.requests, extension.operators.monitor
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-        job.write_job(run, job.TrainingJob(tmp_path / "capture", None, "vhap", settings))
+        folder = requests.folder.request_folder(run)
+        requests.folder.write_request(folder, requests.values.Train(run, tmp_path / "capture", settings))
         monitor.start_training(bpy.context.scene, run, None)
-        writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(job.job_folder(run)))
+        writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
         writer.update(0.25, "Training")
         writer.run, writer.leave = run, stack.close
         yield writer
+
+
+def ask_only(monkeypatch, extension) -> list:
+    """Let the operators that train do nothing but ask; what they ask."""
+    asked = []
+    monkeypatch.setattr(extension.operators.request, "missing_packages", list)
+    monkeypatch.setattr(extension.operators.train, "perform_here", lambda context, folder, wanted: asked.append(wanted))
+    return asked
 
 
 def tick_until(monitor, done: Callable[[], bool]) -> None:
@@ -112,25 +121,23 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
     assert bpy.ops.stga.train(directory=folder, resume=True) == {"FINISHED"}
 
 
-def test_device_reaches_the_job(head, tmp_path, monkeypatch, extension):
+def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
     """Catches a choice of device in the panel that training does not get."""
-    monkeypatch.setattr(extension.operators.train, "run_training_job", lambda run, also: run / "avatar.npz")
-    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
+    asked = ask_only(monkeypatch, extension)
     assert bpy.ops.stga.train(directory=str(tmp_path / "run"), device="cpu") == {"FINISHED"}
-    assert extension.stga_addon.requests.training_job.read_job(tmp_path / "run").device == "cpu"
+    assert asked[-1].device == "cpu"
 
 
 @pytest.mark.parametrize(
     ("device", "adapter", "wanted"),
     [("gpu", "", "gpu"), ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"), ("cpu", "Card", "cpu")],
 )
-def test_named_gpu_reaches_the_job(device, adapter, wanted, head, tmp_path, monkeypatch, extension):
+def test_named_gpu_reaches_the_request(device, adapter, wanted, head, tmp_path, monkeypatch, extension):
     """Catches a GPU chosen by name that another one trains instead of, and a name that moves the CPU's training."""
-    monkeypatch.setattr(extension.operators.train, "run_training_job", lambda run, also: run / "avatar.npz")
-    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
+    asked = ask_only(monkeypatch, extension)
     folder = str(tmp_path / "run")
     assert bpy.ops.stga.train(directory=folder, device=device, adapter=adapter) == {"FINISHED"}
-    assert extension.stga_addon.requests.training_job.read_job(tmp_path / "run").device == wanted
+    assert asked[-1].device == wanted
 
 
 def test_gpus_are_those_of_the_last_test(tmp_path, monkeypatch, extension):
@@ -148,7 +155,7 @@ def test_gpus_are_those_of_the_last_test(tmp_path, monkeypatch, extension):
 def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
     """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
     monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)
-    monkeypatch.setattr(extension.operators.train, "missing_packages", lambda: ["torch"])
+    monkeypatch.setattr(extension.operators.request, "missing_packages", lambda: ["torch"])
     expected = r"^Error: No training environment: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
@@ -197,8 +204,8 @@ def test_running_worker_cannot_be_replaced_or_dismissed(worker):
     assert not bpy.ops.stga.dismiss_training.poll()
 
 
-def test_dismiss_removes_a_jobs_files_only(worker):
-    """Catches a Dismiss that deletes what a user put into the job's folder."""
+def test_dismiss_removes_a_requests_files_only(worker):
+    """Catches a Dismiss that deletes what a user put into the request's folder."""
     (worker.folder / "notes.txt").write_text("mine")
     worker.leave()
     assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
@@ -209,7 +216,7 @@ def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
     """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no training wrote."""
     folder = tmp_path / "documents/job"
     folder.mkdir(parents=True)
-    names = ["job.json", "preview.npz", "selection.npz", "status.json", "worker.log"]
+    names = ["preview.npz", "result.json", "selection.npz", "status.json", "worker.log"]
     for name in names:
         (folder / name).write_text("[]")
     bpy.context.scene.stga.training_run = str(tmp_path / "documents")
