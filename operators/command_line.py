@@ -21,7 +21,7 @@ from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids
-from .common import file_path, is_head, scene_settings
+from .common import capture_source, file_path, is_head, scene_settings
 from .environment import environment_folder, preferred_python, training_python
 
 IN_BLENDER = ("select", "export", "demo", "environment")
@@ -71,11 +71,12 @@ def _open_head() -> "OpenHead | None":
     head = scene_settings(bpy.context).head
     if not is_head(head):
         return None
-    model, avatar = head.get(tags.FLAME_MODEL), scene_settings(bpy.context).avatar
+    avatar = scene_settings(bpy.context).avatar
+    capture, flame, principal_point = capture_source(head)
     return OpenHead(
-        capture=Path(head[tags.CAPTURE]),
-        flame=Path(model) if model else None,
-        principal_point=head.get(tags.PRINCIPAL_POINT, "vhap"),
+        capture=capture,
+        flame=flame,
+        principal_point=principal_point,
         avatar=file_path(avatar, "avatar") if avatar else None,
         fps=frames_per_second(bpy.context.scene),
         selection=lambda: training_selection(head),

@@ -9,6 +9,7 @@ from bpy_extras.io_utils import ImportHelper
 
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
+from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
@@ -125,8 +126,8 @@ def flame_model_path(context: Any, given: str = "") -> Path | None:
 def capture_source(head: Any) -> tuple[Path, Path | None, str]:
     """The capture that a head was imported from, its FLAME model and its convention of principal points, as
     `open_capture` takes them."""
-    model = head.get(tags.FLAME_MODEL)
-    return Path(head[tags.CAPTURE]), Path(model) if model else None, head.get(tags.PRINCIPAL_POINT, "vhap")
+    model, point = head.get(tags.FLAME_MODEL), head.get(tags.PRINCIPAL_POINT, DEFAULT_PRINCIPAL_POINT)
+    return Path(head[tags.CAPTURE]), Path(model) if model else None, point
 
 
 def capture_of(head: Any) -> Capture:

@@ -7,6 +7,7 @@ import bpy
 
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
+from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
@@ -86,7 +87,7 @@ def bring_in(
     context: Any,
     source: Path,
     flame: str = "",
-    principal_point: str = "vhap",
+    principal_point: str = DEFAULT_PRINCIPAL_POINT,
     set_up_scene: bool = False,
     correctives: str = "all",
 ) -> None:

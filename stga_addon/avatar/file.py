@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.transforms import PRINCIPAL_POINTS
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames, position_shift, shifted_frames
@@ -48,7 +48,7 @@ class Avatar:
     regions: Mapping[str, np.ndarray] = field(default_factory=dict)
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     antialiased: bool = False
-    principal_point: str = "vhap"
+    principal_point: str = DEFAULT_PRINCIPAL_POINT
     strain_range: np.ndarray | None = None
     strain_position: np.ndarray | None = None
 

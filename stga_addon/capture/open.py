@@ -13,13 +13,21 @@ from .mesh_capture import mesh_files, open_mesh_capture, open_mesh_folder
 from .model import Capture, View
 from .principal_point import principal_point_warning
 from .release import is_release, open_release
-from .transforms import PRINCIPAL_POINTS, SPLITS, Frame, Transforms, has_transforms, read_splits
+from .transforms import (
+    DEFAULT_PRINCIPAL_POINT,
+    PRINCIPAL_POINTS,
+    SPLITS,
+    Frame,
+    Transforms,
+    has_transforms,
+    read_splits,
+)
 
 MIN_HEAD_EXTENT_M, TYPICAL_HEAD_EXTENT_M, MAX_HEAD_EXTENT_M = 0.05, 0.3, 3.0
 """Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
 
 
-def open_capture(folder: Path, flame: Path | None = None, principal_point: str = "vhap") -> Capture:
+def open_capture(folder: Path, flame: Path | None = None, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Capture:
     """Open a capture: cameras and file names now, images and tracked meshes when they are asked for.
 
     An .npz file in place of a folder is a FLAME motion: a capture without views.

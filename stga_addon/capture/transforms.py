@@ -19,6 +19,7 @@ from .model import View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
+DEFAULT_PRINCIPAL_POINT = PRINCIPAL_POINTS[0]
 ROTATION_TOLERANCE = 1e-3  # exporters write float32 poses, some rounded to a few decimals
 MAX_NUMBER = sys.float_info.max  # JSON does not limit whole numbers
 INDEX_LIMIT = 1 << 31
@@ -63,7 +64,7 @@ def has_transforms(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("transforms.json", *map(_split_file, SPLITS)))
 
 
-def read_transforms(path: Path, principal_point: str = "vhap") -> tuple[Frame, ...]:
+def read_transforms(path: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> tuple[Frame, ...]:
     """Read the frames of one transforms file; neither images nor tracked files are opened, nor need they exist.
 
     A frame's own intrinsics take precedence over the top level's, which are wrong in some exports.
@@ -76,7 +77,7 @@ def read_transforms(path: Path, principal_point: str = "vhap") -> tuple[Frame, .
     return _numbered(_read_frames(path, read_json(path), principal_point))
 
 
-def read_splits(folder: Path, principal_point: str = "vhap") -> Transforms:
+def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Transforms:
     """Read every split of a capture folder, as `read_transforms` does; `transforms.json` alone is all training.
 
     Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.

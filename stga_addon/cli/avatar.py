@@ -16,6 +16,7 @@ from ..errors import StgaError, shorten
 from ..files import read_json, write_json
 from ..format import format_duration
 from ..requests.open_head import OpenHead
+from ..training.run.folder import AVATAR, has_run
 from .arguments import usable_path
 from .carry_out import carry_out
 from .track import add_footage, tracking_request
@@ -61,7 +62,7 @@ def training_options(options: Namespace, capture: Path, run_folder: Path) -> Nam
         "principal_point": None,
         "head": None,
         "out": run_folder,
-        "resume": (run_folder / "run.json").exists(),
+        "resume": has_run(run_folder),
     }
     return Namespace(**{**vars(options), **given})
 
@@ -83,7 +84,7 @@ def summary(out: Path, blend: Path | None) -> list[str]:
     lines += report_run(out / RUN)
     files = [out / CAPTURE / SHEET_FILE, out / CAPTURE / REPORT_FILE, out / RUN / CURVE]
     lines += [f"report: {', '.join(str(path) for path in files if path.exists())}"]
-    lines += [f"avatar: {out / RUN / 'avatar.npz'}"]
+    lines += [f"avatar: {out / RUN / AVATAR}"]
     return lines + ([f"blender: {blend}"] if blend is not None else [])
 
 
@@ -150,7 +151,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
 
     inputs = _read_inputs(out)
     flame = Path(inputs["model"]) if is_flame(out / CAPTURE) else None
-    capture, avatar = open_capture(out / CAPTURE, flame), read_avatar(out / RUN / "avatar.npz")
+    capture, avatar = open_capture(out / CAPTURE, flame), read_avatar(out / RUN / AVATAR)
     empty_file()
     head = set_up_head(refine(capture), flame)
     show_on_head(avatar, head, f"//{RUN}/avatar.npz", DEFAULT_FPS)

@@ -13,6 +13,7 @@ from ..export.formats import export_avatar
 from ..export.playback import MAX_VIEWS, Playback
 from ..export.web.write import RIG_NOTICE
 from ..selection import SelectionOptions, select_capture
+from ..training.run.folder import AVATAR
 from .inputs import required_capture, timesteps_between
 from .outputs import announce_size
 
@@ -45,7 +46,7 @@ def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> N
 
 def _title(options: Namespace) -> str:
     path = options.avatar.resolve()
-    return str(path.parent.name if path.name == "avatar.npz" else path.stem)
+    return str(path.parent.name if path.name == AVATAR else path.stem)
 
 
 def capture_views(capture: Capture) -> dict[str, Camera]:

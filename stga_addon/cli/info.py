@@ -11,7 +11,7 @@ from ..schema import to_json
 from ..training.effects.decisions import parse_choices
 from .arguments import add_capture, add_device, add_effects
 from .carry_out import carry_out
-from .inputs import open_named_capture
+from .inputs import open_named_capture, principal_point_of
 from .table import print_table
 
 NAME, HELP = "info", "show what a capture holds, and which effects training on it would use"
@@ -32,7 +32,7 @@ def run(options: Namespace) -> None:
     if options.presets and not options.json:
         raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
     capture = None if options.json else open_named_capture(options)
-    point, effects = options.principal_point or "vhap", parse_choices(options.effect)
+    point, effects = principal_point_of(options), parse_choices(options.effect)
     found = carry_out(Analyze(options.capture, options.flame, point, effects, options.device, options.presets))
     assert isinstance(found, Analyzed)
     if capture is None:

@@ -9,12 +9,19 @@ import numpy as np
 from ..avatar.file import Avatar, read_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..errors import StgaError
+from ..training.run.folder import AVATAR
+
+
+def principal_point_of(options: Namespace) -> str:
+    """The convention of --principal-point."""
+    return options.principal_point or DEFAULT_PRINCIPAL_POINT
 
 
 def open_named_capture(options: Namespace) -> Capture:
     """The capture of CAPTURE, --flame and --principal-point."""
-    return open_capture(options.capture, options.flame, options.principal_point or "vhap")
+    return open_capture(options.capture, options.flame, principal_point_of(options))
 
 
 def open_avatar(source: Path, options: Namespace) -> tuple[Avatar, Capture | None]:
@@ -73,7 +80,7 @@ def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Captur
 
 def avatar_path(source: Path) -> Path:
     """The avatar file that a run folder or an avatar file names."""
-    return source / "avatar.npz" if source.is_dir() else source
+    return source / AVATAR if source.is_dir() else source
 
 
 def check_topology(capture: Capture, avatar: Avatar) -> None:

@@ -13,7 +13,7 @@ from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import TURNTABLE_S, covered_angles, to_and_fro, turntable
 from ..capture.model import View
 from ..capture.open import open_capture
-from ..capture.transforms import read_transforms
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS
 from ..export.ply import read_ply
@@ -190,7 +190,9 @@ def _chosen_camera(options: Namespace, views: Sequence[View]) -> View:
 
 def _principal_point(source: Path) -> str:
     """The convention that the avatar was trained with; a PLY has none."""
-    return "vhap" if source.suffix.lower() == ".ply" else read_avatar(avatar_path(source)).principal_point
+    return (
+        DEFAULT_PRINCIPAL_POINT if source.suffix.lower() == ".ply" else read_avatar(avatar_path(source)).principal_point
+    )
 
 
 def _subject(options: Namespace) -> _Subject:

@@ -13,6 +13,7 @@ from ..training.run.folder import Run, has_run, read_run
 from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, TrainingSettings, make_settings
 from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number
 from .carry_out import carry_out
+from .inputs import principal_point_of
 
 NAME, HELP = "train", "train an avatar from a capture"
 DEFAULT_SECONDS = 120.0
@@ -72,9 +73,15 @@ def training_request(options: Namespace) -> Train | Resume:
     settings = _settings(options)
     untimed = options.preset is not None and options.budget is None and options.iterations is None
     return Train(
-        options.out, options.capture, settings, options.flame, options.principal_point or "vhap", untimed,
-        options.device, selection,
-    )  # fmt: skip
+        options.out,
+        options.capture,
+        settings,
+        options.flame,
+        principal_point_of(options),
+        preset_time=untimed,
+        device=options.device,
+        selection=selection,
+    )
 
 
 def _settings(options: Namespace) -> TrainingSettings:

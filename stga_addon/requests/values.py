@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.transforms import PRINCIPAL_POINTS
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..render.device import EXPECTED_DEVICE, is_device
 from ..schema import MAX_COUNT, setting
@@ -40,7 +40,7 @@ class Train:
     capture: Path
     settings: TrainingSettings
     flame: Path | None = None
-    principal_point: str = setting("vhap", choices=PRINCIPAL_POINTS)
+    principal_point: str = setting(DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
     preset_time: bool = False
     device: str = device_field()
     selection: Mapping[int, np.ndarray] | None = None
@@ -206,7 +206,7 @@ class Analyze:
 
     capture: Path
     flame: Path | None = None
-    principal_point: str = setting("vhap", choices=PRINCIPAL_POINTS)
+    principal_point: str = setting(DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
     effects: Mapping[str, str] | None = None
     device: str = device_field()
     timed: bool = False

@@ -4,6 +4,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from ...capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ...cli.arguments import add_capture, duration, usable_path, whole_number
 from ...cli.inputs import open_named_capture
 from ...errors import StgaError
@@ -36,7 +37,7 @@ def run(options: Namespace) -> None:
         if not capture.views.get(split):
             raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
     flame = None if options.flame is None else options.flame.resolve()
-    run = Run(options.capture.resolve(), flame, options.principal_point or "vhap", settings)
+    run = Run(options.capture.resolve(), flame, options.principal_point or DEFAULT_PRINCIPAL_POINT, settings)
     print(run_benchmark(capture, run, variants, options.budget, options.seeds, options.out.resolve(), _print_progress))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import StgaError
-from ...training.run.folder import Run, read_run, write_run
+from ...training.run.folder import Run, has_run, read_run, write_run
 from ...worker.launch import same_interpreter_environment
 from .worker import QUALITY
 
@@ -37,7 +37,7 @@ class BenchmarkRun:
 
     def check(self) -> None:
         """Raise StgaError where the folder holds another run."""
-        if (self.out / "run.json").exists() and read_run(self.out) != self.run:
+        if has_run(self.out) and read_run(self.out) != self.run:
             raise StgaError(f"{self.out}: holds a run with other settings; choose another --out, or delete it")
 
 
@@ -80,7 +80,7 @@ class _Worker:
 
     def start(self) -> None:
         """Start the process and wait until it is ready to train."""
-        if not (self._run.out / "run.json").exists():
+        if not has_run(self._run.out):
             write_run(self._run.out, self._run.run)
         # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
         with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:

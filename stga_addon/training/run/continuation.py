@@ -29,7 +29,7 @@ from ..optimize.state import (
 )
 from ..settings import Rates, TrainingSettings
 from .checkpoint import read_checkpoint
-from .folder import CHECKPOINT, Continuation, Run
+from .folder import AVATAR, CHECKPOINT, Continuation, Run
 from .identity import file_digest
 from .replay import replayed_views
 from .strain_range import require_color_range
@@ -53,7 +53,7 @@ def select_for_takes(continuation: Continuation, capture: Capture, settings: Tra
     the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
     """
     views = capture.views["train"]
-    avatar, correct = read_avatar(continuation.parent / "avatar.npz"), exposure_correction(settings)
+    avatar, correct = read_avatar(continuation.parent / AVATAR), exposure_correction(settings)
     parts = [[view for view in views if continuation.includes(view.timestep) is new] for new in (False, True)]
     old, new = (
         triangle_residuals(avatar, capture, members, correct, RESIDUAL_SCALE).mean()
@@ -74,10 +74,10 @@ def starting_state(continuation: Continuation, settings: TrainingSettings, trian
     Raises StgaError where the avatar is not the one that the continuation was made for, or `require_color_range` does.
     """
     folder = continuation.parent
-    if file_digest(folder / "avatar.npz") != continuation.avatar:
+    if file_digest(folder / AVATAR) != continuation.avatar:
         raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
-    avatar = read_avatar(folder / "avatar.npz")
-    require_color_range(folder / "avatar.npz", avatar)
+    avatar = read_avatar(folder / AVATAR)
+    require_color_range(folder / AVATAR, avatar)
     state = new_state(avatar.splats)
     if avatar.strain_position is not None:
         state.strain_position = new_strain_position(avatar.strain_position)

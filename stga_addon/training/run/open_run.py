@@ -8,7 +8,7 @@ from ...capture.open import open_capture
 from ...capture.takes import join_takes
 from ...errors import StgaError
 from ...render.device import GPU, adapter_names, choose_device
-from .folder import Run, Take, read_run
+from .folder import Run, Take, has_run, read_run
 from .identity import Identity, difference, identity_of
 
 
@@ -63,7 +63,7 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
     Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
     """
     given = identity_of(capture, run.flame, run.principal_point, run.settings)
-    if not (folder / "run.json").exists():
+    if not has_run(folder):
         return given
     stored = read_run(folder)
     trained = stored.identity
