@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import bpy
 
+from ..stga_addon.capture.flame_capture import OWN_MODELS
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
@@ -96,12 +97,11 @@ def bring_in(
     def warn(sentence: str) -> None:
         operator.report({"WARNING"}, sentence)
 
-    model = flame_model_path(context, flame)
-    capture = open_capture(source, flame=model, principal_point=principal_point)
+    capture = _open(context, source, flame, principal_point)
     is_first = not any(is_head(thing) for thing in context.scene.objects)
     head = import_head(capture, warn=warn, correctives=correctives)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
-    head[tags.FLAME_MODEL] = str(model or "")
+    head[tags.FLAME_MODEL] = str(capture.flame_file or "")
     head[tags.PRINCIPAL_POINT] = principal_point
     head[tags.TRACKED] = is_tracked(capture.root)
     scene_settings(context).head = head
@@ -120,6 +120,13 @@ def bring_in(
         warn(sentence)
     counts = f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
     operator.report({"INFO"}, counts)
+
+
+def _open(context: Any, source: Path, flame: str, principal_point: str) -> Capture:
+    """The capture, with the FLAME model that is given, else its own, else that of the preferences. Raises StgaError."""
+    own = not flame and any((source / name).is_file() for name in OWN_MODELS)
+    model = None if own else flame_model_path(context, flame)
+    return open_capture(source, flame=model, principal_point=principal_point)
 
 
 def _show_first_frame(scene: Any, capture: Capture) -> None:

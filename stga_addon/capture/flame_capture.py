@@ -27,6 +27,8 @@ from .transforms import Transforms, tracked_files
 
 CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
+OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
+"""Names of a FLAME model file in the folder of a capture, which is used where none is given."""
 
 
 def open_flame_capture(
@@ -36,21 +38,24 @@ def open_flame_capture(
 
     A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use them; a model of any
     other size is used as it is. Shape and static offset come from the first timestep.
-    Raises StgaError, also where the model file is not given: FLAME's license forbids passing it on.
+    Raises StgaError, also where no model file is given, and none lies in the folder (OWN_MODELS): FLAME's license
+    forbids passing it on.
     """
-    model = _model_for(root, model_file)
+    model_file = _model_file(root, model_file)
+    model = flame_model(model_file)
     files = parameter_files(root, transforms)
     first = files[min(files)]
     shape, static_offset = read_identity(first, model)
     sequence = FlameSequence(
         model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
     )
-    return _flame_capture(root, sequence, views)
+    return _flame_capture(root, sequence, model_file, views)
 
 
 def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
     """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views. Raises StgaError."""
-    return _flame_capture(path, read_motion(path, _model_for(path, model_file)), {})
+    model_file = _model_file(path, model_file)
+    return _flame_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
 
 
 def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
@@ -58,7 +63,9 @@ def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
     return replace(capture, **_posed(capture.root, sequence))
 
 
-def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tuple[View, ...]]) -> Capture:
+def _flame_capture(
+    root: Path, sequence: FlameSequence, model_file: Path, views: Mapping[str, tuple[View, ...]]
+) -> Capture:
     model = sequence.model
     regions = key_regions(model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"
@@ -70,6 +77,7 @@ def _flame_capture(root: Path, sequence: FlameSequence, views: Mapping[str, tupl
         views=views,
         timesteps=sequence.timesteps,
         regions=regions,
+        flame_file=model_file,
         warnings=() if regions else (missing,),
         **_posed(root, sequence),
     )
@@ -88,13 +96,16 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
     }
 
 
-def _model_for(root: Path, model_file: Path | None) -> FlameModel:
-    if model_file is None:
+def _model_file(root: Path, given: Path | None) -> Path:
+    """The FLAME model file that is given, else the one in the capture's folder."""
+    own = (root / name for name in OWN_MODELS)
+    found = given or next((path for path in own if path.is_file()), None)
+    if found is None:
         raise StgaError(
-            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame"
-            " or in the preferences of the add-on"
+            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame or in the"
+            f" preferences of the add-on, or put it into the folder as {OWN_MODELS[0]}"
         )
-    return flame_model(model_file)
+    return found
 
 
 def flame_model(path: Path) -> FlameModel:

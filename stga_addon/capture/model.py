@@ -37,6 +37,7 @@ class Capture:
     mesh       timestep -> (V, 3) float64, the tracked mesh in world space, read on demand
     expression_mesh  (timestep, zero_pose) -> (V, 3) float64 without rigid head motion (STGA, selective training)
     flame      the parameters and model behind the meshes, for FLAME captures
+    flame_file the model's file; None without one
     given_selection  timestep -> (F,) bool where the capture comes with a selection
     warnings   one sentence each
     """
@@ -51,6 +52,7 @@ class Capture:
     mesh: Callable[[int], np.ndarray]
     expression_mesh: Callable[[int, str], np.ndarray]
     flame: FlameSequence | None = None
+    flame_file: Path | None = None
     given_selection: Mapping[int, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 

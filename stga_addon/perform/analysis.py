@@ -3,7 +3,6 @@
 from ..capture.open import open_capture
 from ..progress import Progress, Report, Say
 from ..render.device import choose_device
-from ..report.preset_timing import time_presets
 from ..requests.results import Analyzed
 from ..requests.values import Analyze
 from ..training.effects.plan import plan_effects
@@ -21,5 +20,7 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     _, plan = plan_effects(capture, make_settings(iterations=1, effects=dict(request.effects or {})), device)
     if not request.timed:
         return Analyzed(plan, {})
+    from ..report.preset_timing import time_presets  # imports Numba, which deciding effects does without
+
     report(Progress(0.5, "Timing the presets"))
     return Analyzed(plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)})

@@ -220,7 +220,7 @@ def _joined_takes(request: Extend) -> tuple[OpenedRun, Capture, Selection, Run]:
     capture = with_refined_tracking(join_takes(everything), request.parent)
     starts = first_timesteps(everything)[len(opened.takes) :]
     added = [
-        Take(take.root, start, identity_of(take, run.flame, run.principal_point, run.settings))
+        Take(take.root, start, identity_of(take, run.principal_point, run.settings))
         for take, start in zip(new, starts, strict=True)
     ]
     continuation = _continuation(request.parent, (starts[0], max(capture.timesteps)))

@@ -514,3 +514,15 @@ def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:
     np.testing.assert_array_equal(motion.mesh(0), whole.mesh(3))
     np.testing.assert_array_equal(motion.neutral, whole.neutral)
     assert motion.regions.keys() == whole.regions.keys()
+
+
+def test_a_flame_model_in_the_captures_folder(tmp_path: Path) -> None:
+    """Catches a capture that brings its model, as the demo's does, and still asks for it; and a given one ignored."""
+    root, model_file = factory.write_flame_capture(tmp_path / "capture")
+    own = root / "flame_model.npz"
+    shutil.copy(model_file, own)
+    capture = open_capture(root)
+    assert capture.flame_file == own.resolve()
+    np.testing.assert_array_equal(capture.mesh(0), open_capture(root, model_file).mesh(0))
+    own.write_bytes(b"")
+    assert open_capture(root, model_file).flame_file == model_file

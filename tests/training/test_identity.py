@@ -143,7 +143,7 @@ def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
     views = {split: tuple(map(shifted, members)) for split, members in toy.views.items()}
     settings = quick_settings()
     same = replace(toy, views=views, neutral=toy.neutral + 1e-16)
-    one, two = (identity_of(capture, None, "vhap", settings) for capture in (toy, same))
+    one, two = (identity_of(capture, "vhap", settings) for capture in (toy, same))
     assert one == two
     assert difference(one, two) is None
 
@@ -324,4 +324,4 @@ def test_a_prepared_run_begins_with_its_identity(toy: Capture, tmp_path: Path) -
     assert json.loads((tmp_path / "run.json").read_text())["identity"] is None
     train(toy, tmp_path, make_run(toy), resume=True, report=stop_at(2))
     stored = read_run(tmp_path)
-    assert stored.identity == identity_of(toy, None, "vhap", stored.settings)
+    assert stored.identity == identity_of(toy, "vhap", stored.settings)

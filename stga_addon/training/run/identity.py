@@ -46,7 +46,7 @@ class Identity:
         return _digest(json.dumps(asdict(self)).encode())
 
 
-def identity_of(capture: Capture, flame: Path | None, principal_point: str, settings: TrainingSettings) -> Identity:
+def identity_of(capture: Capture, principal_point: str, settings: TrainingSettings) -> Identity:
     """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises StgaError."""
     views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
     return Identity(
@@ -56,7 +56,7 @@ def identity_of(capture: Capture, flame: Path | None, principal_point: str, sett
         _digest(_quantized(_camera_table([view.camera for _, view in views]))),
         _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
         _digest(_quantized(capture.neutral)),
-        "" if flame is None or capture.flame is None else file_digest(flame),
+        "" if capture.flame_file is None else file_digest(capture.flame_file),
         _digest(json.dumps(to_json(settings), sort_keys=True).encode()),
     )
 

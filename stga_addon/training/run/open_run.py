@@ -51,7 +51,7 @@ def open_run(
 def _open_take(folder: Path, run: Run, take: Take) -> Capture:
     """A capture that joined the run. Raises StgaError where it is missing or has changed."""
     capture = open_capture(take.capture, run.flame, run.principal_point)
-    changed = difference(take.identity, identity_of(capture, run.flame, run.principal_point, run.settings))
+    changed = difference(take.identity, identity_of(capture, run.principal_point, run.settings))
     if changed is not None:
         raise StgaError(f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it now {changed}")
     return capture
@@ -62,7 +62,7 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
 
     Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
     """
-    given = identity_of(capture, run.flame, run.principal_point, run.settings)
+    given = identity_of(capture, run.principal_point, run.settings)
     if not has_run(folder):
         return given
     stored = read_run(folder)
