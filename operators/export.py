@@ -54,8 +54,8 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
     motion_only: bpy.props.BoolProperty(
         name="Motion Only",
-        description="Leave out blend shapes, skeleton and sliders, which are derived from the FLAME model: its licence "
-        "decides who may receive them",
+        description="Leave out blend shapes, skeleton and sliders of the FLAME model. The head's triangles and posed "
+        "meshes stay in the page: FLAME's licence decides who may receive it either way",
     )
     _range: RangeExport | None = None
     _is_invoked = False

@@ -13,7 +13,7 @@ from stga_addon.cli.main import make_parser
 from stga_addon.export.ply import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "THIRD_PARTY.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 PATH_FOLDERS = ("", "stga_addon/", "tests/", "stga_addon/training/")
 """Folders that the docs leave out when they name a file."""

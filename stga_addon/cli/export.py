@@ -33,7 +33,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         help=f"frames per second of usd and web (default: {DEFAULT_FPS if head is None else head.fps:g})",
     )
     parser.add_argument(
-        "--motion-only", action="store_true", help="web: leave out the blend shapes and skeleton of the FLAME file"
+        "--motion-only",
+        action="store_true",
+        help="web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take stay in the page",
     )
     parser.add_argument("--out", type=usable_path, required=True)
 

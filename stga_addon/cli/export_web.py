@@ -11,7 +11,7 @@ from ..capture.camera import Camera
 from ..capture.model import Capture
 from ..export.formats import export_avatar
 from ..export.playback import MAX_VIEWS, Playback
-from ..export.web.write import RIG_NOTICE
+from ..export.web.write import flame_notice
 from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR
 from .inputs import required_capture, timesteps_between
@@ -25,6 +25,7 @@ def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> N
     if capture is None and options.frames is None:
         announce_size(options.out, avatar, "web", 1)
         playback = Playback(title=_title(options), fps=options.fps, motion_only=True)
+        _announce_licence(flame_notice(avatar, None, motion_only=True))
         export_avatar(options.out, avatar, "web", [(0, avatar.neutral)], playback=playback)
         return
     capture = required_capture(capture)
@@ -39,9 +40,15 @@ def export_web(avatar: Avatar, capture: Capture | None, options: Namespace) -> N
         motion_only=options.motion_only,
     )
     sequence = None if capture.flame is None else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
-    if sequence is not None and not options.motion_only:
-        print(f"{RIG_NOTICE} --motion-only leaves them out.")
+    notice = flame_notice(avatar, sequence, options.motion_only)
+    has_rig = sequence is not None and not options.motion_only
+    _announce_licence(f"{notice} --motion-only leaves them out, but not the meshes of the take." if has_rig else notice)
     export_avatar(options.out, avatar, "web", _meshes(capture, timesteps), sequence, playback=playback)
+
+
+def _announce_licence(notice: str) -> None:
+    if notice:
+        print(notice)
 
 
 def _title(options: Namespace) -> str:

@@ -21,7 +21,7 @@ class Playback:
     views      name -> camera in the avatar's space; the first is where a viewer begins
     up         (3,) direction that points up in the avatar's space
     selection  (F,) bool per pose: the triangles that it trained; None where that is not known
-    motion_only  leave out what a FLAME file gives: blend shapes, skeleton and sliders
+    motion_only  leave out blend shapes, skeleton and sliders of the FLAME file; the posed meshes stay
     """
 
     title: str = "Avatar"

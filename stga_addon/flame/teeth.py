@@ -1,6 +1,12 @@
-"""Teeth: the two rows that GaussianAvatars adds to FLAME's mesh."""
+"""Teeth for FLAME's mesh: two rows behind the lips, fitted to the mesh's own mouth.
 
-from dataclasses import replace
+The mesh with teeth has the index layout of the 5143-vertex meshes that VHAP and GaussianAvatars exchange: number and
+order of the added vertices and triangles, and the corners of each triangle. Offsets name vertices and bindings name
+triangles by index, and a triangle's local frame starts at its first corner. Shape, size, place and rigging of the
+teeth are this project's own construction from the mesh.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,14 +16,11 @@ from .model import JOINTS, FlameModel
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES, TEETH_FACES = 120, 168
 TEETH_PER_ROW = 15
-# Inner lip vertices of the 5023-vertex topology, from the person's left corner of the mouth to the right.
-UPPER_LIP = (1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830)
-LOWER_LIP = (1576, 1577, 1773, 1774, 1795, 1802, 1865, 3503, 2948, 2905, 2898, 2881, 2880, 2713, 2712)
-# Order of the eight rows among the added vertices: upper, lower; root, edge; B for back.
+# Index layout. Order of the eight rows among the added vertices: upper, lower; root, edge; B for back. Each row runs
+# from the person's left to the right.
 TEETH_ROWS = ("UR", "LR", "UE", "LE", "URB", "UEB", "LRB", "LEB")
-# Two triangles a column; a corner is (row, 0 or 1 for the column's near or far end). The diagonal flips in the middle
-# of the mouth (the first half and the second half below) so that left and right mirror each other. The first corner
-# matters: a triangle's local frame starts there.
+# Index layout. Two triangles a column; a corner is (row, 0 or 1 for the column's near or far end). The diagonal flips
+# in the middle of the mouth (the first half and the second half below) so that left and right mirror each other.
 TEETH_STRIPS = {
     "upper front": ("UR0 UE1 UE0 UR0 UR1 UE1", "UR0 UR1 UE0 UR1 UE1 UE0"),
     "upper back": ("URB0 UEB0 UEB1 URB0 UEB1 URB1", "URB0 UEB0 URB1 URB1 UEB0 UEB1"),
@@ -26,22 +29,48 @@ TEETH_STRIPS = {
     "lower back": ("LRB0 LEB1 LEB0 LRB0 LRB1 LEB1", "LRB0 LRB1 LEB0 LRB1 LEB1 LEB0"),
     "lower top": ("LEB0 LEB1 LE0 LEB1 LE1 LE0", "LEB0 LE1 LE0 LEB0 LEB1 LE1"),
 }
+# Sizes as shares of the width between the corners of the mouth, about 50 mm.
+ARCH_WIDTH = 0.85
+CLEARANCE = 0.03
+"""Between the lips' inner surface and the teeth."""
+OVERBITE, OVERJET = 0.06, 0.02
+"""How far the upper edge reaches below the lower one, and stands in front of it."""
+EDGE_THICKNESS, ROOT_THICKNESS = 0.05, 0.1
+MAX_MOUTH_RINGS = 12
+
+
+@dataclass(frozen=True)
+class _Mouth:
+    """The inside of the mouth from the open end of the throat to the lips.
+
+    rings  vertex ids of each ring of neighbours, from the open end outwards; the last is the foremost of the lips
+    lips   (N,) the last ring in order around the mouth
+    """
+
+    rings: tuple[np.ndarray, ...]
+    lips: np.ndarray
+
+    @property
+    def inside(self) -> np.ndarray:
+        return np.concatenate(self.rings)
 
 
 def with_teeth(model: FlameModel) -> FlameModel:
-    """The model with upper and lower teeth: 5023 to 5143 vertices, 9976 to 10144 triangles (GaussianAvatars).
+    """The model with upper and lower teeth: 5023 to 5143 vertices, 9976 to 10144 triangles.
 
-    The upper row follows the neck and the lower row the jaw; both follow identity like the lips, neither expression
-    nor pose correctives. Adds the mask "teeth". Raises StgaError for any other topology.
+    The upper row follows the neck joint, which turns the head, and the lower row the jaw; both follow identity as the
+    inside of the mouth does, neither expression nor pose correctives. Adds the mask "teeth". Raises StgaError for any
+    other topology.
     """
     if len(model.v_template) != TEMPLATE_VERTICES:
         raise StgaError(
             f"teeth: the model has {len(model.v_template)} vertices, expected FLAME's topology of {TEMPLATE_VERTICES}"
         )
-    upper, lower = list(UPPER_LIP), list(LOWER_LIP)
-    teeth = _positions(model.v_template[upper], model.v_template[lower])
-    shapedirs = np.tile((model.shapedirs[upper] + model.shapedirs[lower]) / 2, (len(TEETH_ROWS), 1, 1))
-    shapedirs[:, :, model.n_identity :] = 0
+    mouth = _mouth(model)
+    teeth = _positions(model.v_template, mouth)
+    shapedirs = np.zeros((TEETH_VERTICES, *model.shapedirs.shape[1:]))
+    identity = model.shapedirs[mouth.inside, :, : model.n_identity]
+    shapedirs[:, :, : model.n_identity] = _followed(model.v_template[mouth.inside], identity, teeth)
     weights = np.zeros((TEETH_VERTICES, len(JOINTS)))
     for row, name in enumerate(TEETH_ROWS):
         joint = JOINTS.index("neck" if name.startswith("U") else "jaw")
@@ -59,18 +88,16 @@ def with_teeth(model: FlameModel) -> FlameModel:
     )
 
 
-def _positions(upper_lip: np.ndarray, lower_lip: np.ndarray) -> np.ndarray:
-    """(120, 3) teeth behind lips (15, 3) each, sized by the mean distance between the lips."""
-    size = np.linalg.norm(upper_lip - lower_lip, axis=1).mean()
-    up, forward = np.array([0, size, 0]), np.array([0, 0, size])
-    middle = (upper_lip + lower_lip) / 2
-    middle[:, 1] = middle[:, 1].mean()
-    middle -= 1.5 * forward
-    rows = {"UE": middle + 0.1 * up, "LE": middle - 0.1 * up - 0.4 * forward}
-    rows["UR"], rows["LR"] = rows["UE"] + 2 * up, rows["LE"] - 2 * up
-    for front in ("UR", "UE", "LR", "LE"):
-        rows[front + "B"] = rows[front] - forward
-    return np.concatenate([rows[name] for name in TEETH_ROWS])
+def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
+    """Vertex ids (n,) along the upper and the lower lip between the corners of the mouth, opposite each other.
+
+    They are found on FLAME's mesh with or without teeth. Raises StgaError for a mesh without an open mouth.
+    """
+    lips = _mouth(model).lips
+    half = len(lips) // 2
+    sides = lips[1:half], lips[:half:-1]
+    heights = [model.v_template[side, 1].mean() for side in sides]
+    return sides if heights[0] > heights[1] else sides[::-1]
 
 
 def teeth_faces(first: int) -> np.ndarray:
@@ -82,3 +109,115 @@ def teeth_faces(first: int) -> np.ndarray:
             corners = halves[column >= TEETH_PER_ROW // 2].split()
             faces += [start[corner[:-1]] + column + int(corner[-1]) for corner in corners]
     return np.array(faces, np.int32).reshape(-1, 3)
+
+
+def _mouth(model: FlameModel) -> _Mouth:
+    """Rings of neighbours from the mesh's foremost hole outwards, up to the one that lies foremost on average."""
+    faces = model.faces[(model.faces < TEMPLATE_VERTICES).all(axis=1)]
+    depth = model.v_template[:, 2]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    holes = [hole for hole in _holes(edges) if depth[hole].mean() > depth[faces].mean()]  # the neck's is farther back
+    if not holes:
+        raise StgaError("teeth: the FLAME model's mesh has a closed mouth, expected one that is open at the throat")
+    rings = [max(holes, key=lambda hole: float(depth[hole].mean()))]
+    reached = np.zeros(len(model.v_template), bool)
+    for _ in range(MAX_MOUTH_RINGS):
+        reached[rings[-1]] = True
+        touched = edges[reached[edges].any(axis=1)]
+        ring = np.unique(touched[~reached[touched]])
+        if not len(ring) or depth[ring].mean() < depth[rings[-1]].mean():
+            break
+        rings.append(ring)
+    lips = _ring_order(edges, rings[-1])
+    return _Mouth(tuple(rings), _from_corner(model.v_template, lips))
+
+
+def _holes(edges: np.ndarray) -> list[np.ndarray]:
+    """Vertex ids of each hole of the mesh, from its directed edges (E, 2)."""
+    key = edges.max() + 1
+    forth, back = edges @ (key, 1), edges @ (1, key)
+    following = dict(edges[~np.isin(forth, back)].tolist())
+    holes = []
+    while following:
+        vertex, after = following.popitem()
+        hole = [vertex]
+        while after in following:
+            hole.append(after)
+            after = following.pop(after)
+        holes.append(np.array(hole))
+    return holes
+
+
+def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """The vertices of a ring in order around it. Raises StgaError where the edges among them are not one ring."""
+    inside = edges[np.isin(edges, ring).all(axis=1)]
+    beside: dict[int, set[int]] = {vertex: set() for vertex in ring.tolist()}
+    for one, other in inside.tolist():
+        beside[one].add(other)
+        beside[other].add(one)
+    ordered = [int(ring[0])]
+    left = set(beside) - set(ordered)
+    while following := beside[ordered[-1]] & left:
+        ordered.append(min(following))
+        left.discard(ordered[-1])
+    if left or len(ring) % 2 or any(len(others) != 2 for others in beside.values()):
+        raise StgaError("teeth: the FLAME model's mesh has no ring of vertices around its lips, expected FLAME's mesh")
+    return np.array(ordered)
+
+
+def _from_corner(vertices: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """The ring (N,) from the person's left corner of the mouth on; the right one is N / 2 further."""
+    half = len(ring) // 2
+    x = vertices[ring, 0]
+    return np.roll(ring, -int((x - np.roll(x, half)).argmax()))
+
+
+def _positions(vertices: np.ndarray, mouth: _Mouth) -> np.ndarray:
+    """(120, 3) teeth: an upper arch curved like the lips, as far forward as their inner surface allows, and a lower one
+    behind it."""
+    lips, inside = vertices[mouth.lips], vertices[mouth.inside]
+    left, right = lips[0], lips[len(lips) // 2]
+    width, middle = left[0] - right[0], (left[0] + right[0]) / 2
+    curvature = max(0.0, -float(np.polyfit((lips[:, 0] - middle) ** 2, lips[:, 2], 1)[0]))
+    arch, outward = _arch(ARCH_WIDTH * width / 2, curvature)
+    bite = (lips[:, 1].max() + lips[:, 1].min()) / 2
+    height = np.ptp(vertices[mouth.rings[0], 1]) / 2  # both rows together fill the open end
+    edge = bite - OVERBITE * width
+    reach = inside[:, 2] + curvature * (inside[:, 0] - middle) ** 2 - CLEARANCE * width  # on the axis
+    upper, lower = reach[inside[:, 1] > edge].min(), reach[inside[:, 1] < bite].min()
+    rows = {"UE": arch + np.array([middle, edge, upper])}
+    rows["UR"] = rows["UE"] + [0, bite + height - edge, 0]
+    rows["LE"] = rows["UE"] - (EDGE_THICKNESS + OVERJET) * width * outward + [0, bite - edge, 0]
+    axis = rows["LE"][TEETH_PER_ROW // 2, 2]
+    rows["LR"] = rows["LE"] - [0, height, max(0.0, axis - lower)]
+    for front in ("UR", "UE", "LR", "LE"):
+        thickness = EDGE_THICKNESS if front.endswith("E") else ROOT_THICKNESS
+        rows[front + "B"] = rows[front] - thickness * width * outward
+    return np.concatenate([rows[name] for name in TEETH_ROWS])
+
+
+def _arch(half_width: float, curvature: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (15, 3), evenly spaced along z = −curvature · x² from left to right, and their outward normals (15, 3)."""
+    x = np.linspace(half_width, -half_width, 257)
+    length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(curvature * x**2)))])
+    x = np.interp(np.linspace(0, length[-1], TEETH_PER_ROW), length, x)
+    x = (x - x[::-1]) / 2
+    zero = np.zeros_like(x)
+    normals = np.stack([2 * curvature * x, zero, zero + 1], axis=1)
+    return np.stack([x, zero, -curvature * x**2], axis=1), normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _followed(points: np.ndarray, displacements: np.ndarray, teeth: np.ndarray) -> np.ndarray:
+    """Displacements (T, 3, K) of the teeth (T, 3): smooth ones that fit those (M, 3, K) of the mouth's points (M, 3).
+
+    Linear in width and height and quadratic in width, so that the arch grows and bends as a whole.
+    """
+    center, size = points.mean(0), np.ptp(points[:, 0]) / 2
+
+    def terms(at: np.ndarray) -> np.ndarray:
+        x, y = ((at - center) / size)[:, :2].T
+        return np.stack([np.ones_like(x), x, y, x**2], axis=1)
+
+    known, wanted = terms(points), terms(teeth)
+    weights = wanted @ np.linalg.pinv(known)
+    return np.asarray(np.einsum("tm,mck->tck", weights, displacements))

@@ -78,6 +78,7 @@ def test_zip_holds_what_the_extension_runs(zip_file):
         "LICENSE",
         "README.md",
         "CHANGELOG.md",
+        "THIRD_PARTY.md",
         "__init__.py",
         "blender_manifest.toml",
     }

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture.factory import write_mesh_capture
+from capture.factory import write_flame_capture, write_mesh_capture
 from export.web.web_data import read_web_data
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -56,6 +56,20 @@ def test_an_avatar_alone_is_a_still(avatar_file, tmp_path):
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>anna</title>" in text
     assert "{{" not in text.partition('<script type="module">')[0]
+
+
+def test_what_is_left_of_flame_is_said(tmp_path, capsys):
+    """Catches an export without FLAME's rig that does not say that its triangles and meshes are in the page."""
+    root, model = write_flame_capture(tmp_path / "flame")
+    capture = open_capture(root, model)
+    neutral = capture.neutral.astype(np.float32)
+    splats = lattice_splats(neutral, capture.faces, sh_degree=1, convention="stga")
+    write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
+    words = ["export", str(tmp_path / "anna.npz"), "--format", "web", "--capture", str(root), "--flame", str(model)]
+    assert main([*words, "--motion-only", "--out", str(tmp_path / "a.stga")]) == 0
+    assert "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence" in capsys.readouterr().out
+    assert main([*words, "--out", str(tmp_path / "a.stga")]) == 0
+    assert "--motion-only leaves them out, but not the meshes of the take." in capsys.readouterr().out
 
 
 def test_mistakes_are_one_sentence(avatar_file, tmp_path, capsys):

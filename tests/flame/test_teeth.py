@@ -1,5 +1,6 @@
 """The teeth on FLAME's real topology."""
 
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,31 +10,26 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.flame.masks import key_regions
 from stga_addon.flame.model import FlameModel
-from stga_addon.flame.teeth import LOWER_LIP, UPPER_LIP, with_teeth
+from stga_addon.flame.teeth import lip_pairs, teeth_faces, with_teeth
 
-from .conftest import model_of, random_arrays
+from .mouths import JOINT_POSITIONS_M, covered_from_front, crossings, jaw_opened, open_edges, open_flame
 
-# Half the triangles of each strip, as vertex rows of 15: the added vertices stand in the order UR LR UE LE URB UEB LRB
-# LEB. (row, column step) per corner; written down apart from the package's table.
+# The added vertices stand in this order, in rows of 15.
 UR, LR, UE, LE, URB, UEB, LRB, LEB = range(8)
-RIGHT_HALF = {
-    "upper front": [[(UR, 0), (UE, 1), (UE, 0)], [(UR, 0), (UR, 1), (UE, 1)]],
-    "upper back": [[(URB, 0), (UEB, 0), (UEB, 1)], [(URB, 0), (UEB, 1), (URB, 1)]],
-    "upper bottom": [[(UEB, 0), (UE, 0), (UEB, 1)], [(UEB, 1), (UE, 0), (UE, 1)]],
-    "lower front": [[(LE, 0), (LE, 1), (LR, 0)], [(LE, 1), (LR, 1), (LR, 0)]],
-    "lower back": [[(LRB, 0), (LEB, 1), (LEB, 0)], [(LRB, 0), (LRB, 1), (LEB, 1)]],
-    "lower top": [[(LEB, 0), (LEB, 1), (LE, 0)], [(LEB, 1), (LE, 1), (LE, 0)]],
+STRIP_ROWS = {
+    "upper front": (UR, UE),
+    "upper back": (URB, UEB),
+    "upper bottom": (UE, UEB),
+    "lower front": (LR, LE),
+    "lower back": (LRB, LEB),
+    "lower top": (LE, LEB),
 }
+LAYOUT_CRC32 = 0xB43FE122
 
 
 @pytest.fixture(scope="module")
 def flame_open(shared_data: Path) -> FlameModel:
-    """FLAME 2023 Open's template and identity; expressions, correctives and skeleton random."""
-    with np.load(shared_data / "flame_open" / "flame2023_open_basis.npz") as data:
-        arrays = random_arrays(vertices=5023, components=80)
-        arrays["shapedirs"][:, :, :60] = data["shapedirs"]
-        arrays |= {"v_template": data["v_template"].astype(float), "f": data["faces"]}
-    return model_of(arrays, n_identity=60)
+    return open_flame(shared_data)
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +37,19 @@ def toothed(flame_open: FlameModel) -> FlameModel:
     return with_teeth(flame_open)
 
 
+def _rows(model: FlameModel) -> np.ndarray:
+    return model.v_template[5023:].reshape(8, 15, 3)
+
+
 def _strip_normals(model: FlameModel) -> dict[str, np.ndarray]:
     corners = model.v_template[model.faces[9976:]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return dict(zip(RIGHT_HALF, normals.reshape(6, 28, 3), strict=True))
+    return dict(zip(STRIP_ROWS, normals.reshape(6, 28, 3), strict=True))
 
 
 def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) -> None:
-    # Catches vertices that are inserted rather than appended: tracked offsets would land elsewhere.
+    """Catches vertices that are inserted rather than appended: tracked offsets would land elsewhere."""
     assert (len(toothed.v_template), len(toothed.faces)) == (5143, 10144)
     for name in ("v_template", "shapedirs", "posedirs", "weights"):
         np.testing.assert_array_equal(getattr(toothed, name)[:5023], getattr(flame_open, name))
@@ -58,20 +58,23 @@ def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) 
     assert set(toothed.faces[9976:].ravel()) == set(range(5023, 5143))
 
 
-def test_triangle_table(toothed: FlameModel) -> None:
-    # Catches a wrong corner order. The right half is a second transcription; the left half must be its mirror image
-    # (rows kept, columns reversed), which is what makes teeth symmetric and was not used to write the table.
-    added = toothed.faces[9976:] - 5023
-    for strip, faces in zip(RIGHT_HALF.values(), added.reshape(6, 14, 2, 3), strict=True):
-        for column in range(7):
-            expected = [[row * 15 + column + step for row, step in corner] for corner in strip]
-            assert faces[column].tolist() == expected
-            mirrored = [frozenset(row * 15 + 14 - column - step for row, step in corner) for corner in strip]
-            assert {frozenset(face) for face in faces[13 - column].tolist()} == set(mirrored)
+def test_index_layout() -> None:
+    """Catches triangles in another order, or that start at another corner: splats bound to them by index would turn
+    or move to another tooth. Left and right are each other's mirror image."""
+    strips = teeth_faces(0).reshape(6, 14, 2, 3)
+    for rows, strip in zip(STRIP_ROWS.values(), strips, strict=True):
+        assert set((strip // 15).ravel()) == set(rows)
+        for column in range(14):
+            assert set((strip[column] % 15).ravel()) == {column, column + 1}
+        mirrored = strip // 15 * 15 + 14 - strip % 15
+        for column in range(14):
+            expected = {frozenset(face) for face in mirrored[13 - column].tolist()}
+            assert {frozenset(face) for face in strip[column].tolist()} == expected
+    assert zlib.crc32(strips.astype("<i4").tobytes()) == LAYOUT_CRC32
 
 
 def test_each_row_is_an_open_strip(toothed: FlameModel) -> None:
-    # Catches doubled or flipped triangles: within a row of teeth every inner edge is run through once each way.
+    """Catches doubled or flipped triangles: within a row of teeth every inner edge is run through once each way."""
     for half in (toothed.faces[9976 : 9976 + 84], toothed.faces[9976 + 84 :]):
         edges = [tuple(edge) for face in half.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
         assert len(set(edges)) == len(edges)
@@ -81,52 +84,151 @@ def test_each_row_is_an_open_strip(toothed: FlameModel) -> None:
 
 
 def test_sides_face_outwards(toothed: FlameModel) -> None:
-    # Catches teeth that are lit or culled from the wrong side.
+    """Catches teeth that are lit or culled from the wrong side."""
     normals = _strip_normals(toothed)
-    assert (normals["upper front"][:, 2] > 0.2).all()
-    assert (normals["lower front"][:, 2] > 0.2).all()
-    assert (normals["upper back"][:, 2] < -0.2).all()
-    assert (normals["lower back"][:, 2] < -0.2).all()
+    assert (normals["upper front"][:, 2] > 0.5).all()
+    assert (normals["lower front"][:, 2] > 0.5).all()
+    assert (normals["upper back"][:, 2] < -0.5).all()
+    assert (normals["lower back"][:, 2] < -0.5).all()
     assert (normals["upper bottom"][:, 1] < -0.9).all()
     assert (normals["lower top"][:, 1] > 0.9).all()
 
 
-def test_where_the_teeth_stand(toothed: FlameModel) -> None:
-    # Catches a wrong scale or side: behind the lips, inside the mouth's width, upper above lower, in meters.
-    rows = toothed.v_template[5023:].reshape(8, 15, 3)
-    upper, lower = toothed.v_template[list(UPPER_LIP)], toothed.v_template[list(LOWER_LIP)]
-    gap = np.linalg.norm(upper - lower, axis=1).mean()
-    np.testing.assert_allclose(rows[UE, :, 1] - rows[LE, :, 1], 0.2 * gap, atol=1e-12)
-    np.testing.assert_allclose(rows[UE, :, 2] - rows[LE, :, 2], 0.4 * gap, atol=1e-12)
-    np.testing.assert_allclose(rows[[UR, LR]] - rows[[UE, LE]], [[[0, 2 * gap, 0]] * 15, [[0, -2 * gap, 0]] * 15])
-    np.testing.assert_allclose(rows[[UR, UE, LR, LE]] - rows[[URB, UEB, LRB, LEB]], [[[0, 0, gap]] * 15] * 4)
-    np.testing.assert_allclose(rows[UE, :, [0, 2]], ((upper + lower) / 2)[:, [0, 2]].T - [[0], [1.5 * gap]])
-    assert (np.diff(rows[UE, :, 0]) < 0).all()
-    assert np.ptp(rows[UE, :, 1]) < 1e-12
+def test_sound_triangles(toothed: FlameModel) -> None:
+    """Catches slivers, whose frames and strain are noise."""
+    corners = toothed.v_template[toothed.faces[9976:]]
+    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    assert double_area.min() / 2 > 1.5e-6
+    assert (double_area / longest**2).min() > 0.15
+
+
+def test_left_mirrors_right(toothed: FlameModel) -> None:
+    """Catches an arch that is shifted, or turned towards one cheek."""
+    rows = _rows(toothed)
+    np.testing.assert_allclose(rows[:, ::-1, 1:], rows[:, :, 1:], atol=1e-12)
+    plane = (rows[:, ::-1, 0] + rows[:, :, 0]) / 2
+    np.testing.assert_allclose(plane, plane[0, 0], atol=1e-12)
+    assert abs(plane[0, 0]) < 0.0003
+    assert (np.diff(rows[:, :, 0]) < 0).all()
+
+
+def test_rows_bite(toothed: FlameModel) -> None:
+    """Catches rows that are upside down, far apart or larger than teeth."""
+    rows = _rows(toothed)
+    assert 0.001 < (rows[LE, :, 1] - rows[UE, :, 1]).mean() < 0.004
+    assert 0.002 < rows[UE, 7, 2] - rows[LE, 7, 2] < 0.005
+    for root, edge in ((UR, UE), (LR, LE)):
+        assert 0.008 < np.abs(rows[root, 7, 1] - rows[edge, 7, 1]) < 0.016
+    assert 0.03 < np.ptp(rows[UE, :, 0]) < 0.05
+
+
+@pytest.mark.parametrize("jaw_deg", [0, 10, 20])
+def test_teeth_stay_behind_the_lips(toothed: FlameModel, jaw_deg: float) -> None:
+    """Catches teeth in the flesh, or through the lips, of the mean face and of others."""
+    skin, teeth = toothed.faces[:9976], toothed.faces[9976:]
+    for seed in range(5):
+        shape = np.random.default_rng(seed).normal(size=60) * (seed > 0)
+        mesh = jaw_opened(toothed, jaw_deg, shape)
+        assert crossings(mesh, skin, teeth) == 0
+        assert crossings(mesh, teeth[:84], teeth[84:]) == 0
+        if jaw_deg == 0:
+            assert covered_from_front(mesh, skin, mesh[teeth].mean(1)).all()
+    mesh[5023:, 2] += 0.005
+    assert crossings(mesh, skin, teeth) > 10  # what is counted above can be found
+
+
+def test_jaw_moves_the_lower_row_only(toothed: FlameModel) -> None:
+    """Catches an upper row that follows the jaw, and a lower one that bends or turns about another point."""
+    closed, opened = toothed.v_template[5023:], jaw_opened(toothed, 20)[5023:]
+    lower = np.isin(np.repeat(np.arange(8), 15), (LR, LE, LRB, LEB))
+    np.testing.assert_allclose(opened[~lower], closed[~lower], atol=1e-12)
+    c, s = np.cos(np.radians(20)), np.sin(np.radians(20))
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    np.testing.assert_allclose(
+        opened[lower], (closed[lower] - JOINT_POSITIONS_M[2]) @ turn.T + JOINT_POSITIONS_M[2], atol=1e-9
+    )
 
 
 def test_what_moves_the_teeth(flame_open: FlameModel, toothed: FlameModel) -> None:
-    # Catches teeth that follow expressions, the wrong bone, or shift the joints.
-    rows = np.repeat(np.arange(8), 15)
-    jaw = np.isin(rows, (LR, LE, LRB, LEB))
+    """Catches teeth that follow expressions or correctives, the wrong bone, or shift the joints."""
+    jaw = np.isin(np.repeat(np.arange(8), 15), (LR, LE, LRB, LEB))
     np.testing.assert_array_equal(toothed.weights[5023:][jaw], np.tile([0, 0, 1, 0, 0], (60, 1)))
     np.testing.assert_array_equal(toothed.weights[5023:][~jaw], np.tile([0, 1, 0, 0, 0], (60, 1)))
     assert not toothed.shapedirs[5023:, :, 60:].any()
     assert not toothed.posedirs[5023:].any()
     assert not toothed.j_regressor[:, 5023:].any()
     np.testing.assert_array_equal(toothed.j_regressor[:, :5023], flame_open.j_regressor)
-    column = 4
-    lips = (flame_open.shapedirs[UPPER_LIP[column]] + flame_open.shapedirs[LOWER_LIP[column]])[:, :60] / 2
-    for row in range(8):
-        np.testing.assert_array_equal(toothed.shapedirs[5023 + row * 15 + column, :, :60], lips)
+
+
+def test_identity_carries_the_teeth(flame_open: FlameModel) -> None:
+    """Catches teeth that stay, or grow otherwise, where the head is moved, wider, longer or has a bent mouth."""
+    template = flame_open.v_template
+    shapes = np.zeros((len(template), 3, 4))
+    shapes[:, :, 0] = [0.001, 0.002, 0.003]
+    shapes[:, 0, 1] = template[:, 0]
+    shapes[:, 1, 2] = template[:, 1]
+    shapes[:, 2, 3] = template[:, 0] ** 2
+    teeth = with_teeth(replace(flame_open, shapedirs=shapes, n_identity=4))
+    at, found = teeth.v_template[5023:], teeth.shapedirs[5023:]
+    expected = np.zeros_like(found)
+    expected[:, :, 0] = [0.001, 0.002, 0.003]
+    expected[:, 0, 1], expected[:, 1, 2], expected[:, 2, 3] = at[:, 0], at[:, 1], at[:, 0] ** 2
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_teeth_and_lips_come_from_the_mesh(flame_open: FlameModel, toothed: FlameModel) -> None:
+    """Catches lists of vertices of one published mesh, and lengths in meters: another numbering and size of the same
+    mesh has the same teeth."""
+    order = np.random.default_rng(1).permutation(5023)
+    number = np.argsort(order)
+    other = with_teeth(
+        replace(
+            flame_open,
+            v_template=2 * flame_open.v_template[order],
+            shapedirs=flame_open.shapedirs[order],
+            faces=number[flame_open.faces].astype(np.int32),
+        )
+    )
+    np.testing.assert_allclose(other.v_template[5023:], 2 * toothed.v_template[5023:], atol=1e-9)
+    np.testing.assert_allclose(other.shapedirs[5023:], toothed.shapedirs[5023:], atol=1e-9)
+    np.testing.assert_array_equal(order[np.array(lip_pairs(other))], lip_pairs(toothed))
+
+
+def test_lips_face_each_other(flame_open: FlameModel, toothed: FlameModel) -> None:
+    """Catches vertices that are not on the lips, in another order, or paired with the wrong ones."""
+    upper, lower = (flame_open.v_template[ids] for ids in lip_pairs(toothed))
+    np.testing.assert_array_equal(lip_pairs(toothed), lip_pairs(flame_open))
+    assert (np.diff(upper[:, 0]) < 0).all()
+    assert (np.diff(lower[:, 0]) < 0).all()
+    assert (upper[:, 1] > lower[:, 1]).all()
+    assert np.abs(upper[:, 0] - lower[:, 0]).max() < 0.003
+    assert np.ptp(upper[:, 0]) > 0.045
+    opened = jaw_opened(toothed, 20)
+    before, after = (
+        np.linalg.norm(np.subtract(*(mesh[ids] for ids in lip_pairs(toothed))), axis=1).max()
+        for mesh in (flame_open.v_template, opened)
+    )
+    assert after - before > 0.008
 
 
 def test_teeth_belong_to_the_mouth(flame_open: FlameModel) -> None:
-    # Catches selection that leaves the teeth out of the mouth region.
-    model = with_teeth(replace(flame_open, masks={"lips": np.array([*UPPER_LIP, *LOWER_LIP])}))
+    """Catches selection that leaves the teeth out of the mouth region."""
+    model = with_teeth(replace(flame_open, masks={"lips": np.concatenate(lip_pairs(flame_open))}))
     assert key_regions(model)["mouth"][9976:].all()
 
 
 def test_other_topologies_are_refused(tiny_flame: FlameModel) -> None:
     with pytest.raises(StgaError, match="40 vertices, expected FLAME's topology of 5023"):
         with_teeth(tiny_flame)
+
+
+def test_a_closed_mouth_is_refused(flame_open: FlameModel) -> None:
+    """Catches teeth at the neck, which is open too."""
+    ring = np.intersect1d(open_edges(flame_open.faces), np.flatnonzero(flame_open.v_template[:, 2] > 0.03))
+    directed = np.concatenate([flame_open.faces[:, [0, 1]], flame_open.faces[:, [1, 2]], flame_open.faces[:, [2, 0]]])
+    known = {tuple(edge) for edge in directed.tolist()}
+    lid = [(b, a, int(ring[0])) for a, b in known if a in ring and b in ring and (b, a) not in known]
+    faces = np.concatenate([flame_open.faces, np.array([face for face in lid if len(set(face)) == 3], np.int32)])
+    with pytest.raises(StgaError, match="closed mouth"):
+        with_teeth(replace(flame_open, faces=faces))

@@ -9,6 +9,7 @@ from ...avatar.file import Avatar
 from ...errors import StgaError
 from ...files import replacing
 from ...flame.sequence import FlameSequence
+from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 from ..playback import Playback
 from .data_file import data_file
 from .page import element_script, page
@@ -20,6 +21,10 @@ BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
 RIG_NOTICE = (
     "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
     "who may receive them."
+)
+MESH_NOTICE = (
+    "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence (flame.is.tue.mpg.de) decides who "
+    "may receive them."
 )
 
 
@@ -36,7 +41,6 @@ def write_web(
               (V, 3) meters are baked, of which there is one at least
     Raises StgaError where there is no pose, or a file cannot be written.
     """
-    with_flame = sequence is not None and not playback.motion_only
     rig = _rig(path, None if playback.motion_only else sequence, meshes)
     try:
         data = data_file(avatar, rig, playback)
@@ -46,8 +50,19 @@ def write_web(
         _write(path.with_name(SCRIPT_NAME), element_script().encode("utf-8"))
         _write(path, data)  # last: where the player cannot be written, no data without one
         return [path, path.with_name(SCRIPT_NAME)]
-    _write(path, page(playback.title, RIG_NOTICE if with_flame else "", data).encode("utf-8"))
+    _write(path, page(playback.title, flame_notice(avatar, sequence, playback.motion_only), data).encode("utf-8"))
     return [path]
+
+
+def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
+    """What a page of the avatar holds of a FLAME model, and whose licence that has; "" for any other head.
+
+    Without a sequence, FLAME's mesh is known by its number of vertices.
+    """
+    if sequence is not None and not motion_only:
+        return RIG_NOTICE
+    is_flame = len(avatar.neutral) in (TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)
+    return MESH_NOTICE if is_flame or sequence is not None else ""
 
 
 def web_bytes(avatar: Avatar) -> int:

@@ -9,7 +9,7 @@ from ...avatar.strain import STRAIN_GAIN, color_range, rest_strain
 from ...capture.model import Capture, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.sequence import joint_angles
-from ...flame.teeth import LOWER_LIP, TEETH_VERTICES, TEMPLATE_VERTICES, UPPER_LIP
+from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, lip_pairs
 from ...selection import select_capture
 from ..settings import TrainingSettings
 from .evidence import CameraColors, Evidence, camera_evidence, fit_cameras, linear_evidence, stable_colors
@@ -158,7 +158,9 @@ class CaptureFacts:
     @cached_property
     def lip_gap_mm(self) -> float:
         """How far the lips part at most, beyond their distance in the neutral mesh."""
-        upper, lower, zero_pose = list(UPPER_LIP), list(LOWER_LIP), self.settings.selection.zero_pose
+        assert self.capture.flame is not None
+        upper, lower = lip_pairs(self.capture.flame.model)
+        zero_pose = self.settings.selection.zero_pose
         posed = (self.sampled.expression_mesh(timestep, zero_pose) for timestep in self.sampled_timesteps)
         meshes = [self.capture.neutral, *posed]
         gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]

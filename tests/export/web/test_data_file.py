@@ -1,5 +1,6 @@
 """Web data files against an independent reader: what quantization may cost, and what is refused."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +101,22 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
     assert (tmp_path / SCRIPT_NAME).read_text(encoding="utf-8") == element_script()
     write_web(tmp_path / "b.html", head.avatar, Playback(), sequence=head.sequence)
     assert "derived from a FLAME model" in (tmp_path / "b.html").read_text(encoding="utf-8")
+
+
+def test_pages_of_flame_meshes_name_flames_licence(head, tmp_path):
+    """Catches a page without FLAME's rig that keeps quiet about FLAME's triangles and meshes in it, and one of any
+    other head that names FLAME's licence."""
+    path = tmp_path / "a.html"
+
+    def notice(avatar, sequence):
+        write_web(path, avatar, Playback(motion_only=True), [avatar.neutral], sequence)
+        return re.search(r'<p id="notice">(.*?)</p>', path.read_text(encoding="utf-8"))[1]
+
+    assert "posed meshes of a FLAME head" in notice(head.avatar, head.sequence)
+    assert notice(head.avatar, None) == ""
+    padding = np.zeros((5143 - len(head.avatar.neutral), 3))
+    flame_sized = replace(head.avatar, neutral=np.concatenate([head.avatar.neutral, padding]))
+    assert "FLAME&#x27;s licence (flame.is.tue.mpg.de) decides" in notice(flame_sized, None)
 
 
 def test_no_data_without_its_player(head, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame
-from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
+from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
 from stga_addon.training.effects import rules
 from stga_addon.training.effects.decisions import EFFECTS, parse_choices
@@ -344,8 +344,9 @@ def test_two_cameras_that_are_alike(painted):
     assert abs(found.gain * 120 + found.offset - 120).max() < 1.5
 
 
-def test_each_timestep_is_posed_once(painted):
+def test_each_timestep_is_posed_once(painted, monkeypatch):
     """Catches a long capture of which every timestep is posed, or one several times, to decide its effects."""
+    monkeypatch.setattr("stga_addon.training.effects.facts.lip_pairs", lambda model: np.arange(30).reshape(2, 15))
     neutral = np.random.default_rng(0).normal(size=(TEMPLATE_VERTICES + TEETH_VERTICES, 3))
     posed: list[int] = []
 
@@ -362,6 +363,26 @@ def test_each_timestep_is_posed_once(painted):
     assert facts.lip_gap_mm == pytest.approx(0)
     assert len(posed) == len(set(posed)) == MAX_TIMESTEPS
     assert {0, 499} <= set(posed)
+
+
+def test_lips_that_part(painted, shared_data):
+    """Catches lips that are not those of FLAME's mesh, and a head that turns taken for lips that part."""
+    with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
+        template, faces = data["v_template"].astype(float), data["faces"]
+    closed = np.concatenate([template, np.zeros((TEETH_VERTICES, 3))])
+    model = SimpleNamespace(v_template=closed, faces=np.concatenate([faces, teeth_faces(TEMPLATE_VERTICES)]))
+    opened = closed - [0, 0.01, 0] * (closed[:, 1:2] < -0.047)  # a cut through the mouth, below its corners
+    meshes = [closed, closed @ [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], opened]
+    capture = replace(
+        painted(),
+        timesteps=(0, 1),
+        neutral=closed,
+        expression_mesh=lambda timestep, zero_pose: meshes[timestep],
+        flame=SimpleNamespace(model=model),
+    )
+    settings = make_settings(iterations=1)
+    assert CaptureFacts(capture, settings).lip_gap_mm == pytest.approx(0, abs=1e-9)
+    assert CaptureFacts(replace(capture, timesteps=(0, 2)), settings).lip_gap_mm == pytest.approx(10, abs=0.2)
 
 
 def test_a_sample_without_motion_does_not_forbid_selection(painted):

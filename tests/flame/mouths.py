@@ -1,0 +1,111 @@
+"""A FLAME model whose jaw opens, and what meets what in its mouth."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+from stga_addon.flame.forward import flame_forward, neutral_frame
+from stga_addon.flame.model import FlameModel
+
+from .conftest import model_of, random_arrays
+
+JOINT_POSITIONS_M = np.array(
+    [[0, -0.16, -0.03], [0, -0.12, -0.03], [0, -0.02, 0], [0.03, 0.03, 0.04], [-0.03, 0.03, 0.04]]
+)
+
+
+def open_flame(shared_data: Path) -> FlameModel:
+    """FLAME 2023 Open's template and identity, with a skeleton and a jaw made here.
+
+    Expressions and correctives stay random: they are not published openly.
+    """
+    with np.load(shared_data / "flame_open" / "flame2023_open_basis.npz") as data:
+        arrays = random_arrays(vertices=5023, components=80)
+        arrays["shapedirs"][:, :, :60] = data["shapedirs"]
+        arrays |= {"v_template": data["v_template"].astype(float), "f": data["faces"]}
+    model = model_of(arrays, n_identity=60)
+    jaw = jaw_weights(model.v_template, model.faces)
+    weights = np.zeros_like(model.weights)
+    weights[:, 1], weights[:, 2] = 1 - jaw, jaw
+    homogeneous = np.vstack([model.v_template.T, np.ones(5023)])
+    targets = np.vstack([JOINT_POSITIONS_M.T, np.ones(5)])
+    regressor = np.linalg.lstsq(homogeneous, targets, rcond=None)[0].T
+    return replace(model, weights=weights, j_regressor=regressor)
+
+
+def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V,) how much each vertex follows the jaw: 1 at chin and lower lip, 0 above the lips, as smooth as possible."""
+    x, y, z = vertices.T
+    inner = np.isin(np.arange(len(vertices)), open_edges(faces))
+    fixed = (y > -0.036) | (z < 0) | (y < -0.11)
+    moved = ((y < -0.05) & (z > 0.045) & (np.abs(x) < 0.025) & (y > -0.09)) | (inner & (z > 0.03) & (y < -0.053))
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.concatenate([edges, edges[:, ::-1]])
+    adjacency = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2).tocsr()
+    laplacian = diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
+    free = ~(fixed | moved)
+    weights = np.where(moved & ~fixed, 1.0, 0.0)
+    weights[free] = spsolve(laplacian[free][:, free].tocsc(), -(laplacian[free][:, ~free] @ weights[~free]))
+    return np.clip(weights, 0, 1)
+
+
+def open_edges(faces: np.ndarray) -> np.ndarray:
+    """Vertices (n,) of the edges (directed) that one triangle has alone."""
+    edges = [tuple(edge) for face in faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
+    known = set(edges)
+    return np.unique([edge for edge in edges if edge[::-1] not in known])
+
+
+def jaw_opened(model: FlameModel, degrees: float, shape: np.ndarray | None = None) -> np.ndarray:
+    """The mesh (V, 3) with the jaw opened, without expression or correctives."""
+    model = replace(model, posedirs=np.zeros_like(model.posedirs))
+    frame = replace(neutral_frame(model), jaw_pose=np.array([np.radians(degrees), 0, 0]))
+    return flame_forward(model, np.zeros(model.n_identity) if shape is None else shape, frame, None)
+
+
+def crossings(vertices: np.ndarray, skin: np.ndarray, teeth: np.ndarray) -> int:
+    """How many pairs of an edge of one and a triangle of the other, of two sets of triangles, meet."""
+    return _pierced(vertices, teeth, skin) + _pierced(vertices, skin, teeth)
+
+
+def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> int:
+    edges = np.unique(np.sort(np.concatenate([edged[:, [0, 1]], edged[:, [1, 2]], edged[:, [2, 0]]]), axis=1), axis=0)
+    ends, corners = vertices[edges], vertices[pierced]
+    ends, corners = _near(ends, corners), _near(corners, ends)
+    start, direction = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]
+    origin, u, v = corners[None, :, 0], (corners[:, 1] - corners[:, 0])[None], (corners[:, 2] - corners[:, 0])[None]
+    across = np.cross(direction, v)
+    determinant = (across * u).sum(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a = ((start - origin) * across).sum(-1) / determinant
+        along = np.cross(start - origin, u)
+        b = (along * direction).sum(-1) / determinant
+        t = (along * v).sum(-1) / determinant
+        met = (a >= 0) & (b >= 0) & (a + b <= 1) & (t >= 0) & (t <= 1)
+    return int(met.sum())
+
+
+def _near(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Those of some (n, k, 3) that touch the box around the others."""
+    low, high = others.min((0, 1)), others.max((0, 1))
+    return np.asarray(some[((some.min(1) <= high) & (some.max(1) >= low)).all(1)])
+
+
+def covered_from_front(vertices: np.ndarray, skin: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n,) bool: points (n, 3) with a triangle of the skin in front of them, along z."""
+    corners = vertices[skin]
+    corners = corners[corners[:, :, 2].max(1) > points[:, 2].min()]
+    a, b, c = corners[None, :, 0], corners[None, :, 1], corners[None, :, 2]
+
+    def twice_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+
+    at = points[:, None]
+    parts = np.stack([twice_area(at, b, c), twice_area(at, c, a), twice_area(at, a, b)], axis=-1)
+    inside = (parts > 0).all(-1) | (parts < 0).all(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (parts * np.stack([a[..., 2], b[..., 2], c[..., 2]], axis=-1)).sum(-1) / parts.sum(-1)
+    return (inside & (depth > at[..., 2])).any(1)
