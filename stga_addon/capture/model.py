@@ -12,6 +12,9 @@ from .camera import Camera
 
 Item = TypeVar("Item")
 
+FPS_LIMIT = 1000.0
+"""Frame rates are below it."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -39,6 +42,8 @@ class Capture:
     flame      the parameters and model behind the meshes, for FLAME captures
     given_selection  timestep -> (F,) bool where the capture comes with a selection
     warnings   one sentence each
+    fps        timesteps per second, counted by their numbers: with 60, timestep 30 was recorded 0.5 s after timestep 0,
+               also where those between are missing; None where unknown
     """
 
     root: Path
@@ -53,6 +58,7 @@ class Capture:
     flame: FlameSequence | None = None
     given_selection: Mapping[int, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    fps: float | None = None
 
 
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:

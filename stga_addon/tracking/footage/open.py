@@ -60,7 +60,8 @@ def open_footage(
     if any(names):
         rig = _by_name(shots, names, root)
         sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
-        return replace(_rig(root, sources, sequences, rig, frames), warnings=warnings)
+        footage = _rig(root, sources, sequences, rig, frames)
+        return replace(footage, warnings=(*warnings, *footage.warnings))
     return _footage(root, _listed_cameras(_with_stills(shots, sources), calibration), warnings=warnings)
 
 
@@ -102,7 +103,8 @@ def _rig(
 ) -> Footage:
     fps = frames_per_second(sequences)
     recorded = synchronized(sequences, shots, sources, frames)
-    return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps)
+    warnings = tuple(warning for s in sequences.values() if isinstance(s, video.Video) for warning in s.warnings)
+    return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps, warnings)
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...capture.images import image_size
-from ...capture.model import View
+from ...capture.model import FPS_LIMIT, View
 from ...errors import StgaError
 from .image_frames import ImageFrames
 from .model import Frames
@@ -51,8 +51,8 @@ def sequence_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
-    """Of the videos; None where there are none. Raises StgaError for videos of different rates."""
-    rates = {name: s.fps for name, s in sequences.items() if isinstance(s, Video)}
+    """Of the videos; None where none says a plausible one. Raises StgaError for videos of different rates."""
+    rates = {name: s.fps for name, s in sequences.items() if isinstance(s, Video) and 0 < s.fps < FPS_LIMIT}
     first = next(iter(rates), None)
     for name, rate in rates.items():
         if first is not None and abs(rate - rates[first]) > 0.01 * rates[first]:
