@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import read_json
 from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
-from .model import View
+from .model import FPS_LIMIT, View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
@@ -47,11 +47,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and the files named at the top level (None where they are missing)."""
+    """All frames of a capture by split, and what the top level says (None where it is missing): files, frame rate."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
     regions: Path | None
+    fps: float | None = None
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -90,6 +91,7 @@ def read_splits(folder: Path, principal_point: str = "vhap") -> Transforms:
         splits,
         canonical_mesh=_first_path(documents.values(), "canonical_mesh_path"),
         regions=_first_path(documents.values(), "regions_path"),
+        fps=_frame_rate(documents.values()),
     )
 
 
@@ -340,3 +342,8 @@ def _camera_key(frame: Frame) -> str | bytes:
 
 def _first_path(records: Iterable[_Record], key: str) -> Path | None:
     return next((path for path in (record.path_of(key) for record in records) if path is not None), None)
+
+
+def _frame_rate(records: Iterable[_Record]) -> float | None:
+    rates = [record.number("fps", low=0, high=FPS_LIMIT) for record in records if record.has("fps")]
+    return next(iter(rates), None)
