@@ -137,7 +137,12 @@ def test_frames_hidden_by_an_edit_list(tmp_path, codec, suffix):
 
 @pytest.mark.parametrize(
     ("codec", "options", "name"),
-    [("libx265", OPEN_X265, "a.mov"), ("libx265", OPEN_X265, "a.mts"), ("libx264", OPEN_X264, "a.mts")],
+    [
+        ("libx265", OPEN_X265, "a.mov"),
+        ("libx265", OPEN_X265, "a.mkv"),
+        ("libx265", OPEN_X265, "a.mts"),
+        ("libx264", OPEN_X264, "a.mts"),
+    ],
 )
 def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
     """Catches pictures counted whose references were cut away, and frames shown in their place."""
@@ -148,8 +153,12 @@ def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
     second = [n for n, packet in enumerate(packets) if packet.is_keyframe][1]
     (tmp_path / "take").mkdir()
     copy_packets(whole, tmp_path / "take" / name, first=second)
-    camera = open_footage(tmp_path / "take" / name).cameras[0]
-    start = shown(camera.image(0))
+    footage = open_footage(tmp_path / "take" / name)
+    start = shown(footage.cameras[0].image(0))
+    if name == "a.mkv":
+        assert footage.warnings[0].endswith(
+            "a.mkv: its first 3 frames cannot be decoded; they are left out, and not counted"
+        )
     assert_numbers(tmp_path / "take" / name, list(range(start, FRAMES)))
 
 
@@ -195,3 +204,15 @@ def test_frame_that_the_decoder_leaves_out(tmp_path):
         with pytest.raises(StgaError, match=r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"):
             camera.image(41)
     assert shown(camera.image(50)) == 50
+
+
+def test_without_pictures(tmp_path):
+    """Catches a message that names an exception instead of what is missing."""
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(StgaError, match=r"a.mkv: is not a readable video \(it has no video stream\)"):
+        open_footage(tmp_path)

@@ -17,7 +17,15 @@ from .calibrations import EXPECTED, find_calibration, read_calibration
 from .image_frames import ImageFrames
 from .lens import Lens
 from .model import Footage, FootageCamera, Frames
-from .sequences import FrameRange, Sequence, frames_per_second, open_sequence, sequence_size, synchronized
+from .sequences import (
+    FrameRange,
+    Sequence,
+    frames_per_second,
+    open_sequence,
+    recorded_size,
+    sequence_size,
+    synchronized,
+)
 from .shots import Shot
 from .sources import Sources, find_sources, sequence_files, sequence_names, still_image
 from .undistort import undistortion
@@ -159,7 +167,7 @@ def _image_size(sources: Sources, label: str) -> tuple[int, int]:
     """Size of the images of a label; for calibrations that do not hold it."""
     name = sequence_names(sources, [label])[0]
     if name is not None:
-        return sequence_size(open_sequence(sequence_files(sources, name)))
+        return recorded_size(sequence_files(sources, name))
     return image_size(still_image(sources, label, f"camera {label}"))
 
 

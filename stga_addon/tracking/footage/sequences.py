@@ -11,7 +11,7 @@ from .image_frames import ImageFrames
 from .model import Frames
 from .shots import Shot
 from .sources import Sources, frame_number
-from .video import Video, VideoFrames, read_video
+from .video import Video, VideoFrames, read_video, video_size
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,11 @@ Sequence = Video | list[Path]
 def open_sequence(files: Path | list[Path]) -> Sequence:
     """Index a video; images are taken as they are. Raises StgaError where the video cannot be read."""
     return read_video(files) if isinstance(files, Path) else files
+
+
+def recorded_size(files: Path | list[Path]) -> tuple[int, int]:
+    """(width, height) of the first frame, without an index of the video. Raises StgaError as `open_sequence` does."""
+    return video_size(files) if isinstance(files, Path) else image_size(files[0])
 
 
 def sequence_size(sequence: Sequence) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,26 +60,28 @@ def read_video(path: Path) -> Video:
 
     Where the container says when packets are shown, only the first frames are decoded; otherwise, all are.
     """
-    av = _pyav(path)
-    try:
-        size, first = _first_frames(path)
-        times = _packet_times(path, first)
-        if times is None:
-            times = _decoded_times(path)
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            seekable = _ascending(times) and (_is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream))
-            rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
-            time_base = float(stream.time_base)
-    except (av.FFmpegError, StopIteration, IndexError, ValueError) as error:
-        raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
-    if not is_image_size(*size):
-        raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, more than are read")
+    size, first = _first_frames(path)
+    times: Sequence[int | None] | None = _packet_times(path)
+    left_out = 0 if times is None or first[0] not in times else times.index(first[0])
+    if times is None or times[left_out : left_out + len(first)] != first:
+        times, left_out = _decoded_times(path), 0
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        seekable = _ascending(times) and (_is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream))
+        rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
+        time_base = float(stream.time_base)
     if not seekable:
         return Video(path, tuple(range(len(times))), next(iter(rates), 0.0), size, seekable=False)
-    shown = tuple(time for time in times if time is not None)
-    durations_s = np.diff(shown) * time_base
-    return Video(path, shown, _frame_rate(durations_s, rates), size, warnings=_rate_warnings(path, durations_s))
+    shown = tuple(time for time in times[left_out:] if time is not None)
+    warnings = _rate_warnings(path, shown, time_base)
+    if left_out:
+        warnings += (f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",)
+    return Video(path, shown, _frame_rate(shown, time_base, rates), size, warnings=warnings)
+
+
+def video_size(path: Path) -> tuple[int, int]:
+    """(width, height) as displayed. Raises StgaError as `read_video` does."""
+    return _first_frames(path)[0]
 
 
 class VideoFrames:
@@ -127,12 +130,14 @@ class VideoFrames:
 
         Raises ValueError where the decoder gives no frame of that time.
         """
+        from av.error import InvalidDataError
+
         failure = None
         for decoder in self._decoders(number):
             self._decoder = decoder
             try:
                 frame = self._reached(number)
-            except _pyav(self.video.path).error.InvalidDataError as error:
+            except InvalidDataError as error:
                 frame, failure = None, error
             if frame is not None:
                 self._decoded = number
@@ -141,6 +146,8 @@ class VideoFrames:
 
     def _decoders(self, number: int) -> Iterator[Iterator[Any]]:
         """Decoders before the frame, the nearest first."""
+        from av.error import FFmpegError
+
         seekable = self.video.seekable
         if self._decoder is not None and 0 < number - self._decoded <= (MAX_FRAMES_AHEAD if seekable else number + 1):
             yield self._decoder
@@ -148,7 +155,10 @@ class VideoFrames:
             if number - back > 0:
                 self._open()
                 stream = self._container.streams.video[0]
-                self._container.seek(self.video.times[number - back], stream=stream)
+                try:
+                    self._container.seek(self.video.times[number - back], stream=stream)
+                except FFmpegError:
+                    break
                 yield _from_key_frame(self._container.decode(stream), self.video.times[number])
         self.close()
         self._open()
@@ -170,35 +180,50 @@ class VideoFrames:
 
 
 def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
-    """Size (width, height) as displayed and times of the first frames in the order shown. Raises StopIteration."""
-    with _pyav(path).open(str(path)) as container:
+    """Size (width, height) as displayed and times of the first frames in the order shown. Raises StgaError."""
+    with _opened(path) as container:
         frames = _decoded_frames(container)
-        first = next(frames)
+        first = next(frames, None)
+        if first is None:
+            raise ValueError("none of its frames can be decoded")
         height, width = _pixels(first).shape[:2]
-        return (width, height), [first.pts, *(frame.pts for frame in itertools.islice(frames, CHECKED_FRAMES - 1))]
+        times = [first.pts, *(frame.pts for frame in itertools.islice(frames, CHECKED_FRAMES - 1))]
+    if not is_image_size(width, height):
+        raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
+    return (width, height), times
 
 
-def _packet_times(path: Path, first: list[int | None]) -> list[int | None] | None:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A container that has a video stream. Raises StgaError for what fails while it is open."""
+    av = _pyav(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise ValueError("it has no video stream")
+            yield container
+    except (av.FFmpegError, ValueError) as error:
+        raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
+
+
+def _packet_times(path: Path) -> list[int] | None:
     """When packets are shown, ascending; None where they do not say it, so that all frames must be decoded.
 
-    first: times of the first decoded frames. Packets before them refer to frames that were cut away. Packets that an
-    edit list hides are decoded, but not shown.
+    Packets that an edit list hides are decoded, but not shown.
     """
-    with _pyav(path).open(str(path)) as container:
+    with _opened(path) as container:
         stream = container.streams.video[0]
         timed = _is_of(container, TIMED_CONTAINERS) and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
         if not (timed or _is_intra_only(stream)):
             return None
         packets = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
-    if None in packets or first[0] is None:
-        return None
-    times = sorted(time for time in packets if time is not None and time >= first[0])
-    return list(times) if _ascending(times) and times[: len(first)] == first else None
+    times = sorted(time for time in packets if time is not None)
+    return times if len(times) == len(packets) and _ascending(times) else None
 
 
-def _decoded_times(path: Path) -> list[int | None]:
+def _decoded_times(path: Path) -> Sequence[int | None]:
     """Times of all frames in the order shown."""
-    with _pyav(path).open(str(path)) as container:
+    with _opened(path) as container:
         container.streams.video[0].thread_type = "AUTO"
         return [frame.pts for frame in _decoded_frames(container)]
 
@@ -220,9 +245,9 @@ def _decoded_frames(container: Any) -> Iterator[Any]:
 
 
 def _from_key_frame(frames: Iterator[Any], time: int) -> Iterator[Any]:
-    """The frames from the first key frame on: those shown before it may refer to frames before the seek.
+    """The frames from the first key frame on, because those shown before it may refer to frames before the seek.
 
-    None where the key frame is later than `time`.
+    No frames where the key frame is later than `time`.
     """
     for frame in frames:
         if frame.key_frame:
@@ -244,18 +269,23 @@ def _is_intra_only(stream: Any) -> bool:
     return bool(stream.codec_context.codec.intra_only)
 
 
-def _frame_rate(durations_s: np.ndarray, rates: list[float]) -> float:
-    """The first of the stated rates that the frames' times agree with, else the average of the times."""
-    if not len(durations_s):
+def _frame_rate(times: Sequence[int], time_base: float, rates: list[float]) -> float:
+    """The first of the stated rates that the frames' times agree with, else the average of the times.
+
+    What a file states also counts frames that are hidden.
+    """
+    if len(times) < 2:
         return next(iter(rates), 0.0)
-    measured = 1 / float(durations_s.mean())
+    measured = (len(times) - 1) / ((times[-1] - times[0]) * time_base)
     return next((rate for rate in rates if abs(rate - measured) <= RATE_TOLERANCE * measured), measured)
 
 
-def _rate_warnings(path: Path, durations_s: np.ndarray) -> tuple[str, ...]:
-    if not len(durations_s) or durations_s.max() <= VARIABLE_RATE_FACTOR * float(np.median(durations_s)):
+def _rate_warnings(path: Path, times: Sequence[int], time_base: float) -> tuple[str, ...]:
+    durations = np.diff(times)
+    if not len(durations) or durations.max() <= VARIABLE_RATE_FACTOR * np.median(durations):
         return ()
-    low, high, average = 1000 * durations_s.min(), 1000 * durations_s.max(), 1 / durations_s.mean()
+    low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
+    average = 1 / (time_base * float(durations.mean()))
     return (
         f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); it is played at the average of "
         f"{average:.4g} frames per second",
@@ -263,7 +293,7 @@ def _rate_warnings(path: Path, durations_s: np.ndarray) -> tuple[str, ...]:
 
 
 def _reason(error: Exception) -> str:
-    return str(error) or type(error).__name__
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
 def _pixels(frame: Any) -> np.ndarray:
