@@ -85,14 +85,21 @@ def read_splits(folder: Path, principal_point: str = "vhap") -> Transforms:
     names = {split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()}
     documents = {split: _document(folder / name) for split, name in (names or {"train": "transforms.json"}).items()}
     frames = {split: _read_frames(record.path, record.values, principal_point) for split, record in documents.items()}
+    rates = [frame_rate(record.path, record.values) for record in documents.values()]
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
     splits = {split: tuple(itertools.islice(numbered, len(frames.get(split, ())))) for split in SPLITS}
     return Transforms(
         splits,
         canonical_mesh=_first_path(documents.values(), "canonical_mesh_path"),
         regions=_first_path(documents.values(), "regions_path"),
-        fps=_frame_rate(documents.values()),
+        fps=next((rate for rate in rates if rate is not None), None),
     )
+
+
+def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
+    """`fps` at the top level of a transforms file; None where it is missing. Raises StgaError naming the file."""
+    record = _Record(path, path.parent, "", values)
+    return record.number("fps", low=0, high=FPS_LIMIT) if record.has("fps") else None
 
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
@@ -342,8 +349,3 @@ def _camera_key(frame: Frame) -> str | bytes:
 
 def _first_path(records: Iterable[_Record], key: str) -> Path | None:
     return next((path for path in (record.path_of(key) for record in records) if path is not None), None)
-
-
-def _frame_rate(records: Iterable[_Record]) -> float | None:
-    rates = [record.number("fps", low=0, high=FPS_LIMIT) for record in records if record.has("fps")]
-    return next(iter(rates), None)

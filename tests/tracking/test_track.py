@@ -120,7 +120,10 @@ def test_frame_rate_of_the_footage(recorded, fps):
     folder, _ = recorded
     for path in (folder / "points").glob("cam*.npz"):
         write_npz(path, {name: array[::3] for name, array in read_npz(path).items()})
-    footage = replace(open_footage(folder / "footage", frames=FrameRange(0, None, 3)), fps=fps)
+    transforms = folder / "footage/transforms.json"
+    write_json(transforms, {**read_json(transforms), "fps": fps})
+    footage = open_footage(folder / "footage", frames=FrameRange(0, None, 3))
+    assert footage.fps == fps
     track(footage, folder / "head.npz", folder / "out", folder / "points")
     capture = open_capture(folder / "out", folder / "head.npz")
     assert capture.timesteps == (0, 3)

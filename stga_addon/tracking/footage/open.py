@@ -64,7 +64,7 @@ def open_footage(
         raise StgaError(f"{calibration}: lists images, which offsets do not apply to; expected none")
     if timed:
         found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
-        return _footage(root, found, warnings=warnings)
+        return _footage(root, found, next((shot.fps for shot in shots if shot.fps is not None), None), warnings)
     if any(names):
         rig = _by_name(shots, names, root)
         sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
