@@ -61,8 +61,8 @@ class ImportCapture(bpy.types.Operator, FileImport):
     )
     set_up_scene: bpy.props.BoolProperty(
         name="Set Up Scene",
-        description="Set the scene's resolution and camera to those of the capture, and its view transform to "
-        "Standard, which the splats' colors are trained for",
+        description="Set the scene's resolution, camera and frame rate to those of the capture, and its view transform "
+        "to Standard, which the splats' colors are trained for",
         default=True,
     )
     filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})

@@ -12,6 +12,9 @@ from .camera import Camera
 
 Item = TypeVar("Item")
 
+FPS_LIMIT = 1000.0
+"""Frame rates are below it."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -40,6 +43,8 @@ class Capture:
     flame_file the model's file; None without one
     given_selection  timestep -> (F,) bool where the capture comes with a selection
     warnings   one sentence each
+    fps        timesteps per second, counted by their numbers: with 60, timestep 30 was recorded 0.5 s after timestep 0,
+               also where those between are missing; None where unknown
     """
 
     root: Path
@@ -55,6 +60,7 @@ class Capture:
     flame_file: Path | None = None
     given_selection: Mapping[int, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    fps: float | None = None
 
 
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:

@@ -52,7 +52,9 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
     _require_files(transforms)
     capture = _open_layout(root, transforms, views, flame)
     found = (principal_point_warning(transforms.frames, capture.mesh, principal_point), _size_warning(capture))
-    return replace(capture, warnings=(*capture.warnings, *(warning for warning in found if warning)))
+    return replace(
+        capture, fps=transforms.fps, warnings=(*capture.warnings, *(warning for warning in found if warning))
+    )
 
 
 def _size_warning(capture: Capture) -> str | None:

@@ -14,6 +14,7 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained on")]
     lines += [
         ("timesteps", format_ranges(capture.timesteps)),
+        *([("frame rate", f"{capture.fps:g} frames per second")] if capture.fps is not None else []),
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
         ("regions", _regions(capture)),
     ]

@@ -15,6 +15,9 @@ from .model import Capture, View
 MAX_NEUTRAL_DIFFERENCE_M = 1e-4
 """Largest distance between the neutral meshes of two takes of one head: trackers write rounded shape coefficients."""
 
+RATE_TOLERANCE = 0.01
+"""Relative difference up to which the frame rates of takes are the same."""
+
 T = TypeVar("T")
 
 
@@ -23,7 +26,8 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
 
     A timestep of take n becomes `first_timesteps(takes)[n]` + timestep, and the first take keeps its own. Neutral mesh
     and regions are the first take's. A camera of a later take keeps its index where the first take has the same
-    camera under it, so that exposure is corrected alike. Raises StgaError where the takes are not of one head.
+    camera under it, so that exposure is corrected alike. The frame rate is the one of all takes that have one, None
+    where they differ. Raises StgaError where the takes are not of one head.
     """
     first = takes[0]
     if len(takes) == 1:
@@ -53,6 +57,7 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
             start + timestep: faces for take, start in numbered for timestep, faces in take.given_selection.items()
         },
         warnings=tuple(dict.fromkeys(warning for take in takes for warning in take.warnings)),
+        fps=_common_rate([take.fps for take in takes if take.fps is not None]),
     )
 
 
@@ -74,6 +79,11 @@ def require_same_head(first: Capture, other: Capture) -> None:
             f"{other.root}: its neutral mesh is up to {1000 * distance:.2g} mm from that of {first.root}; "
             "a take must be of the same head, tracked with the same shape"
         )
+
+
+def _common_rate(rates: Sequence[float]) -> float | None:
+    """None where there are none, or differences of more than 1 %."""
+    return rates[0] if rates and max(rates) <= (1 + RATE_TOLERANCE) * min(rates) else None
 
 
 def _first_free_index(take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import read_json
 from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
-from .model import View
+from .model import FPS_LIMIT, View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
@@ -48,11 +48,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and the files named at the top level (None where they are missing)."""
+    """All frames of a capture by split, and what the top level says (None where it is missing): files, frame rate."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
     regions: Path | None
+    fps: float | None = None
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -85,13 +86,21 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
     names = {split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()}
     documents = {split: _document(folder / name) for split, name in (names or {"train": "transforms.json"}).items()}
     frames = {split: _read_frames(record.path, record.values, principal_point) for split, record in documents.items()}
+    rates = [frame_rate(record.path, record.values) for record in documents.values()]
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
     splits = {split: tuple(itertools.islice(numbered, len(frames.get(split, ())))) for split in SPLITS}
     return Transforms(
         splits,
         canonical_mesh=_first_path(documents.values(), "canonical_mesh_path"),
         regions=_first_path(documents.values(), "regions_path"),
+        fps=next((rate for rate in rates if rate is not None), None),
     )
+
+
+def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
+    """`fps` at the top level of a transforms file; None where it is missing. Raises StgaError naming the file."""
+    record = _Record(path, path.parent, "", values)
+    return record.number("fps", low=0, high=FPS_LIMIT) if record.has("fps") else None
 
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:

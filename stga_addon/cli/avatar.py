@@ -26,8 +26,6 @@ NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a r
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
 """Files and folders of OUT."""
 TRACKING_OPTIONS = ("footage", "model", "cameras", "landmarks", "detector", "focal", "start", "stop", "step", "offset")
-DEFAULT_FPS = 24
-"""At which the .blend file plays; videos have a rate of their own."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -145,6 +143,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     """
     from ..avatar.file import read_avatar
     from ..capture.open import open_capture
+    from ..export.playback import playback_fps
     from ..scene.avatar_scene import set_up_head, show_on_head
     from ..scene.blend_file import empty_file, save_file
     from ..tracking.folder import is_flame
@@ -154,7 +153,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     capture, avatar = open_capture(out / CAPTURE, flame), read_avatar(out / RUN / AVATAR)
     empty_file()
     head = set_up_head(refine(capture), flame)
-    show_on_head(avatar, head, f"//{RUN}/avatar.npz", DEFAULT_FPS)
+    show_on_head(avatar, head, f"//{RUN}/avatar.npz", playback_fps(capture, numbered=True))
     finish(head)
     save_file(out / BLEND)
     return Path(out / BLEND)

@@ -6,7 +6,7 @@ from ..avatar.file import Avatar
 from ..capture.model import Capture
 from ..errors import StgaError
 from ..export.formats import FORMATS, Meshes, check_suffix, export_avatar
-from ..export.playback import DEFAULT_FPS
+from ..export.playback import DEFAULT_FPS, playback_fps
 from ..requests.open_head import OpenHead
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
 from .export_web import export_web
@@ -30,7 +30,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--fps",
         type=frame_rate,
-        help=f"frames per second of usd and web (default: {DEFAULT_FPS if head is None else head.fps:g})",
+        help=f"frames per second of usd and web (default: {_default_rate(head)})",
     )
     parser.add_argument(
         "--motion-only",
@@ -40,11 +40,16 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--out", type=usable_path, required=True)
 
 
+def _default_rate(head: OpenHead | None) -> str:
+    return f"the capture's, else {DEFAULT_FPS:g}" if head is None else f"{head.fps:g}"
+
+
 def run(options: Namespace) -> None:
     _check_options(options)
-    if options.fps is None:
-        options.fps = DEFAULT_FPS if options.head is None else options.head.fps
+    if options.fps is None and options.head is not None:
+        options.fps = options.head.fps
     avatar, capture = open_avatar(options.avatar, options)
+    options.fps = playback_fps(capture, options.fps, numbered=options.format == "usd")
     source = FORMATS[options.format].source
     if options.format == "web":
         export_web(avatar, capture, options)

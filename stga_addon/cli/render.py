@@ -15,7 +15,7 @@ from ..capture.model import View
 from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..errors import StgaError
-from ..export.playback import DEFAULT_FPS
+from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.ply import read_ply
 from ..files import replacing
 from ..flame.motion import transferred_motion
@@ -57,7 +57,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--camera", type=whole_number(0), metavar="INDEX", help="camera of the video (default: the central one)"
     )
-    parser.add_argument("--fps", type=real_number, help=f"frames per second of the video (default {DEFAULT_FPS:g})")
+    parser.add_argument(
+        "--fps", type=real_number, help=f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})"
+    )
     parser.add_argument(
         "--seconds", type=real_number, metavar="S",
         help=f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
@@ -103,7 +105,7 @@ def _check_film_options(options: Namespace) -> None:
     films = turns or options.video is not None
     for name, has_effect, needed, default in (
         ("camera", films, "--video or --turntable", None),
-        ("fps", films, "--video or --turntable", DEFAULT_FPS),
+        ("fps", films, "--video or --turntable", None),
         ("seconds", turns, "--turntable", TURNTABLE_S),
     ):
         if getattr(options, name) is None:
@@ -119,12 +121,14 @@ class _Subject:
     image      view -> image (3, H, W)
     timesteps  of its motion, ascending; none where nothing moves
     center     of the head or splats at the first timestep, (3,) meters
+    fps        at which it plays
     views      of its capture
     """
 
     image: Callable[[View], np.ndarray]
     timesteps: tuple[int, ...]
     center: Callable[[], np.ndarray]
+    fps: float
     views: Sequence[View] = ()
 
 
@@ -155,12 +159,12 @@ def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
     timesteps: Sequence[int] = subject.timesteps or (0,)
     path = [start] * len(timesteps)
     if options.turntable is not None:
-        count = max(len(timesteps), round(min(options.seconds * options.fps, MAX_TURNTABLE_IMAGES)), 1)
+        count = max(len(timesteps), round(min(options.seconds * subject.fps, MAX_TURNTABLE_IMAGES)), 1)
         timesteps = to_and_fro(timesteps, count)
         cameras = _turntable(options.turntable, start, views, subject.center(), count)
         path = [replace(start, camera=camera) for camera in cameras]
     path = [replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)]
-    writer = sequence_writer(options.out) if options.video is None else video_writer(options.video, options.fps)
+    writer = sequence_writer(options.out) if options.video is None else video_writer(options.video, subject.fps)
     with writer as write:
         for view in tqdm(path, desc="Rendering", unit="image"):
             write(to_uint8(subject.image(view)))
@@ -205,6 +209,7 @@ def _subject(options: Namespace) -> _Subject:
             lambda view: render(splats, view.camera, options.background, composer=options.composer),
             (),
             lambda: np.median(splats.xyz, axis=0),
+            playback_fps(None, options.fps),
         )
     avatar, capture = open_avatar(options.source, options)
     if capture is None:
@@ -219,6 +224,7 @@ def _subject(options: Namespace) -> _Subject:
         lambda view: render_avatar(avatar, mesh(view), view.camera, options.background, options.composer),
         capture.timesteps,
         lambda: _middle(capture.mesh(capture.timesteps[0])),
+        playback_fps(capture, options.fps),
         [view for views in capture.views.values() for view in views],
     )
 
@@ -245,6 +251,7 @@ def _reenacted(options: Namespace) -> _Subject:
         lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background, options.composer),
         tuple(sequence.timesteps),
         lambda: _middle(mesh(sequence.timesteps[0])),
+        playback_fps(motion, options.fps),
     )
 
 

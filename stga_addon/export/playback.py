@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median_low
 
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.model import Capture
 
 DEFAULT_FPS = 25.0
 MAX_VIEWS = 32
@@ -30,3 +32,17 @@ class Playback:
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     selection: Sequence[np.ndarray] | None = None
     motion_only: bool = False
+
+
+def playback_fps(capture: Capture | None, given: float | None = None, numbered: bool = False) -> float:
+    """Poses per second at which a capture plays: the given ones, else those of its recording, else `DEFAULT_FPS`.
+
+    numbered: poses are shown at the numbers of their timesteps, as in Blender and USD. Otherwise one follows the other,
+    so that every third frame of a recording plays at a third of its rate.
+    """
+    if given is not None:
+        return given
+    if capture is None or capture.fps is None:
+        return DEFAULT_FPS
+    gaps = np.diff(capture.timesteps).tolist()
+    return capture.fps if numbered or not gaps else capture.fps / median_low(gaps)

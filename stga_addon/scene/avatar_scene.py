@@ -24,7 +24,7 @@ def set_up_head(capture: Capture, flame: Path | None) -> Any:
     return head
 
 
-def show_on_head(avatar: Avatar, head: Any, link: str, fps: int) -> Any:
+def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     """Show the avatar in place of the mesh, with every viewport on it; returns the splats.
 
     link: the avatar's file, relative to the .blend file; fps: frames per second at which the scene plays.

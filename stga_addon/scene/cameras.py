@@ -14,6 +14,7 @@ from ..errors import StgaError
 from . import compat, tags
 from .animation import write_curve
 from .objects import Warn, log_warning, place, remove
+from .timeline import set_frames_per_second
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # meters
@@ -41,9 +42,9 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
 def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_warning) -> None:
     """Make `scene` render the images of `camera`, one of `import_cameras`'.
 
-    Sets the active camera, the resolution, the pixel aspect, the frame range (the capture's timesteps) and the view
-    transform: splat colors are trained in sRGB, so it has to be Standard. `warn` reports cameras whose images have
-    another size, since a Blender scene has only one.
+    Sets the active camera, the resolution, the pixel aspect, the frame range (the capture's timesteps), the frame rate
+    where the capture has one, and the view transform: splat colors are trained in sRGB, so it has to be Standard.
+    `warn` reports cameras whose images have another size, since a Blender scene has only one.
     """
     if camera.get(tags.KIND) != tags.CAMERA:
         raise StgaError(f"{camera.name}: is not a camera imported from a capture")
@@ -55,6 +56,8 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
     render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, 1.0 / aspect), max(1.0, aspect)
     if capture.timesteps:
         scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
+    if capture.fps is not None:
+        set_frames_per_second(scene, capture.fps)
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
     for other in tags.find(tags.CAMERA, capture.root):

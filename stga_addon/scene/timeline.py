@@ -11,6 +11,12 @@ def frames_per_second(scene: Any) -> float:
     return float(scene.render.fps / scene.render.fps_base)
 
 
+def set_frames_per_second(scene: Any, rate: float) -> None:
+    """Let the scene play at the rate; Blender holds a whole number and a divisor, such as 30 and 1.001."""
+    whole = max(1, round(rate))
+    scene.render.fps, scene.render.fps_base = whole, whole / rate
+
+
 def go_to_frame(frame: int) -> None:
     """Move the open scene to a frame and evaluate it."""
     bpy.context.scene.frame_set(frame)

@@ -10,6 +10,7 @@ from mathutils import Vector
 from .arrays import evaluated_vertices
 from .compat import enable_nodes
 from .objects import COLLECTIONS, show_kind
+from .timeline import set_frames_per_second
 
 DISTANCE = 2.2
 """From the viewport's eye to the head's center, in radii of the sphere around its bounding box."""
@@ -35,12 +36,12 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_location, region.view_distance = center, DISTANCE * radius
 
 
-def frame_alone(head: Any, scene: Any, frames_per_second: int) -> None:
+def frame_alone(head: Any, scene: Any, frames_per_second: float) -> None:
     """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head.
 
     The world is white, the background of captures without one of their own.
     """
-    scene.render.fps = frames_per_second
+    set_frames_per_second(scene, frames_per_second)
     scene.world = bpy.data.worlds.new("World")
     enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
     for kind in COLLECTIONS:

@@ -40,7 +40,9 @@ def write_capture(
         entry["flame_param_path" if folder[1] == "npz" else "mesh_path"] = f"{folder[0]}/{timestep:05d}.{folder[1]}"
         frames["val" if camera.name == held_out else "train"].append(entry)
         report("Images", number + 1, len(views))
-    top = _write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)
+    top: dict[str, Any] = {**_write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)}
+    if footage.fps is not None:
+        top["fps"] = footage.fps
     for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):  # train last: see is_written
         write_json(out / name, {**top, "frames": entries})
 

@@ -20,6 +20,7 @@ from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.cameras import central, configure_scene, import_cameras  # noqa: E402
 from stga_addon.scene.objects import capture_root, collection_of, layers_of, show_kind  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
+from stga_addon.scene.timeline import frames_per_second  # noqa: E402
 
 from .captures import mesh_capture  # noqa: E402
 
@@ -93,6 +94,16 @@ def test_projection_equals_the_capture_s(tmp_path, width, height, fl_y):
     (imported,) = import_cameras(capture, capture_root(tmp_path))
     configure_scene(bpy.context.scene, capture, imported)
     assert_projects(imported, one)
+
+
+@pytest.mark.parametrize("fps", [None, 60.0, 30000 / 1001, 12.5, 0.4])
+def test_the_scene_plays_at_the_rate_of_the_capture(tmp_path, fps):
+    """Catches footage of 60 frames a second that plays 2.5 times too slowly, and rates rounded to whole numbers."""
+    capture = replace(capture_of(tmp_path, {0: [camera(1)]}), fps=fps)
+    (imported,) = import_cameras(capture, capture_root(tmp_path))
+    bpy.context.scene.render.fps, bpy.context.scene.render.fps_base = 24, 1.0
+    configure_scene(bpy.context.scene, capture, imported)
+    assert frames_per_second(bpy.context.scene) == pytest.approx(fps or 24, rel=1e-6)
 
 
 def test_a_moving_camera_is_keyframed(tmp_path):

@@ -168,3 +168,12 @@ print(peak() - before)
 """
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert float(run.stdout) < 600  # decoded by Pillow, as an array, and blended: 10 bytes a pixel
+
+
+@pytest.mark.parametrize("value", [0, -25, 1000, float("inf"), float("nan"), True, "60", [60]])
+def test_impossible_frame_rate(tmp_path, value):
+    """Catches a rate at which nothing plays, which fails as late as in an export."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    factory.edit(root / "transforms_val.json", lambda document: document.update(fps=value))
+    with pytest.raises(StgaError, match=r"transforms_val\.json: (fps: expected a finite number|is not valid JSON)"):
+        open_capture(root)

@@ -526,3 +526,16 @@ def test_a_flame_model_in_the_captures_folder(tmp_path: Path) -> None:
     np.testing.assert_array_equal(capture.mesh(0), open_capture(root, model_file).mesh(0))
     own.write_bytes(b"")
     assert open_capture(root, model_file).flame_file == model_file
+
+
+def test_frame_rate(tmp_path: Path) -> None:
+    """Catches a rate that is lost in one of the layouts, or made up where none is written."""
+    mesh = factory.write_mesh_capture(tmp_path / "mesh")
+    flame, model = factory.write_flame_capture(tmp_path / "flame")
+    release = factory.write_release(tmp_path / "release")
+    for root in (mesh, flame, release):
+        assert open_capture(root, model).fps is None
+        assert "frame rate" not in dict(summarize_capture(open_capture(root, model)))
+        factory.edit(root / "transforms_train.json", lambda document: document.update(fps=59.94))
+        assert open_capture(root, model).fps == 59.94
+        assert dict(summarize_capture(open_capture(root, model)))["frame rate"] == "59.94 frames per second"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture, write_mesh_capture
+from capture.factory import edit, write_flame_capture, write_mesh_capture
 from export.web.web_data import read_web_data
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -35,6 +35,17 @@ def test_frames_cameras_and_selection_of_a_capture(avatar_file, tmp_path):
     assert len(arrays["pose"]) == len(arrays["selection"]) == frames
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     assert {view["name"] for view in header["views"]} == {f"Camera {index}" for index in cameras}
+
+
+def test_the_captures_own_rate(avatar_file, tmp_path):
+    """Catches footage of 60 frames a second that plays 2.4 times too slowly."""
+    edit(tmp_path / "capture/transforms_train.json", lambda document: document.update(fps=60))
+    words = ["--capture", str(tmp_path / "capture"), "--out"]
+    assert main(["export", str(avatar_file), "--format", "web", *words, str(tmp_path / "a.stga")]) == 0
+    assert read_web_data((tmp_path / "a.stga").read_bytes())[0]["fps"] == 60
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    assert main(["export", str(avatar_file), "--format", "usd", *words, str(tmp_path / "a.usdc")]) == 0
+    assert usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
 
 
 def test_a_run_brings_its_capture(tmp_path):

@@ -57,6 +57,14 @@ def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
         assert errors[timestep] < 12  # colors at half the resolution: splats are a few pixels wide
 
 
+def test_video_at_the_rate_of_the_footage(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Catches footage of 60 frames a second that plays 2.4 times too slowly."""
+    assert render(parts, "--video", tmp_path / "unknown.mp4") == 0
+    factory.edit(parts["capture"] / "transforms_train.json", lambda document: document.update(fps=60))
+    assert render(parts, "--video", tmp_path / "known.mp4") == 0
+    assert [decoded(tmp_path / name)[0] for name in ("unknown.mp4", "known.mp4")] == [25, 60]
+
+
 def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches a turn about another point, one that leaves out a part of the circle, and motion that does not play."""
     out = tmp_path / "turn"

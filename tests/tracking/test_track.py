@@ -13,7 +13,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
-from stga_addon.files import read_json, write_json, write_npz
+from stga_addon.export.playback import playback_fps
+from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.folder import PLACES_FILE
@@ -111,6 +112,23 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
     np.testing.assert_allclose(written, capture.mesh(1), atol=2e-6)
     assert read_json(folder / "out/tracking.json")["interpolated"] == [2]
     assert (folder / "out/contact_sheet.png").is_file()
+
+
+@pytest.mark.parametrize("fps", [None, 60000 / 1001])
+def test_frame_rate_of_the_footage(recorded, fps):
+    """Catches a rate that is read and thrown away, or that a step of the frames makes another one."""
+    folder, _ = recorded
+    for path in (folder / "points").glob("cam*.npz"):
+        write_npz(path, {name: array[::3] for name, array in read_npz(path).items()})
+    transforms = folder / "footage/transforms.json"
+    write_json(transforms, {**read_json(transforms), "fps": fps})
+    footage = open_footage(folder / "footage", frames=FrameRange(0, None, 3))
+    assert footage.fps == fps
+    track(footage, folder / "head.npz", folder / "out", folder / "points")
+    capture = open_capture(folder / "out", folder / "head.npz")
+    assert capture.timesteps == (0, 3)
+    assert capture.fps == fps
+    assert playback_fps(capture) == pytest.approx(25 if fps is None else 20000 / 1001)
 
 
 @pytest.mark.parametrize("offset", ["cam0", "cam0=soon", "=", "cam0=1.5"])

@@ -79,7 +79,8 @@ class Footage:
     """What was filmed: cameras with unique names, in the order of the calibration.
 
     timesteps   all that any camera has a frame of, ascending
-    fps         frames per second of the videos; None for images
+    fps         frames per second of the videos, the average where it varies; None where not known, as for most images.
+                Timesteps are numbers of frames
     calibrated  False for one camera whose focal length is a guess, not read from a file or given
     warnings    one sentence each
     """

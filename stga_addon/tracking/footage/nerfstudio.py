@@ -1,10 +1,11 @@
 """Cameras of nerfstudio, instant-ngp and VHAP: `transforms.json`, with lens distortion."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...capture.transforms import Frame, inside, read_transforms
+from ...capture.transforms import Frame, frame_rate, inside, read_transforms
 from ...errors import StgaError, shorten
 from ...files import read_json
 from .lens import Lens
@@ -29,7 +30,11 @@ def read_nerfstudio(path: Path, principal_point: str | None = None) -> list[Shot
     frames = read_transforms(path, principal_point or ("vhap" if timed else "opencv"))
     timed = timed or any("keyframe" in entry for entry in entries)
     folder = path.parent.resolve()
-    return [_shot(folder, frame, {**values, **entry}, timed) for frame, entry in zip(frames, entries, strict=True)]
+    fps = frame_rate(path, values)
+    return [
+        replace(_shot(folder, frame, {**values, **entry}, timed), fps=fps)
+        for frame, entry in zip(frames, entries, strict=True)
+    ]
 
 
 def _shot(folder: Path, frame: Frame, values: dict[str, Any], timed: bool) -> Shot:

@@ -17,7 +17,15 @@ from .calibrations import EXPECTED, find_calibration, read_calibration
 from .image_frames import ImageFrames
 from .lens import Lens
 from .model import Footage, FootageCamera, Frames
-from .sequences import FrameRange, Sequence, frames_per_second, open_sequence, sequence_size, synchronized
+from .sequences import (
+    FrameRange,
+    Sequence,
+    frames_per_second,
+    open_sequence,
+    recorded_size,
+    sequence_size,
+    synchronized,
+)
 from .shots import Shot
 from .sources import Sources, find_sources, sequence_files, sequence_names, still_image
 from .undistort import undistortion
@@ -56,11 +64,12 @@ def open_footage(
         raise StgaError(f"{calibration}: lists images, which offsets do not apply to; expected none")
     if timed:
         found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
-        return _footage(root, found, warnings=warnings)
+        return _footage(root, found, next((shot.fps for shot in shots if shot.fps is not None), None), warnings)
     if any(names):
         rig = _by_name(shots, names, root)
         sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
-        return replace(_rig(root, sources, sequences, rig, frames), warnings=warnings)
+        footage = _rig(root, sources, sequences, rig, frames)
+        return replace(footage, warnings=(*warnings, *footage.warnings))
     return _footage(root, _listed_cameras(_with_stills(shots, sources), calibration), warnings=warnings)
 
 
@@ -102,7 +111,8 @@ def _rig(
 ) -> Footage:
     fps = frames_per_second(sequences)
     recorded = synchronized(sequences, shots, sources, frames)
-    return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps)
+    warnings = tuple(warning for s in sequences.values() if isinstance(s, video.Video) for warning in s.warnings)
+    return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps, warnings)
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
@@ -157,7 +167,7 @@ def _image_size(sources: Sources, label: str) -> tuple[int, int]:
     """Size of the images of a label; for calibrations that do not hold it."""
     name = sequence_names(sources, [label])[0]
     if name is not None:
-        return sequence_size(open_sequence(sequence_files(sources, name)))
+        return recorded_size(sequence_files(sources, name))
     return image_size(still_image(sources, label, f"camera {label}"))
 
 

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...capture.images import image_size
-from ...capture.model import View
+from ...capture.model import FPS_LIMIT, View
 from ...errors import StgaError
 from .image_frames import ImageFrames
 from .model import Frames
 from .shots import Shot
 from .sources import Sources, frame_number
-from .video import Video, VideoFrames, read_video
+from .video import Video, VideoFrames, read_video, video_size
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,19 @@ def open_sequence(files: Path | list[Path]) -> Sequence:
     return read_video(files) if isinstance(files, Path) else files
 
 
+def recorded_size(files: Path | list[Path]) -> tuple[int, int]:
+    """(width, height) of the first frame, without an index of the video. Raises StgaError as `open_sequence` does."""
+    return video_size(files) if isinstance(files, Path) else image_size(files[0])
+
+
 def sequence_size(sequence: Sequence) -> tuple[int, int]:
     """(width, height) of the first frame. Raises StgaError where it is no image."""
     return sequence.size if isinstance(sequence, Video) else image_size(sequence[0])
 
 
 def frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
-    """Of the videos; None where there are none. Raises StgaError for videos of different rates."""
-    rates = {name: s.fps for name, s in sequences.items() if isinstance(s, Video)}
+    """Of the videos; None where none says a plausible one. Raises StgaError for videos of different rates."""
+    rates = {name: s.fps for name, s in sequences.items() if isinstance(s, Video) and 0 < s.fps < FPS_LIMIT}
     first = next(iter(rates), None)
     for name, rate in rates.items():
         if first is not None and abs(rate - rates[first]) > 0.01 * rates[first]:

@@ -17,6 +17,7 @@ class Shot:
     image     the image, where the file says that it is a frame of the footage; then with its timestep
     mask      its foreground mask
     camera_name  what the file calls the camera of several images
+    fps       frames per second that the file states, whose numbers the timesteps are
     """
 
     label: str
@@ -27,3 +28,4 @@ class Shot:
     timestep: int | None = None
     mask: Path | None = None
     camera_name: str | None = None
+    fps: float | None = None

@@ -1,6 +1,8 @@
 """Frames of one camera that are in a video, decoded with PyAV."""
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,39 +16,72 @@ SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf")
 MIN_HD_LINES = 720
 """From here on, videos without a stated color matrix are in that of HD (BT.709)."""
 
+TIMED_CONTAINERS = ("mov", "matroska")
+"""FFmpeg's names of containers that store when each packet is shown."""
+SEEKABLE_CONTAINERS = (*TIMED_CONTAINERS, "mpegts")
+"""Containers in which a frame has the same presentation time after a seek as in order."""
+CODECS_WITH_HIDDEN_PACKETS = ("vp8",)
+"""Whose reference frames that are not shown are packets of their own."""
+
+CHECKED_FRAMES = 8
+"""Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
 """Frames that are decoded to reach a later one; further ahead, the key frame before it is sought."""
+SEEK_BACK_FRAMES = (0, 16, 64, 256)
+"""How far before a frame a seek is tried, one after the other, before all is decoded from the beginning."""
+RATE_TOLERANCE = 0.01
+"""Relative difference up to which a stated frame rate is that of the frames' times."""
+VARIABLE_RATE_FACTOR = 1.5
+"""A frame that lasts this many times the median makes the rate a variable one."""
 
 
 @dataclass(frozen=True)
 class Video:
     """What a video holds.
 
-    times     presentation times of its frames, ascending, in the stream's time base
+    times     presentation times of the frames that are shown, ascending, in the stream's time base; their numbers where
+              the file holds no reliable times
+    fps       frames per second, the average where it varies; 0 where unknown
     size      (width, height) as displayed
+    seekable  whether a frame is recognized by its time; False: frames are counted from the beginning
+    warnings  one sentence each
     """
 
     path: Path
     times: tuple[int, ...]
     fps: float
     size: tuple[int, int]
+    seekable: bool = True
+    warnings: tuple[str, ...] = ()
 
 
 def read_video(path: Path) -> Video:
-    """Index a video; only its first frame is decoded. Raises StgaError where it cannot be read, or without PyAV."""
-    av = _pyav(path)
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            times = tuple(sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None))
-            fps = float(stream.average_rate or stream.guessed_rate or 0)
-            container.seek(min(times, default=0), stream=stream)
-            height, width = _pixels(next(container.decode(stream))).shape[:2]
-    except (av.FFmpegError, StopIteration, IndexError, ValueError) as error:
-        raise StgaError(f"{path}: is not a readable video ({error or type(error).__name__})") from error
-    if not is_image_size(width, height):
-        raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
-    return Video(path, times, fps, (width, height))
+    """Index a video. Raises StgaError where it cannot be read, or without PyAV.
+
+    Where the container says when packets are shown, only the first frames are decoded; otherwise, all are.
+    """
+    size, first = _first_frames(path)
+    times: Sequence[int | None] | None = _packet_times(path)
+    left_out = 0 if times is None or first[0] not in times else times.index(first[0])
+    if times is None or times[left_out : left_out + len(first)] != first:
+        times, left_out = _decoded_times(path), 0
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        seekable = _ascending(times) and (_is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream))
+        rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
+        time_base = float(stream.time_base)
+    if not seekable:
+        return Video(path, tuple(range(len(times))), next(iter(rates), 0.0), size, seekable=False)
+    shown = tuple(time for time in times[left_out:] if time is not None)
+    warnings = _rate_warnings(path, shown, time_base)
+    if left_out:
+        warnings += (f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",)
+    return Video(path, shown, _frame_rate(shown, time_base, rates), size, warnings=warnings)
+
+
+def video_size(path: Path) -> tuple[int, int]:
+    """(width, height) as displayed. Raises StgaError as `read_video` does."""
+    return _first_frames(path)[0]
 
 
 class VideoFrames:
@@ -55,7 +90,7 @@ class VideoFrames:
     def __init__(self, video: Video, numbers: Mapping[int, int]) -> None:
         self.video, self.numbers = video, numbers
         self._container: Any = None
-        self._decoder: Any = None
+        self._decoder: Iterator[Any] | None = None
         self._decoded = -1
         """Number of the frame that was decoded last."""
 
@@ -68,9 +103,9 @@ class VideoFrames:
         av = _pyav(self.video.path)
         try:
             pixels = _pixels(self._frame(number))
-        except (av.FFmpegError, StopIteration, ValueError) as error:
+        except (av.FFmpegError, ValueError) as error:
             self.close()
-            raise StgaError(f"{self.source(timestep)}: cannot be decoded ({error or type(error).__name__})") from error
+            raise StgaError(f"{self.source(timestep)}: cannot be decoded ({_reason(error)})") from error
         if timestep == self.timesteps[-1]:
             self.close()  # a decoder holds dozens of frames, and a rig has dozens of cameras
         return pixels
@@ -91,18 +126,174 @@ class VideoFrames:
         self._container, self._decoder, self._decoded = None, None, -1
 
     def _frame(self, number: int) -> Any:
-        """The frame, decoded on from the last one, or from the key frame before it."""
+        """The frame, decoded on from the last one, from a key frame before it, or from the beginning.
+
+        Raises ValueError where the decoder gives no frame of that time.
+        """
+        from av.error import InvalidDataError
+
+        failure = None
+        for decoder in self._decoders(number):
+            self._decoder = decoder
+            try:
+                frame = self._reached(number)
+            except InvalidDataError as error:
+                frame, failure = None, error
+            if frame is not None:
+                self._decoded = number
+                return frame
+        raise failure or ValueError("the decoder gives no picture for it; the file may be damaged")
+
+    def _decoders(self, number: int) -> Iterator[Iterator[Any]]:
+        """Decoders before the frame, the nearest first."""
+        from av.error import FFmpegError
+
+        seekable = self.video.seekable
+        if self._decoder is not None and 0 < number - self._decoded <= (MAX_FRAMES_AHEAD if seekable else number + 1):
+            yield self._decoder
+        for back in SEEK_BACK_FRAMES if seekable else ():
+            if number - back > 0:
+                self._open()
+                stream = self._container.streams.video[0]
+                try:
+                    self._container.seek(self.video.times[number - back], stream=stream)
+                except FFmpegError:
+                    break
+                yield _from_key_frame(self._container.decode(stream), self.video.times[number])
+        self.close()
+        self._open()
+        yield _decoded_frames(self._container)
+
+    def _reached(self, number: int) -> Any:
+        """The frame of that number, None where the decoder is already past it or at the end."""
+        assert self._decoder is not None
+        if not self.video.seekable:
+            return next(itertools.islice(self._decoder, number - self._decoded - 1, None), None)
+        time = self.video.times[number]
+        frame = next((frame for frame in self._decoder if frame.pts is not None and frame.pts >= time), None)
+        return frame if frame is not None and frame.pts == time else None
+
+    def _open(self) -> None:
         if self._container is None:
             self._container = _pyav(self.video.path).open(str(self.video.path))
             self._container.streams.video[0].thread_type = "AUTO"
-        time = self.video.times[number]
-        if self._decoder is None or not 0 < number - self._decoded <= MAX_FRAMES_AHEAD:
-            stream = self._container.streams.video[0]
-            self._container.seek(time, stream=stream)
-            self._decoder = self._container.decode(stream)
-        frame = next(frame for frame in self._decoder if frame.pts is not None and frame.pts >= time)
-        self._decoded = number
-        return frame
+
+
+def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
+    """Size (width, height) as displayed and times of the first frames in the order shown. Raises StgaError."""
+    with _opened(path) as container:
+        frames = _decoded_frames(container)
+        first = next(frames, None)
+        if first is None:
+            raise ValueError("none of its frames can be decoded")
+        height, width = _pixels(first).shape[:2]
+        times = [first.pts, *(frame.pts for frame in itertools.islice(frames, CHECKED_FRAMES - 1))]
+    if not is_image_size(width, height):
+        raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
+    return (width, height), times
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A container that has a video stream. Raises StgaError for what fails while it is open."""
+    av = _pyav(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise ValueError("it has no video stream")
+            yield container
+    except (av.FFmpegError, ValueError) as error:
+        raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
+
+
+def _packet_times(path: Path) -> list[int] | None:
+    """When packets are shown, ascending; None where they do not say it, so that all frames must be decoded.
+
+    Packets that an edit list hides are decoded, but not shown.
+    """
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        timed = _is_of(container, TIMED_CONTAINERS) and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
+        if not (timed or _is_intra_only(stream)):
+            return None
+        packets = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
+    times = sorted(time for time in packets if time is not None)
+    return times if len(times) == len(packets) and _ascending(times) else None
+
+
+def _decoded_times(path: Path) -> Sequence[int | None]:
+    """Times of all frames in the order shown."""
+    with _opened(path) as container:
+        container.streams.video[0].thread_type = "AUTO"
+        return [frame.pts for frame in _decoded_frames(container)]
+
+
+def _decoded_frames(container: Any) -> Iterator[Any]:
+    """All frames from the beginning; a transport stream may begin with packets that cannot be decoded."""
+    from av.error import InvalidDataError
+
+    stream, may_fail = container.streams.video[0], _is_of(container, ("mpegts",))
+    for packet in container.demux(stream):
+        try:
+            frames = packet.decode()
+        except InvalidDataError:
+            if not may_fail:
+                raise
+            continue
+        may_fail = may_fail and not frames
+        yield from frames
+
+
+def _from_key_frame(frames: Iterator[Any], time: int) -> Iterator[Any]:
+    """The frames from the first key frame on, because those shown before it may refer to frames before the seek.
+
+    No frames where the key frame is later than `time`.
+    """
+    for frame in frames:
+        if frame.key_frame:
+            yield frame
+            yield from frames
+        elif frame.pts is not None and frame.pts >= time:
+            return
+
+
+def _ascending(times: Sequence[int | None]) -> bool:
+    return None not in times and all(a < b for a, b in itertools.pairwise(times))  # type: ignore[operator]
+
+
+def _is_of(container: Any, formats: Sequence[str]) -> bool:
+    return not set(formats).isdisjoint(container.format.name.split(","))
+
+
+def _is_intra_only(stream: Any) -> bool:
+    return bool(stream.codec_context.codec.intra_only)
+
+
+def _frame_rate(times: Sequence[int], time_base: float, rates: list[float]) -> float:
+    """The first of the stated rates that the frames' times agree with, else the average of the times.
+
+    What a file states also counts frames that are hidden.
+    """
+    if len(times) < 2:
+        return next(iter(rates), 0.0)
+    measured = (len(times) - 1) / ((times[-1] - times[0]) * time_base)
+    return next((rate for rate in rates if abs(rate - measured) <= RATE_TOLERANCE * measured), measured)
+
+
+def _rate_warnings(path: Path, times: Sequence[int], time_base: float) -> tuple[str, ...]:
+    durations = np.diff(times)
+    if not len(durations) or durations.max() <= VARIABLE_RATE_FACTOR * np.median(durations):
+        return ()
+    low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
+    average = 1 / (time_base * float(durations.mean()))
+    return (
+        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); it is played at the average of "
+        f"{average:.4g} frames per second",
+    )
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
 def _pixels(frame: Any) -> np.ndarray:

@@ -1,0 +1,218 @@
+"""Every frame of a video by its number, whatever the container and codec."""
+
+import random
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.tracking.footage.open import open_footage
+
+av = pytest.importorskip("av")
+
+BLOCK, COLUMNS, ROWS = 16, 6, 4
+FRAMES = 75
+X264 = {"bf": "3", "b_strategy": "0", "g": "12", "keyint_min": "12", "sc_threshold": "0", "crf": "12"}
+OPEN_X264 = X264 | {"x264-params": "open-gop=1:b-adapt=0"}
+OPEN_X265 = {"x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:log-level=0"}
+MPEG4 = {"g": "12", "bf": "2", "b": "4000000"}
+
+VIDEOS = {
+    "H.264 with B-frames": ("a.mp4", "libx264", X264),
+    "H.264, open GOP": ("a.mp4", "libx264", OPEN_X264),
+    "H.264 in a transport stream": ("a.mts", "libx264", X264),
+    "H.264 in a transport stream, open GOP": ("a.mts", "libx264", OPEN_X264),
+    "H.264 in AVI": ("a.avi", "libx264", X264),
+    "H.264 in Matroska": ("a.mkv", "libx264", X264),
+    "HEVC, open GOP": ("a.mov", "libx265", OPEN_X265),
+    "HEVC in a transport stream, open GOP": ("a.mts", "libx265", OPEN_X265),
+    "MPEG-4 with B-frames in AVI": ("a.avi", "mpeg4", MPEG4),
+    "MPEG-4 with B-frames in Matroska": ("a.mkv", "mpeg4", MPEG4),
+    "MPEG-2 in a transport stream": ("a.mts", "mpeg2video", MPEG4),
+    "MPEG-2 in MXF": ("a.mxf", "mpeg2video", MPEG4),
+    "Motion JPEG in AVI": ("a.avi", "mjpeg", {"qmin": "2", "qmax": "3"}),
+    "VP9": ("a.webm", "libvpx-vp9", {"g": "12", "b": "2000000", "cpu-used": "8", "deadline": "realtime"}),
+    "VP8 with hidden reference frames": (
+        "a.webm", "libvpx", {"g": "40", "b": "2000000", "auto-alt-ref": "1", "lag-in-frames": "10", "cpu-used": "4"},
+    ),
+}  # fmt: skip
+
+
+def picture(number):
+    """A frame that shows its number in blocks, one a bit, with the inverse in the lower half."""
+    bits = (number >> np.arange(COLUMNS * ROWS // 2)) & 1
+    blocks = np.concatenate([bits, 1 - bits]).reshape(ROWS, COLUMNS)
+    gray = np.kron(60 + 130 * blocks, np.ones((BLOCK, BLOCK))).astype(np.uint8)
+    return np.repeat(gray[..., None], 3, axis=2)
+
+
+def shown(image):
+    """The number that a picture shows; fails for one mixed of several or damaged."""
+    gray = image.astype(float).mean(axis=2).reshape(ROWS, BLOCK, COLUMNS, BLOCK).swapaxes(1, 2)
+    levels = gray[:, :, 3:-3, 3:-3].mean(axis=(2, 3)).ravel()
+    bits = levels > 125
+    assert np.abs(levels - np.where(bits, 190, 60)).max() < 25, levels.round()
+    first, second = np.split(bits, 2)
+    np.testing.assert_array_equal(first, ~second)
+    return int((first << np.arange(len(first))).sum())
+
+
+def write_numbered(path, codec, options, frames=FRAMES, rate=25, durations=None):
+    """A video of numbered pictures; durations: of each frame, in frames of `rate`."""
+    if codec not in av.codecs_available:
+        pytest.skip(f"this PyAV lacks {codec}")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate, options=dict(options))
+        stream.width, stream.height = COLUMNS * BLOCK, ROWS * BLOCK
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        if codec == "mpeg4" or codec == "mpeg2video":
+            stream.codec_context.max_b_frames = int(options["bf"])
+        for number in range(frames):
+            frame = av.VideoFrame.from_ndarray(picture(number), format="rgb24")
+            if durations is not None:
+                frame.pts = sum(durations[:number])
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def copy_packets(source, path, shift=0, first=0, last=None):
+    """Copy the packets from number `first` to before `last`, in the order of decoding, `shift` frames earlier."""
+    with av.open(str(source)) as container, av.open(str(path), "w") as out:
+        stream = container.streams.video[0]
+        copied = out.add_stream_from_template(stream)
+        per_frame = int(1 / (stream.average_rate * stream.time_base))
+        packets = [packet for packet in container.demux(stream) if packet.size]
+        for packet in packets[first:last]:
+            packet.pts -= shift * per_frame
+            packet.dts -= shift * per_frame
+            packet.stream = copied
+            out.mux(packet)
+
+
+def orders(count):
+    shuffled = list(range(count))
+    random.Random(1).shuffle(shuffled)
+    return {
+        "in order": list(range(count)),
+        "every third": list(range(0, count, 3)),
+        "shuffled": shuffled,
+        "last first": [count - 1, 0, count - 1, *range(count - 2, -1, -7)],
+    }
+
+
+def assert_numbers(path, expected):
+    """Each frame, however it is reached, is the picture of its number."""
+    camera = open_footage(path).cameras[0]
+    assert camera.timesteps == tuple(range(len(expected)))
+    for name, order in orders(len(expected)).items():
+        camera = open_footage(path).cameras[0]
+        found = [shown(camera.image(number)) for number in order]
+        assert found == [expected[number] for number in order], name
+    for number in range(0, len(expected), 11):
+        camera = open_footage(path).cameras[0]
+        assert shown(camera.image(number)) == expected[number], f"alone: {number}"
+
+
+@pytest.mark.parametrize("kind", VIDEOS)
+def test_frames_by_their_number(tmp_path, kind):
+    """Catches frames that are shifted, shown twice or missing, in order or after a jump."""
+    name, codec, options = VIDEOS[kind]
+    write_numbered(tmp_path / name, codec, options)
+    assert_numbers(tmp_path / name, list(range(FRAMES)))
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+@pytest.mark.parametrize("suffix", [".mp4", ".mov"])
+def test_frames_hidden_by_an_edit_list(tmp_path, codec, suffix):
+    """Catches a video that was trimmed without encoding, whose hidden frames are counted."""
+    write_numbered(tmp_path / "whole.mp4", codec, X264 if codec == "libx264" else OPEN_X265)
+    (tmp_path / "take").mkdir()
+    path = tmp_path / f"take/a{suffix}"
+    copy_packets(tmp_path / "whole.mp4", path, shift=7)
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    assert any(packet.is_discard for packet in packets)
+    assert_numbers(path, list(range(7, FRAMES)))
+
+
+@pytest.mark.parametrize(
+    ("codec", "options", "name"),
+    [
+        ("libx265", OPEN_X265, "a.mov"),
+        ("libx265", OPEN_X265, "a.mkv"),
+        ("libx265", OPEN_X265, "a.mts"),
+        ("libx264", OPEN_X264, "a.mts"),
+    ],
+)
+def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
+    """Catches pictures counted whose references were cut away, and frames shown in their place."""
+    whole = tmp_path / f"whole{name[1:]}"
+    write_numbered(whole, codec, options)
+    with av.open(str(whole)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    second = [n for n, packet in enumerate(packets) if packet.is_keyframe][1]
+    (tmp_path / "take").mkdir()
+    copy_packets(whole, tmp_path / "take" / name, first=second)
+    footage = open_footage(tmp_path / "take" / name)
+    start = shown(footage.cameras[0].image(0))
+    if name == "a.mkv":
+        assert footage.warnings[0].endswith(
+            "a.mkv: its first 3 frames cannot be decoded; they are left out, and not counted"
+        )
+    assert_numbers(tmp_path / "take" / name, list(range(start, FRAMES)))
+
+
+def test_variable_frame_rate(tmp_path):
+    """Catches a rate stated as constant where frames were dropped, and times that repeat a frame's number."""
+    durations = [1, 1, 1, 2, 1, 3] * 10
+    write_numbered(tmp_path / "a.mkv", "libx264", X264, len(durations), rate=50, durations=durations)
+    footage = open_footage(tmp_path)
+    (warning,) = footage.warnings
+    assert "a.mkv: has a variable frame rate (frames last 20 to 60 ms)" in warning
+    assert footage.fps == pytest.approx(50 * 6 / 9, rel=0.03)
+    assert_numbers(tmp_path / "a.mkv", list(range(len(durations))))
+
+
+@pytest.mark.parametrize(("name", "rate"), [("a.mp4", 60), ("a.mkv", 30), ("a.mts", 50), ("a.avi", 25)])
+def test_constant_frame_rate(tmp_path, name, rate):
+    """Catches times rounded to milliseconds taken for a variable rate, and hidden frames counted into the rate."""
+    write_numbered(tmp_path / name, "libx264", X264, rate=rate)
+    footage = open_footage(tmp_path / name)
+    assert (footage.fps, footage.warnings) == (rate, ())
+    if name == "a.mp4":
+        copy_packets(tmp_path / name, tmp_path / "trimmed.mp4", shift=9)
+        footage = open_footage(tmp_path / "trimmed.mp4")
+        assert (footage.fps, footage.warnings) == (rate, ())
+
+
+def test_frame_that_the_decoder_leaves_out(tmp_path):
+    """Catches the next frame shown in place of a damaged one, and a message without a reason."""
+    path = tmp_path / "a.mov"
+    write_numbered(path, "libx265", OPEN_X265)
+    with av.open(str(path)) as container:
+        packets = sorted((p for p in container.demux(video=0) if p.size), key=lambda packet: packet.pts)
+        begin, end = packets[41].pos, packets[41].pos + packets[41].size
+    data = bytearray(path.read_bytes())
+    while begin < end:
+        data[begin + 4] = 38 << 1  # makes filler data of the unit, which decoders pass over
+        begin += 4 + int.from_bytes(data[begin : begin + 4], "big")
+    path.write_bytes(data)
+    camera = open_footage(path).cameras[0]
+    assert shown(camera.image(40)) == 40
+    for before in (40, 70):  # in order, and by a seek
+        camera.image(before)
+        with pytest.raises(StgaError, match=r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"):
+            camera.image(41)
+    assert shown(camera.image(50)) == 50
+
+
+def test_without_pictures(tmp_path):
+    """Catches a message that names an exception instead of what is missing."""
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(StgaError, match=r"a.mkv: is not a readable video \(it has no video stream\)"):
+        open_footage(tmp_path)
