@@ -2,12 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from ..capture.camera import Camera
+from ..errors import StgaError
 
 DEFAULT_FPS = 25.0
+MIN_FPS, MAX_FPS = 0.01, 1000.0
+"""Frame rates that videos, USD files and the web player (player/data.js) take."""
 MAX_VIEWS = 32
 """Cameras that a page offers."""
 
@@ -30,3 +34,9 @@ class Playback:
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     selection: Sequence[np.ndarray] | None = None
     motion_only: bool = False
+
+
+def check_rate(path: Path, fps: float) -> None:
+    """Raise StgaError where `fps` is not from MIN_FPS to MAX_FPS, which the file at `path` could not hold."""
+    if not MIN_FPS <= fps <= MAX_FPS:
+        raise StgaError(f"{path}: the frame rate (--fps) must be from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}")
