@@ -5,6 +5,7 @@ export class DataError extends Error {}
 const VERSION = 1;
 const MAX_BYTES = 1 << 30;
 const MAX_HEADER_BYTES = 1 << 24;
+const MAX_VIEW_SIZE = 1 << 16; // pixels
 const CHANNELS = 3;
 
 /** Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence. */
@@ -132,9 +133,7 @@ function checkData(header, arrays) {
   checkRange(arrays.rotation_largest.values, 4, 'rotation_largest');
   checkRange(arrays.splats_per_face.values, splats + 1, 'splats_per_face');
   require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) === splats, 'splats_per_face');
-  require(header.parents.every(
-    (parent, joint) => parent === -1 || (Number.isInteger(parent) && parent >= 0 && parent < joint),
-  ), 'parents');
+  require(header.parents.every((parent, joint) => parent === -1 || isIndex(parent, joint)), 'parents');
   checkHeader(header, joints, shapes);
 }
 
@@ -145,15 +144,17 @@ function checkHeader(header, joints, shapes) {
   require(header.fps > 0 && header.fps <= 1000, 'fps');
   require(numbers(header.background, 3) && header.background.every((value) => value >= 0 && value <= 1), 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
-  require(list(header.joints, 'joints').length === joints, 'joints');
+  const names = list(header.joints, 'joints');
+  require(names.length === joints && names.every((name) => typeof name === 'string'), 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
     require(typeof slider?.name === 'string' &&
+      Number.isFinite(slider.reach) &&
       slider.reach > 0 &&
-      slider.component >= 0 &&
-      slider.component < shapes, 'sliders');
+      isIndex(slider.component, shapes), 'sliders');
   }
   for (const view of list(header.views, 'views')) {
-    require(typeof view?.name === 'string' && numbers(view.size, 2) && Math.min(...view.size) >= 1, 'views');
+    require(typeof view?.name === 'string' && list(view.size, 'views').length === 2, 'views');
+    require(view.size.every((size) => isIndex(size - 1, MAX_VIEW_SIZE)), 'views');
     require(numbers(view.focal, 2) && Math.min(...view.focal) > 0 && numbers(view.center, 2), 'views');
     require(numbers(view.world_to_camera, 16), 'views');
   }
@@ -168,7 +169,11 @@ function checkArray(arrays, name, shape) {
 }
 
 function checkRange(values, past, name) {
-  require(values.every((value) => Number.isInteger(value) && value >= 0 && value < past), name);
+  require(values.every((value) => isIndex(value, past)), name);
+}
+
+function isIndex(value, past) {
+  return Number.isInteger(value) && value >= 0 && value < past;
 }
 
 function size(arrays, name, axis) {

@@ -1,5 +1,6 @@
 // The page's controls. Everything that they do is in the public interface of <stga-avatar>.
 
+import { DataError } from './data.js';
 import './stga-avatar.js';
 
 const SLIDERS_SHOWN = 8;
@@ -323,15 +324,19 @@ addEventListener('keydown', press);
 avatar.addEventListener('load', start, { once: true });
 avatar.addEventListener('error', fail);
 
-function bytesOfBase64(text) {
-  const binary = atob(text.trim());
-  const bytes = new Uint8Array(binary.length);
-  for (let k = 0; k < bytes.length; k++) bytes[k] = binary.charCodeAt(k);
-  return bytes;
+/** The data file that the page holds as base64. Throws DataError where it was cut off or altered. */
+async function embeddedData() {
+  const text = document.getElementById('data')?.textContent?.trim();
+  if (!text) throw new DataError('This page holds no avatar data.');
+  try {
+    return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+  } catch {
+    throw new DataError('The avatar data is damaged.');
+  }
 }
 
 try {
-  await avatar.load(bytesOfBase64(byId('data').textContent));
+  await avatar.load(embeddedData());
 } catch (error) {
   console.error(error);
 }

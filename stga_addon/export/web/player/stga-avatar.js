@@ -54,11 +54,14 @@ class StgaAvatar extends HTMLElement {
     if (name === 'background' && value && this.#player) this.background = value;
   }
 
-  /** Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array). Rejects, and says why on the page. */
+  /**
+   * Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of one). Rejects, and
+   * says why on the page.
+   */
   async load(source) {
     const loading = ++this.#loading;
     try {
-      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(source);
+      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(await source);
       const data = await readData(bytes);
       if (loading !== this.#loading) return; // another load has begun
       this.#show(new Player(this.#canvas, data));
