@@ -207,6 +207,7 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
             (("views", 0, "focal"), "12"),
             (("parents", 1), 0.5),
             (("fps",), 1e300),
+            (("fps",), True),
             (("title",), 5),
         ]
     },

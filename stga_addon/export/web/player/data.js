@@ -178,7 +178,7 @@ function checkHeader(header, joints, shapes) {
   require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
   require(typeof header.antialiased === 'boolean', 'antialiased');
   require(typeof header.title === 'string', 'title');
-  require(header.fps > 0 && header.fps <= 1000, 'fps');
+  require(numbers([header.fps], 1) && header.fps > 0 && header.fps <= 1000, 'fps');
   require(numbers(header.background, 3) &&
     header.background.every((/** @type {number} */ value) => value >= 0 && value <= 1), 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
