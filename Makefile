@@ -26,9 +26,11 @@ lint: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Node.js: format of the web page's player
+# Node.js: format and types of the web page's player
+PLAYER := stga_addon/export/web/player
 lint-web:
-	npx --yes prettier@3.6.2 --check 'stga_addon/export/web/player/*.js' 'stga_addon/export/web/player/*.css'
+	npx --yes prettier@3.6.2 --check '$(PLAYER)/*.js' '$(PLAYER)/*.ts' '$(PLAYER)/*.css' '$(PLAYER)/jsconfig.json'
+	npx --yes -p typescript@5.9.3 tsc --noEmit --project $(PLAYER)/jsconfig.json
 
 fuzz: .venv/ready
 	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} STGA_FUZZ_CASES=$${STGA_FUZZ_CASES:-5000} \

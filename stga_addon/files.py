@@ -9,11 +9,13 @@ import re
 import secrets
 import stat
 import struct
+import time
 import zipfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
+from functools import partial as partial_call
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,31 +31,110 @@ MIN_NPZ_ALLOWANCE_BYTES = 128 << 20
 MAX_HEADER_BYTES = 1 << 16
 PARTIAL_NAME = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL)
 """Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
+RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
+"""How long, and how often, a rename is tried again while another program has the file open, on Windows."""
+WINDOWS_SHARING_ERRORS = (5, 32)
+"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION: what Windows says of renaming over an open file."""
+NewFile = Callable[[Path], AbstractContextManager[Path]]
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 """Computers that share a disk cannot see each other's processes."""
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, patience_s: float = RENAME_PATIENCE_S) -> Iterator[Path]:
     """Yield an empty temporary file beside `path`; rename it over `path` when the block succeeds, else delete it.
 
     The first call for a folder also removes what killed processes left there (`remove_leftovers`).
+    patience_s: how long the rename is tried again while another program has `path` open, on Windows.
     Raises StgaError where the folder cannot be written, or `path` is a folder or a device.
     """
-    if not path.name or (os.path.exists(path) and not os.path.isfile(path)):
-        raise StgaError(f"{path}: cannot be written (is not a regular file)")
-    partial = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial")
-    try:
-        _create(partial)
+    with replacing_together(patience_s) as new_file, new_file(path) as partial:
         yield partial
-        with partial.open("rb+") as written:
-            os.fsync(written.fileno())
-        os.replace(partial, path)
+
+
+@contextmanager
+def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFile]:
+    """Yield a function like `replacing` whose files are renamed together when this block succeeds, else all deleted.
+
+    A failure also removes the folders that were made for the files. Raises StgaError as `replacing` does.
+    """
+    partials: dict[Path, Path] = {}
+    made_folders: list[Path] = []
+
+    @contextmanager
+    def new_file(path: Path) -> Iterator[Path]:
+        if not path.name or (os.path.exists(path) and not os.path.isfile(path)):
+            raise StgaError(f"{path}: cannot be written (is not a regular file)")
+        partial = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial")
+        with _naming(path):
+            _make_folders(path.parent, made_folders)
+            partials[path] = partial
+            _create(partial)
+            yield partial
+            with partial.open("rb+") as written:
+                os.fsync(written.fileno())
+
+    try:
+        yield new_file
+        for path, partial in partials.items():
+            with _naming(path):
+                _once_free(partial_call(os.replace, partial, path), patience_s)
+    except BaseException:
+        for partial in partials.values():
+            with suppress(OSError, ValueError):  # where it was never created, or is renamed
+                partial.unlink()
+        for folder in reversed(made_folders):
+            with suppress(OSError):  # others have written there
+                folder.rmdir()
+        raise
+
+
+def remove_others(folder: Path, names: re.Pattern[str], kept: Iterable[Path]) -> None:
+    """Remove the folder's files whose whole name matches, except `kept`. Raises StgaError where one cannot be removed.
+
+    For the files of an earlier, longer sequence.
+    """
+    with _naming(folder):
+        found = [folder / name for name in os.listdir(folder) if names.fullmatch(name)]
+    for path in sorted(set(found) - set(kept)):
+        with _naming(path, "removed"):
+            _once_free(path.unlink, RENAME_PATIENCE_S)
+
+
+@contextmanager
+def _naming(path: Path, done: str = "written") -> Iterator[None]:
+    """Turn an OSError of the block into a StgaError that names the file."""
+    try:
+        yield
     except OSError as error:
-        raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with suppress(OSError, ValueError):  # where it was never created
-            partial.unlink()
+        raise StgaError(f"{path}: cannot be {done} ({error.strerror or error})") from error
+
+
+def _once_free(action: Callable[[], None], patience_s: float) -> None:
+    """Call `action`, again and again for `patience_s` while Windows says that another program has the file open."""
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            return action()
+        except PermissionError as error:
+            is_open = os.name == "nt" or getattr(error, "winerror", None) in WINDOWS_SHARING_ERRORS
+            if not is_open or time.monotonic() >= deadline:
+                raise
+            time.sleep(RENAME_INTERVAL_S)
+
+
+def _make_folders(folder: Path, made: list[Path]) -> None:
+    """Make the folder and its parents; append those that were missing to `made`. Raises OSError."""
+    missing = []
+    try:
+        while not folder.is_dir() and folder != folder.parent:
+            missing.append(folder)
+            folder = folder.parent
+        for name in reversed(missing):
+            name.mkdir(exist_ok=True)
+            made.append(name)
+    except ValueError as error:  # a null character or a lone surrogate
+        raise OSError(str(error)) from error
 
 
 def check_writable(path: Path) -> None:
@@ -61,9 +142,7 @@ def check_writable(path: Path) -> None:
 
     For work that ends in a file after minutes.
     """
-    folder = next((parent for parent in path.parents if os.path.lexists(parent)), path.parent)
-    beside = path if folder == path.parent else folder / path.name
-    with suppress(_Checked), replacing(beside):
+    with suppress(_Checked), replacing(path):
         raise _Checked
 
 
@@ -72,9 +151,8 @@ class _Checked(Exception):
 
 
 def _create(partial: Path) -> None:
-    """Create the file and its folder. Raises OSError, also for a name that no file can have."""
+    """Create the file. Raises OSError, also for a name that no file can have."""
     try:
-        partial.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers_once(partial.parent)
         os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # O_EXCL follows no symbolic link
     except ValueError as error:  # a null character or a lone surrogate
@@ -140,9 +218,9 @@ def parse_json(data: bytes) -> Any:
     return value
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, atomically."""
-    with replacing(path) as partial:
+def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) -> None:
+    """Write `value` as indented JSON, atomically; `patience_s` as in `replacing`."""
+    with replacing(path, patience_s) as partial:
         partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
@@ -212,9 +290,15 @@ def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:
     """Write arrays as npz, atomically."""
+    with replacing(path) as partial:
+        save_npz(partial, arrays, compressed)
+
+
+def save_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:
+    """Write arrays as npz, not atomically. Raises OSError."""
     packing = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     # Not numpy's own savez: where the disk is full, it leaves an archive behind that complains when it is collected.
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w", packing) as archive:
+    with zipfile.ZipFile(path, "w", packing) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
                 np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)  # type: ignore[no-untyped-call]

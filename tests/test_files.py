@@ -1,10 +1,13 @@
 """Atomic file writes and bounded reads."""
 
+import errno
 import json
 import os
+import re
 import stat
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 
@@ -13,7 +16,16 @@ import pytest
 
 from stga_addon import files
 from stga_addon.errors import StgaError
-from stga_addon.files import check_writable, read_json, read_npz, replacing, write_json, write_npz
+from stga_addon.files import (
+    check_writable,
+    read_json,
+    read_npz,
+    remove_others,
+    replacing,
+    replacing_together,
+    write_json,
+    write_npz,
+)
 
 
 def write_half(path: Path) -> None:
@@ -239,3 +251,78 @@ def test_only_regular_files_are_replaced(tmp_path, name):
     with pytest.raises(StgaError, match="is not a regular file"), files.replacing(path):
         pytest.fail("the block must not run")
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["folder", "pipe"]
+
+
+def refused(times: int, winerror: int | None):
+    """An os.replace that fails `times` times as Windows does (None: as POSIX does), and the number of its calls."""
+    calls, replace = [], os.replace
+
+    def fake(source, target):
+        calls.append(target)
+        if len(calls) <= times:
+            error = PermissionError(13, "Permission denied")
+            if winerror is not None:
+                error.winerror = winerror
+            raise error
+        replace(source, target)
+
+    return fake, calls
+
+
+@pytest.mark.parametrize("winerror", [5, 32])
+def test_a_file_that_another_program_has_open(winerror, tmp_path, monkeypatch):
+    """Catches hours of training that end because a virus scanner, or Blender, reads the last avatar for a moment."""
+    write_json(tmp_path / "a.json", 1)
+    fake, calls = refused(3, winerror)
+    monkeypatch.setattr(files.os, "replace", fake)
+    write_json(tmp_path / "a.json", 2)
+    assert (read_json(tmp_path / "a.json"), len(calls)) == (2, 4)
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize(("winerror", "most_calls", "patience_s"), [(32, 4, 0.25), (32, 1, 0.0), (None, 1, 60.0)])
+def test_a_file_that_stays_in_use(winerror, most_calls, patience_s, tmp_path, monkeypatch):
+    """Catches a wait without end, one on a system where waiting does not help, and a traceback at its end."""
+    write_json(tmp_path / "a.json", 1)
+    fake, calls = refused(10**6, winerror)
+    monkeypatch.setattr(files.os, "replace", fake)
+    begin = time.monotonic()
+    with pytest.raises(StgaError, match=r"a\.json: cannot be written \(Permission denied\)"):
+        write_json(tmp_path / "a.json", 2, patience_s)
+    assert time.monotonic() - begin < 10
+    assert 1 <= len(calls) <= most_calls
+    assert os.listdir(tmp_path) == ["a.json"]
+    assert read_json(tmp_path / "a.json") == 1
+
+
+def write_half_a_pair(folder: Path) -> None:
+    with replacing_together() as new_file:
+        with new_file(folder / "a.json") as partial:
+            partial.write_text("2")
+        with new_file(folder / "b.json"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_files_that_appear_together(tmp_path):
+    """Catches one file of a pair without the other, the folder made for them that stays, and others' files gone."""
+    (tmp_path / "old").mkdir()
+    write_json(tmp_path / "old/a.json", 1)
+    for folder in ("old", "new/inner"):
+        with pytest.raises(StgaError, match=r"b\.json: cannot be written \(No space"):
+            write_half_a_pair(tmp_path / folder)
+        assert {path.name for path in tmp_path.rglob("*")} == {"old", "a.json"}
+        assert read_json(tmp_path / "old/a.json") == 1
+    with replacing_together() as new_file:
+        for name in ("a.json", "b.json"):
+            with new_file(tmp_path / "old" / name) as partial:
+                partial.write_text("2")
+        assert not (tmp_path / "old/b.json").exists()
+    assert {path.name: read_json(path) for path in (tmp_path / "old").iterdir()} == {"a.json": 2, "b.json": 2}
+
+
+def test_files_of_an_earlier_sequence_are_removed(tmp_path):
+    """Catches a longer sequence's last frames that play after a shorter one, and files of others that are removed."""
+    for name in ("00001.ply", "00002.ply", "00003.ply.bak", "notes.txt", "1.ply"):
+        (tmp_path / name).touch()
+    remove_others(tmp_path, re.compile(r"\d{5,}\.ply"), [tmp_path / "00001.ply"])
+    assert sorted(os.listdir(tmp_path)) == ["00001.ply", "00003.ply.bak", "1.ply", "notes.txt"]

@@ -1,62 +1,108 @@
-"""Export of an avatar as files that other viewers and tools open."""
+"""The table of export formats, and export of an avatar in one of them."""
 
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from ..avatar.embedding import to_world
 from ..avatar.file import Avatar
-from ..avatar.splats import Splats
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes
-from .gaussian_avatars import MOTION_NAME, PLY_NAME, write_gaussian_avatars
+from .content import Content, Meshes
+from .gaussian_avatars import write_gaussian_avatars
 from .gltf import write_gltf
-from .playback import DEFAULT_FPS, Playback
-from .ply import PROPERTIES, write_ply
+from .playback import DEFAULT_FPS, Playback, check_rate
+from .ply import ply_bytes, write_ply, write_ply_sequence
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
 from .web.write import web_bytes, write_web
 
-Meshes = Iterable[tuple[int, np.ndarray]]
-"""Pairs of a number and a posed mesh (V, 3) meters."""
+__all__ = ["FORMATS", "Format", "Meshes", "check_free_space", "check_suffix", "export_avatar", "range_bytes"]
 
 
 @dataclass(frozen=True)
 class Format:
-    """What `export_avatar` writes: its name in menus, what it is for, and what it is made of.
+    """A row of FORMATS: what menus and the command line need to know of a format, and its writer.
 
+    label, description  in menus
     suffixes  of the file, the usual one first; none: a folder
     source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and its FLAME parameters
+    write     writes `content` to a path: returns the files, None where that is the path alone
+    size      bytes that `frames` of an avatar take, about; of a "range"
     has_rate  whether it records how many frames play in a second
+    is_page   whether it shows what `Playback` holds besides the rate, and takes the FLAME motion where there is one
     """
 
     label: str
     description: str
     suffixes: tuple[str, ...]
     source: str
+    write: Callable[[Path, Content], list[Path] | None]
+    size: Callable[[Avatar, int], int] = lambda avatar, frames: frames * ply_bytes(avatar.splats)
     has_rate: bool = False
+    is_page: bool = False
 
 
 FORMATS = {
-    "ply": Format("PLY", "The current frame in world space, for any 3D Gaussian Splatting viewer", (".ply",), "frame"),
-    "ply-sequence": Format("PLY Sequence", "One PLY in world space for each frame of the scene", (), "range"),
-    "gaussian-avatars": Format(
-        "GaussianAvatars", "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads", (), "motion"
+    "ply": Format(
+        "PLY",
+        "The current frame in world space, for any 3D Gaussian Splatting viewer",
+        (".ply",),
+        "frame",
+        lambda path, content: write_ply(path, content.first_frame(path)),
     ),
-    "usd": Format("USD", "The frames of the scene as an animated particle field", (".usdc", ".usdz"), "range", True),
+    "ply-sequence": Format(
+        "PLY Sequence",
+        "One PLY in world space for each frame of the scene",
+        (),
+        "range",
+        lambda path, content: write_ply_sequence(path, content.frames(path)),
+    ),
+    "gaussian-avatars": Format(
+        "GaussianAvatars",
+        "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads",
+        (),
+        "motion",
+        lambda path, content: write_gaussian_avatars(path, content.avatar, content.sequence),
+    ),
+    "usd": Format(
+        "USD",
+        "The frames of the scene as an animated particle field",
+        (".usdc", ".usdz"),
+        "range",
+        lambda path, content: write_usd(
+            path, content.frames(path), content.playback.fps, _has_moving_color(content.avatar)
+        ),
+        lambda avatar, frames: usd_bytes(avatar.splats, frames, _has_moving_color(avatar)),
+        has_rate=True,
+    ),
     "web": Format(
         "Web Page",
         "The frames of the scene as a page that plays them, or as data for a server",
         (".html", ".stga"),
         "range",
-        True,
+        lambda path, content: write_web(
+            path, content.avatar, content.playback, (mesh for _, mesh in content.meshes), content.sequence
+        ),
+        lambda avatar, frames: web_bytes(avatar),
+        has_rate=True,
+        is_page=True,
     ),
-    "gltf": Format("glTF", "The current frame, for viewers with KHR_gaussian_splatting", (".glb",), "frame"),
-    "spz": Format("SPZ", "The current frame compressed, a tenth of a PLY's size", (".spz",), "frame"),
+    "gltf": Format(
+        "glTF",
+        "The current frame, for viewers with KHR_gaussian_splatting",
+        (".glb",),
+        "frame",
+        lambda path, content: write_gltf(path, content.first_frame(path)),
+    ),
+    "spz": Format(
+        "SPZ",
+        "The current frame compressed, a tenth of a PLY's size",
+        (".spz",),
+        "frame",
+        lambda path, content: write_spz(path, content.first_frame(path), content.avatar.antialiased),
+    ),
 }
 
 
@@ -69,37 +115,22 @@ def export_avatar(
     fps: float = DEFAULT_FPS,
     playback: Playback | None = None,
 ) -> list[Path]:
-    """Write an avatar in one of FORMATS; returns the files written.
+    """Write an avatar in one of FORMATS, all of its files or none; returns the files written.
 
-    path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its number) and
-             "gaussian-avatars" (point_cloud.ply and flame_param.npz)
+    path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its number; an earlier
+             sequence there is replaced as a whole) and "gaussian-avatars" (point_cloud.ply and flame_param.npz)
     meshes   taken one at a time; a "frame" takes the first
     sequence the FLAME motion, for "gaussian-avatars"; for "web", where its rig is to go along
     fps      meshes per second
     playback what else a "web" page shows, and its meshes per second
-    Raises StgaError where the suffix is another, the format needs what is not given, or a file cannot be written.
+    Raises StgaError where the suffix is another, the format needs what is not given or has no such frame rate, or a
+    file cannot be written.
     """
     check_suffix(path, format)
-    if format == "gaussian-avatars":
-        if sequence is None:
-            raise StgaError(f"{path}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture")
-        write_gaussian_avatars(path, avatar, sequence)
-        return [path / PLY_NAME, path / MOTION_NAME]
-    if format == "web":
-        return write_web(path, avatar, playback or Playback(fps=fps), (mesh for _, mesh in meshes), sequence)
-    frames = _world_frames(path, avatar, meshes)
-    match format:
-        case "usd":
-            write_usd(path, frames, fps, _has_moving_color(avatar))
-        case "ply-sequence":
-            return [_write_numbered_ply(path, number, world) for number, world in frames]
-        case "ply":
-            write_ply(path, next(frames)[1])
-        case "gltf":
-            write_gltf(path, next(frames)[1])
-        case "spz":
-            write_spz(path, next(frames)[1], avatar.antialiased)
-    return [path]
+    playback = playback or Playback(fps=fps)
+    if FORMATS[format].has_rate:
+        check_rate(path, playback.fps)
+    return FORMATS[format].write(path, Content(avatar, meshes, sequence, playback)) or [path]
 
 
 def check_suffix(path: Path, format: str) -> None:
@@ -111,11 +142,7 @@ def check_suffix(path: Path, format: str) -> None:
 
 def range_bytes(avatar: Avatar, format: str, frames: int) -> int:
     """Size of the files that a range of frames takes in a format of the source "range"."""
-    if format == "usd":
-        return usd_bytes(avatar.splats, frames, _has_moving_color(avatar))
-    if format == "web":
-        return web_bytes(avatar)
-    return 4 * len(PROPERTIES) * len(avatar.splats) * frames
+    return FORMATS[format].size(avatar, frames)
 
 
 def check_free_space(path: Path, size: int) -> None:
@@ -128,22 +155,5 @@ def check_free_space(path: Path, size: int) -> None:
         )
 
 
-def _world_frames(path: Path, avatar: Avatar, meshes: Meshes) -> Iterator[tuple[int, Splats]]:
-    """The avatar's splats on each mesh. Raises StgaError where there is no mesh or no splat."""
-    if not len(avatar.splats):
-        raise StgaError(f"{path}: the avatar has no splats to export")
-    number = None
-    for number, mesh in meshes:
-        yield number, to_world(avatar.splats, avatar.frames(mesh))
-    if number is None:
-        raise StgaError(f"{path}: there is no posed mesh to export")
-
-
 def _has_moving_color(avatar: Avatar) -> bool:
     return avatar.splats.strain_color.shape[1] > 0
-
-
-def _write_numbered_ply(folder: Path, number: int, world: Splats) -> Path:
-    path = folder / f"{number:05d}.ply"
-    write_ply(path, world)
-    return path

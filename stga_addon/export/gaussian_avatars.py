@@ -9,22 +9,25 @@ from ..avatar.embedding import face_frames, strained_sh, to_local, to_world
 from ..avatar.file import Avatar
 from ..avatar.splats import Splats, no_strain_color
 from ..errors import StgaError
-from ..files import write_npz
+from ..files import replacing_together, save_npz
 from ..flame.sequence import FlameSequence
-from .ply import PROPERTIES, splat_columns, write_columns
+from .ply import PROPERTIES, save_columns, splat_columns
 
 PLY_NAME = "point_cloud.ply"
 MOTION_NAME = "flame_param.npz"
 BINDING = "binding_0"
 
 
-def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence) -> None:
-    """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, each atomically.
+def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence | None) -> list[Path]:
+    """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, both or neither.
 
     Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the triangle as the
     float property binding_0. The motion holds every timestep of `sequence`, its static offset, and the dynamic
-    offset that the viewer requires. Raises StgaError where the sequence's mesh is not the avatar's.
+    offset that the viewer requires. Returns the two files. Raises StgaError without a sequence, or where its mesh is
+    not the avatar's.
     """
+    if sequence is None:
+        raise StgaError(f"{folder}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture")
     if not np.array_equal(sequence.model.faces, avatar.faces):
         raise StgaError(
             f"{folder}: the avatar's mesh ({len(avatar.faces)} triangles) is not the FLAME model's "
@@ -32,8 +35,12 @@ def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence
         )
     splats = in_convention(avatar, "gaussian_avatars")
     columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
-    write_columns(folder / PLY_NAME, [*PROPERTIES, BINDING], columns)
-    write_npz(folder / MOTION_NAME, motion_arrays(sequence), compressed=True)
+    with replacing_together() as new_file:
+        with new_file(folder / PLY_NAME) as partial:
+            save_columns(partial, [*PROPERTIES, BINDING], columns)
+        with new_file(folder / MOTION_NAME) as partial:
+            save_npz(partial, motion_arrays(sequence), compressed=True)
+    return [folder / PLY_NAME, folder / MOTION_NAME]
 
 
 def in_convention(avatar: Avatar, convention: str) -> Splats:

@@ -2,14 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import median_low
 
 import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.model import Capture
+from ..errors import StgaError
 
 DEFAULT_FPS = 25.0
+MIN_FPS, MAX_FPS = 0.01, 1000.0
+"""Frame rates that videos, USD files and the web player (player/data.js) take."""
 MAX_VIEWS = 32
 """Cameras that a page offers."""
 
@@ -46,3 +50,9 @@ def playback_fps(capture: Capture | None, given: float | None = None, numbered: 
         return DEFAULT_FPS
     gaps = np.diff(capture.timesteps).tolist()
     return capture.fps if numbered or not gaps else capture.fps / median_low(gaps)
+
+
+def check_rate(path: Path, fps: float) -> None:
+    """Raise StgaError where `fps` is not from MIN_FPS to MAX_FPS, which the file at `path` could not hold."""
+    if not MIN_FPS <= fps <= MAX_FPS:
+        raise StgaError(f"{path}: the frame rate (--fps) must be from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}")

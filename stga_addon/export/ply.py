@@ -1,6 +1,7 @@
 """Reading and writing of world-space splats in 3D Gaussian Splatting's PLY layout."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -9,9 +10,11 @@ import numpy as np
 
 from ..avatar.splats import MAX_SH_DEGREE, Splats
 from ..errors import StgaError
-from ..files import file_size, replacing
+from ..files import file_size, remove_others, replacing, replacing_together
 
 MAX_HEADER_BYTES = 1 << 16
+FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
+"""Name of a frame of a sequence: 00012.ply."""
 REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -41,7 +44,29 @@ def write_ply(path: Path, world: Splats) -> None:
 
     All float32 and before activation; normals zero; f_rest channel by channel, zero-padded to degree 3.
     """
-    write_columns(path, PROPERTIES, splat_columns(world))
+    with replacing(path) as partial:
+        save_columns(partial, PROPERTIES, splat_columns(world))
+
+
+def write_ply_sequence(folder: Path, frames: Iterable[tuple[int, Splats]]) -> list[Path]:
+    """Write numbered world-space splats as 00012.ply, … into `folder`, all or none; returns the files.
+
+    They replace an earlier sequence: every other file with such a name is removed once they are written, and all else
+    in the folder stays. Raises StgaError where a file cannot be written or removed.
+    """
+    written = []
+    with replacing_together() as new_file:
+        for number, world in frames:
+            written.append(folder / f"{number:05d}.ply")
+            with new_file(written[-1]) as partial:
+                save_columns(partial, PROPERTIES, splat_columns(world))
+    remove_others(folder, FRAME_NAME, written)
+    return written
+
+
+def ply_bytes(splats: Splats) -> int:
+    """Size of a PLY file."""
+    return 4 * len(PROPERTIES) * len(splats)
 
 
 def read_ply(path: Path) -> Splats:
@@ -102,13 +127,13 @@ def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.
     return columns
 
 
-def write_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
-    """Write (N, len(names)) float32 as the vertices of a binary little-endian PLY, atomically."""
+def save_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
+    """Write (N, len(names)) float32 as the vertices of a binary little-endian PLY, not atomically. Raises OSError."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]
     lines += [f"property float {name}" for name in names]
-    with replacing(path) as partial, partial.open("wb") as out:
+    with path.open("wb") as out:
         out.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
-        np.ascontiguousarray(columns, "<f4").tofile(out)
+        out.write(np.ascontiguousarray(columns, "<f4").data)  # tofile would not say why it failed
 
 
 def read_vertices(path: Path) -> np.ndarray:

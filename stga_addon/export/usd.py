@@ -1,5 +1,8 @@
 """Writing of an avatar as an animated OpenUSD particle field of Gaussian splats."""
 
+import errno
+import os
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -28,17 +31,14 @@ def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, movi
     """
     usd = _import_usd(path)
     with replacing(path) as partial:
-        if path.suffix.lower() != ".usdz":
-            _write_layer(usd, partial, frames, fps, moving_color)
-            return
-        layer = partial.with_name(f".layer{partial.name}")
         try:
-            _write_layer(usd, layer, frames, fps, moving_color)
-            writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter  # there before USD 26
-            with writer.CreateNew(str(partial)) as archive:
-                archive.AddFile(str(layer), f"{path.stem}.usdc")
-        finally:
-            layer.unlink(missing_ok=True)
+            if path.suffix.lower() == ".usdz":
+                _write_package(usd, partial, f"{path.stem}.usdc", frames, fps, moving_color)
+            else:
+                _write_layer(usd, partial, frames, fps, moving_color)
+        except usd.Tf.ErrorException as error:
+            # "Error occurred writing file: No space left on device"
+            raise OSError(error.args[0].commentary.rpartition(": ")[2]) from error
 
 
 def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
@@ -51,12 +51,28 @@ def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
 def _import_usd(path: Path) -> Any:
     try:
         import pxr.Sdf
+        import pxr.Tf
         import pxr.Usd
         import pxr.UsdGeom
         import pxr.Vt
     except ImportError as error:
         raise StgaError(f"{path}: USD files need the package usd-core, which this Python lacks") from error
     return pxr
+
+
+def _write_package(
+    usd: Any, file: Path, name: str, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool
+) -> None:
+    layer = file.with_name(f".layer{file.name}")
+    try:
+        _write_layer(usd, layer, frames, fps, moving_color)
+        writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter  # there before USD 26
+        with writer.CreateNew(str(file)) as archive:
+            archive.AddFile(str(layer), name)
+        if not zipfile.is_zipfile(file):  # the writer reports no error where the disk is full
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    finally:
+        layer.unlink(missing_ok=True)
 
 
 def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool) -> None:

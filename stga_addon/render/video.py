@@ -1,5 +1,6 @@
 """MP4 videos and numbered PNGs, written image by image."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import replacing
+from ..export.playback import check_rate
+from ..files import remove_others, replacing
 
 CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 """H.264 with halved color resolution: what browsers, phones and editors play."""
@@ -17,7 +19,8 @@ QUALITY = {"crf": "16", "preset": "medium"}
 """Constant rate factor of x264: 18 is called visually lossless, lower is better."""
 BT709, LIMITED_RANGE = 1, 1
 """Values of FFmpeg's AVCOL_* enumerations: what players assume of untagged high-definition video."""
-MAX_FPS = 1000
+IMAGE_NAME = re.compile(r"\d{4,}\.png")
+"""Name of an image of a sequence: 0012.png."""
 
 WriteImage = Callable[[np.ndarray], None]
 
@@ -30,8 +33,7 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     appears when the block ends without an exception. Raises StgaError where it cannot be written, or no video has
     such a frame rate.
     """
-    if not 0 < fps <= MAX_FPS:
-        raise StgaError(f"{path}: a video needs a frame rate above 0 and up to {MAX_FPS}, got {fps:g}")
+    check_rate(path, fps)
     import av
 
     with replacing(path) as partial:
@@ -48,19 +50,25 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
 def sequence_writer(folder: Path) -> Iterator[WriteImage]:
     """Write 0001.png, 0002.png, … into the folder: the block is given a function that writes the next image.
 
-    Images: (H, W, 3) or, with straight alpha, (H, W, 4) uint8, sRGB. Raises StgaError where one cannot be written.
+    Images: (H, W, 3) or, with straight alpha, (H, W, 4) uint8, sRGB. They replace an earlier sequence: when the block
+    ends, every other file with such a name is removed, also where it was cut short, so that the folder never holds
+    images of two; all else in it stays. Raises StgaError where one cannot be written or removed.
     """
     from PIL import Image
 
-    count = 0
+    written: list[Path] = []
 
     def write(image: np.ndarray) -> None:
-        nonlocal count
-        count += 1
-        with replacing(folder / f"{count:04d}.png") as partial:
+        path = folder / f"{len(written) + 1:04d}.png"
+        with replacing(path) as partial:
             Image.fromarray(image).save(partial, format="PNG")
+        written.append(path)
 
-    yield write
+    try:
+        yield write
+    finally:
+        if written:
+            remove_others(folder, IMAGE_NAME, written)
 
 
 def _encoder(container: Any, rate: Fraction) -> tuple[WriteImage, Callable[[], None]]:

@@ -26,8 +26,6 @@ from .lock import hold_lock, is_locked, lock_owner
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
 STATUS_INTERVAL_S = 0.5
 """Least time between two writes of status.json with the same message."""
-FINAL_STATUS_TIMEOUT_S = 5.0
-"""How long writing the final status is retried: on Windows, a file that is being read cannot be replaced."""
 MIN_FREE_BYTES = 1 << 20
 """Free space below which a disk counts as full."""
 LOG_TAIL_LINES, REPORT_LOG_LINES = 6, 200
@@ -227,20 +225,14 @@ class StatusWriter:
             self._status = WorkerStatus(WorkerState.WORKING, progress, message, detail, figures=finite)
             self._written_s = now
             with suppress(StgaError):  # a missing status stops no work; the work itself reports a full disk
-                write_json(self.folder / STATUS_FILE, asdict(self._status))
+                write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)  # the next one comes soon
         return self.cancel_requested
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
         """Write the final status."""
         final = replace(self._status, state=state, error=error, traceback=trace)
-        deadline = time.monotonic() + FINAL_STATUS_TIMEOUT_S
-        while True:
-            try:
-                return write_json(self.folder / STATUS_FILE, asdict(final))
-            except StgaError:
-                if time.monotonic() > deadline:
-                    return None  # `inspect_worker` reports a worker that is gone
-                time.sleep(0.1)
+        with suppress(StgaError):  # `inspect_worker` reports a worker that is gone
+            write_json(self.folder / STATUS_FILE, asdict(final))
 
 
 @contextmanager

@@ -96,7 +96,7 @@ def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
     [
         (["--video", "v.avi"], "ends in .mp4"),
         (["--video", "v.mp4", "--camera", "7"], "there are only 0, 1, 2"),
-        (["--video", "v.mp4", "--fps", "0"], "frame rate above 0"),
+        (["--video", "v.mp4", "--fps", "0"], "frame rate (--fps) must be from 0.01"),
         (["--out", "pictures"], "needs --cameras"),
         (["--out", "pictures", "--camera", "1"], "--camera: has no effect without --video or --turntable"),
         (["--out", "pictures", "--fps", "30"], "--fps: has no effect without --video or --turntable"),

@@ -38,6 +38,45 @@ def test_sequence_is_named_by_number(avatar, tmp_path):
         assert np.allclose(read_ply(path).xyz, to_world(avatar.splats, avatar.frames(mesh)).xyz)
 
 
+def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
+    """Catches frames of an earlier, longer export that stay between or behind the new ones, and other files removed."""
+    export_avatar(
+        tmp_path, avatar, "ply-sequence", [(number, posed(avatar, number)) for number in (-7, 0, 1, 2, 100000)]
+    )
+    others = {"notes.txt", "point_cloud.ply", "12.ply"}
+    for name in others:
+        (tmp_path / name).touch()
+    export_avatar(tmp_path, avatar, "ply-sequence", [(1, posed(avatar, 5))])
+    assert {path.name for path in tmp_path.iterdir()} == {"00001.ply", *others}
+    assert np.allclose(
+        read_ply(tmp_path / "00001.ply").xyz, to_world(avatar.splats, avatar.frames(posed(avatar, 5))).xyz
+    )
+
+
+def test_a_sequence_that_fails_leaves_the_earlier_one(avatar, tmp_path):
+    """Catches the first frames of an export that was cancelled among the last ones of the export before."""
+
+    def meshes():
+        yield 0, posed(avatar, 9)
+        raise KeyboardInterrupt
+
+    export_avatar(tmp_path, avatar, "ply-sequence", [(number, posed(avatar, number)) for number in range(3)])
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(KeyboardInterrupt):
+        export_avatar(tmp_path, avatar, "ply-sequence", meshes())
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("fps", [0.0, -25.0, 1e-9, 1e4, 1e300, float("inf"), float("nan")])
+@pytest.mark.parametrize("format", [name for name, format in FORMATS.items() if format.has_rate])
+def test_frame_rates_that_nothing_plays(format, fps, avatar, tmp_path):
+    """Catches a file that its viewers refuse, such as a page that says that its data are damaged."""
+    path = tmp_path / f"a{FORMATS[format].suffixes[0]}"
+    with pytest.raises(StgaError, match=r"frame rate \(--fps\) must be from 0\.01 to 1000"):
+        export_avatar(path, avatar, format, [(0, avatar.neutral)], fps=fps)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("format", ["ply", "ply-sequence", "gaussian-avatars"])
 def test_missing_source(format, avatar, tmp_path):
     """Catches a format that writes nothing, or fails with a traceback, where its meshes or parameters are missing."""

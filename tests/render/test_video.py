@@ -71,3 +71,24 @@ def test_image_sequence(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "images").iterdir()) == ["0001.png", "0002.png", "0003.png"]
     for index, image in enumerate(written):
         np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / f"images/{index + 1:04d}.png")), image)
+
+
+@pytest.mark.parametrize("cut_short", [False, True])
+def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> None:
+    """Catches images of an earlier, longer sequence that play after the new ones, and other files that are removed."""
+    for name in ("0001.png", "0002.png", "0003.png", "10000.png", "12.png", "texture_0001.png"):
+        (tmp_path / name).write_bytes(b"older")
+    with suppress(KeyboardInterrupt), sequence_writer(tmp_path) as write:
+        write(images()[0])
+        if cut_short:
+            raise KeyboardInterrupt
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0001.png", "12.png", "texture_0001.png"]
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "0001.png")), images()[0])
+
+
+def test_a_sequence_without_images_removes_none(tmp_path: Path) -> None:
+    """Catches an earlier sequence lost to a rendering that failed at its first image."""
+    (tmp_path / "0001.png").write_bytes(b"older")
+    with suppress(KeyboardInterrupt), sequence_writer(tmp_path):
+        raise KeyboardInterrupt
+    assert (tmp_path / "0001.png").read_bytes() == b"older"

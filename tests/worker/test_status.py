@@ -301,7 +301,7 @@ def test_status_round_trip(tmp_path):
 def test_status_is_written_rarely(tmp_path, monkeypatch):
     """Catches a status written in every iteration, and a new message that is delayed."""
     written = []
-    monkeypatch.setattr(status, "write_json", lambda path, value: written.append(value["message"]))
+    monkeypatch.setattr(status, "write_json", lambda path, value, **options: written.append(value["message"]))
     writer = StatusWriter(tmp_path)
     for message in ("a", "a", "b", "b"):
         writer.update(0, message)
@@ -311,10 +311,9 @@ def test_status_is_written_rarely(tmp_path, monkeypatch):
 def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
     """Catches a worker that fails because its status cannot be written, and a cause that is not reported."""
 
-    def full(path: Path, value: object) -> None:
+    def full(path: Path, value: object, **options: object) -> None:
         raise StgaError(f"{path}: cannot be written ({os.strerror(errno.ENOSPC)})")
 
-    monkeypatch.setattr(status, "FINAL_STATUS_TIMEOUT_S", 0.0)
     with status_writer(tmp_path) as writer:
         monkeypatch.setattr(status, "write_json", full)
         assert not writer.update(0.5, "training")

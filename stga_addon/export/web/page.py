@@ -26,14 +26,24 @@ MODULES = (
 """Modules of the custom element, each after those that it imports."""
 IMPORT = re.compile(r"^import\b[^;]*?'\./[\w-]+\.js';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
+TYPES = re.compile(
+    r"^// @ts-check\n|^ */\*\*\n(?: *\* @.*\n)+ *\*/\n|^ */\*\* @.*\*/\n|^ *\* @.*\n|/\*\* @type \{.*?\} \*/ ",
+    re.MULTILINE,
+)
+"""Comments that only `make lint-web` reads."""
 
 
 @cache
 def element_script() -> str:
     """The custom element as one module: the player's files without their imports and exports, under their licence."""
-    sources = [EXPORT.sub("", IMPORT.sub("", (PLAYER / name).read_text(encoding="utf-8"))) for name in MODULES]
+    sources = [EXPORT.sub("", _source(name)) for name in MODULES]
     licence = (PLAYER / "LICENSE").read_text(encoding="utf-8")
     return "/*!\n" + licence + "*/\n" + "\n".join(sources)
+
+
+def _source(name: str) -> str:
+    """A module without its imports and types."""
+    return TYPES.sub("", IMPORT.sub("", (PLAYER / name).read_text(encoding="utf-8")))
 
 
 def page(title: str, notice: str, data: bytes) -> str:
@@ -43,7 +53,7 @@ def page(title: str, notice: str, data: bytes) -> str:
         "title": html.escape(title),
         "notice": html.escape(notice),
         "style": (PLAYER / "page.css").read_text(encoding="utf-8"),
-        "script": element_script() + "\n" + IMPORT.sub("", (PLAYER / "page.js").read_text(encoding="utf-8")),
+        "script": element_script() + "\n" + _source("page.js"),
         "data": base64.b64encode(data).decode("ascii"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)

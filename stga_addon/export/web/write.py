@@ -1,13 +1,13 @@
 """Writing of an avatar as a web page, or as data and player for a server."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from ...avatar.file import Avatar
 from ...errors import StgaError
-from ...files import replacing
+from ...files import replacing_together
 from ...flame.sequence import FlameSequence
 from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 from ..playback import Playback
@@ -47,11 +47,9 @@ def write_web(
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
     if path.suffix.lower() == ".stga":
-        _write(path.with_name(SCRIPT_NAME), element_script().encode("utf-8"))
-        _write(path, data)  # last: where the player cannot be written, no data without one
-        return [path, path.with_name(SCRIPT_NAME)]
-    _write(path, page(playback.title, flame_notice(avatar, sequence, playback.motion_only), data).encode("utf-8"))
-    return [path]
+        return _write({path: data, path.with_name(SCRIPT_NAME): element_script().encode("utf-8")})
+    notice = flame_notice(avatar, sequence, playback.motion_only)
+    return _write({path: page(playback.title, notice, data).encode("utf-8")})
 
 
 def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
@@ -80,6 +78,10 @@ def _rig(path: Path, sequence: FlameSequence | None, meshes: Iterable[np.ndarray
     return baked_rig(posed)
 
 
-def _write(path: Path, data: bytes) -> None:
-    with replacing(path) as partial:
-        partial.write_bytes(data)
+def _write(contents: Mapping[Path, bytes]) -> list[Path]:
+    """Write the files, all or none."""
+    with replacing_together() as new_file:
+        for path, data in contents.items():
+            with new_file(path) as partial:
+                partial.write_bytes(data)
+    return list(contents)

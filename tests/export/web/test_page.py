@@ -1,8 +1,16 @@
 """The page in a real browser: its pictures against the renderer, its interface, and damaged data."""
 
 import base64
+import functools
+import gzip
 import io
+import json
+import operator
+import re
+import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +21,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.development.browser import Browser
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.page import page
 from stga_addon.export.web.rig import baked_rig
 from stga_addon.render.render import render_avatar, to_uint8
 from stga_addon.training.optimize.initial_splats import initial_splats
@@ -144,13 +153,90 @@ def test_controls(browser, head, tmp_path):
     assert browser.errors == []
 
 
-def test_damaged_data_shows_a_sentence(browser, head, tmp_path):
-    """Catches a blank page."""
-    data = head.data()
-    show(browser, tmp_path, data[: len(data) // 2])
-    shown = browser.evaluate("document.querySelector('stga-avatar').shadowRoot.querySelector('p').textContent")
-    assert shown == "The avatar data is damaged."
-    assert browser.errors == []
+def cut(text: str, start: str, characters: int = 0) -> str:
+    """The text up to some characters behind the first `start`."""
+    at = text.index(start) + len(start) + characters
+    assert at < len(text)
+    return text[:at]
+
+
+def with_header(page: str, *keys: str | int, value: Any) -> str:
+    """The page with one value of its data's header replaced."""
+    start, data, end = re.split(r'(?<=id="data">)(.*?)(?=</script>)', page, maxsplit=1)
+    raw = gzip.decompress(base64.b64decode(data))
+    length = int.from_bytes(raw[8:12], "little")
+    header = json.loads(raw[12 : 12 + length])
+    *outer, last = keys
+    functools.reduce(operator.getitem, outer, header)[last] = value
+    text = json.dumps(header).replace("Infinity", "1e999").encode()
+    changed = raw[:8] + len(text).to_bytes(4, "little") + text + raw[12 + length :]
+    return start + base64.b64encode(gzip.compress(changed)).decode() + end
+
+
+DATA = r'(?<=id="data">).*?(?=</script>)'
+INCOMPLETE = "This page is damaged or incomplete, or the browser is too old for it."
+DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
+    "cut in the styles": (lambda page: cut(page, "<style>", 500), INCOMPLETE),
+    "cut in the heading": (lambda page: cut(page, '<p id="facts">Load'), INCOMPLETE),
+    "cut in the script": (lambda page: cut(page, '<script type="module">', 9000), INCOMPLETE),
+    "script altered": (lambda page: page.replace("class Player {", "class Player {{"), INCOMPLETE),
+    "script altered elsewhere": (lambda page: page.replace("function addViews(", "function addView("), INCOMPLETE),
+    "no data": (
+        lambda page: re.sub(r'<script [^>]*id="data">.*?</script>', "", page),
+        "This page holds no avatar data.",
+    ),
+    "empty data": (lambda page: re.sub(DATA, "", page), "This page holds no avatar data."),
+    "no base64": (lambda page: re.sub(DATA, "H4sI%%", page), "The avatar data is damaged."),
+    "other data": (lambda page: re.sub(DATA, "AAAA", page), "This is not an avatar data file."),
+    "cut at the data": (lambda page: cut(page, 'id="data">'), "This page holds no avatar data."),
+    "cut in the data": (lambda page: cut(page, 'id="data">', 40_000), "The avatar data is damaged."),
+    "cut to odd base64": (lambda page: cut(page, 'id="data">', 40_001), "The avatar data is damaged."),
+    **{
+        f"{keys} {value}": (
+            functools.partial(lambda page, keys, value: with_header(page, *keys, value=value), keys=keys, value=value),
+            f"The avatar data is damaged: {keys[0]} is missing or malformed.",
+        )
+        for keys, value in [
+            (("sliders", 0, "component"), 0.5),
+            (("sliders", 0, "component"), 10**6),
+            (("sliders", 0, "reach"), float("inf")),
+            (("sliders", 0), None),
+            (("joints", 0), None),
+            (("views", 0, "size"), [0.5, 120]),
+            (("views", 0, "size"), [1e300, 120]),
+            (("views", 0, "focal"), "12"),
+            (("parents", 1), 0.5),
+            (("fps",), 1e300),
+            (("fps",), True),
+            (("title",), 5),
+        ]
+    },
+}
+SHOWN = """(() => {
+  const message = document.querySelector('stga-avatar')?.shadowRoot?.querySelector('p');
+  return [document.body?.innerText ?? '', message && !message.hidden ? message.textContent : ''].join(' ');
+})()"""
+"""Text that can be read on the page, also within the element."""
+
+
+@pytest.fixture(scope="module")
+def whole_page(head: Head) -> str:
+    return page("Zoë", "", head.data())
+
+
+@pytest.mark.parametrize("damage", DAMAGED_PAGES)
+def test_damaged_pages_show_a_sentence(damage, whole_page, browser, tmp_path):
+    """Catches a page that says that it is loading for ever, stays blank, or whose controls throw."""
+    alter, sentence = DAMAGED_PAGES[damage]
+    altered = alter(whole_page)
+    assert altered != whole_page
+    (tmp_path / "a.html").write_text(altered, encoding="utf-8")
+    browser.open((tmp_path / "a.html").as_uri())
+    deadline = time.monotonic() + 10
+    while sentence not in (shown := browser.evaluate(SHOWN)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert sentence in shown
+    assert "Loading" not in shown
 
 
 def test_a_browser_without_webgl2_is_told(browser, head, tmp_path):

@@ -1,13 +1,21 @@
+// @ts-check
 // Reading of web data files: container, arrays, and checks of everything that the player relies on.
+
+/** @import { Data, DataArray, Values } from './types.js' */
 
 export class DataError extends Error {}
 
 const VERSION = 1;
 const MAX_BYTES = 1 << 30;
 const MAX_HEADER_BYTES = 1 << 24;
+const MAX_VIEW_SIZE = 1 << 16; // pixels
 const CHANNELS = 3;
 
-/** Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence. */
+/**
+ * Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
+ * @param {Uint8Array<ArrayBuffer>} bytes
+ * @returns {Promise<Data>}
+ */
 export async function readData(bytes) {
   if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) throw new DataError('This is not an avatar data file.');
   const raw = await inflate(bytes);
@@ -22,9 +30,13 @@ export async function readData(bytes) {
   const header = parseHeader(raw.subarray(12, 12 + length));
   const arrays = readArrays(header, raw.subarray(12 + length));
   checkData(header, arrays);
-  return { header, arrays };
+  return /** @type {any} */ ({ header, arrays });
 }
 
+/**
+ * @param {Uint8Array<ArrayBuffer>} bytes
+ * @returns {Promise<Uint8Array>}
+ */
 async function inflate(bytes) {
   const chunks = [];
   let size = 0;
@@ -47,6 +59,10 @@ async function inflate(bytes) {
   return raw;
 }
 
+/**
+ * @param {Uint8Array} bytes
+ * @returns {any}
+ */
 function parseHeader(bytes) {
   try {
     const header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(bytes));
@@ -57,7 +73,12 @@ function parseHeader(bytes) {
   throw new DataError('The header of the avatar data is damaged.');
 }
 
+/**
+ * @param {any} header
+ * @param {Uint8Array} payload
+ */
 function readArrays(header, payload) {
+  /** @type {Record<string, DataArray>} */
   const arrays = {};
   let at = 0;
   for (const [name, entry] of Object.entries(object(header.arrays, 'arrays'))) {
@@ -74,6 +95,13 @@ function readArrays(header, payload) {
   return arrays;
 }
 
+/**
+ * @param {string} name
+ * @param {any} entry
+ * @param {Uint8Array} block
+ * @param {number} count
+ * @returns {Float32Array | Int32Array}
+ */
 function decoded(name, entry, block, count) {
   if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
   const step = entry.type === 'fixed' ? entry.step : 1;
@@ -92,7 +120,11 @@ function decoded(name, entry, block, count) {
   return values;
 }
 
-/** Throw a DataError unless header and arrays fit each other and hold usable values. */
+/**
+ * Throw a DataError unless header and arrays fit each other and hold usable values.
+ * @param {any} header
+ * @param {Record<string, DataArray>} arrays
+ */
 function checkData(header, arrays) {
   const splats = size(arrays, 'xyz', 0);
   const vertices = size(arrays, 'base', 0);
@@ -101,6 +133,7 @@ function checkData(header, arrays) {
   const frames = size(arrays, 'coefficients', 0);
   const joints = list(header.parents, 'parents').length;
   require(vertices > 0 && faces > 0 && joints > 0 && frames > 0, 'number of vertices, triangles, joints or frames');
+  /** @type {Record<string, number[]>} */
   const shapesOf = {
     xyz: [splats, 3],
     rotation: [splats, 3],
@@ -132,33 +165,44 @@ function checkData(header, arrays) {
   checkRange(arrays.rotation_largest.values, 4, 'rotation_largest');
   checkRange(arrays.splats_per_face.values, splats + 1, 'splats_per_face');
   require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) === splats, 'splats_per_face');
-  require(header.parents.every(
-    (parent, joint) => parent === -1 || (Number.isInteger(parent) && parent >= 0 && parent < joint),
-  ), 'parents');
+  require(list(header.parents, 'parents').every((parent, joint) => parent === -1 || isIndex(parent, joint)), 'parents');
   checkHeader(header, joints, shapes);
 }
 
+/**
+ * @param {any} header
+ * @param {number} joints
+ * @param {number} shapes
+ */
 function checkHeader(header, joints, shapes) {
   require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
   require(typeof header.antialiased === 'boolean', 'antialiased');
   require(typeof header.title === 'string', 'title');
-  require(header.fps > 0 && header.fps <= 1000, 'fps');
-  require(numbers(header.background, 3) && header.background.every((value) => value >= 0 && value <= 1), 'background');
+  require(numbers([header.fps], 1) && header.fps > 0 && header.fps <= 1000, 'fps');
+  require(numbers(header.background, 3) &&
+    header.background.every((/** @type {number} */ value) => value >= 0 && value <= 1), 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
-  require(list(header.joints, 'joints').length === joints, 'joints');
+  const names = list(header.joints, 'joints');
+  require(names.length === joints && names.every((name) => typeof name === 'string'), 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
     require(typeof slider?.name === 'string' &&
+      Number.isFinite(slider.reach) &&
       slider.reach > 0 &&
-      slider.component >= 0 &&
-      slider.component < shapes, 'sliders');
+      isIndex(slider.component, shapes), 'sliders');
   }
   for (const view of list(header.views, 'views')) {
-    require(typeof view?.name === 'string' && numbers(view.size, 2) && Math.min(...view.size) >= 1, 'views');
+    require(typeof view?.name === 'string' && list(view.size, 'views').length === 2, 'views');
+    require(view.size.every((/** @type {unknown} */ side) => isIndex(side, MAX_VIEW_SIZE) && side !== 0), 'views');
     require(numbers(view.focal, 2) && Math.min(...view.focal) > 0 && numbers(view.center, 2), 'views');
     require(numbers(view.world_to_camera, 16), 'views');
   }
 }
 
+/**
+ * @param {Record<string, DataArray>} arrays
+ * @param {string} name
+ * @param {number[]} shape
+ */
 function checkArray(arrays, name, shape) {
   const array = arrays[name];
   require(array &&
@@ -167,29 +211,65 @@ function checkArray(arrays, name, shape) {
   if (array.values instanceof Float32Array) require(array.values.every(Number.isFinite), name);
 }
 
+/**
+ * @param {Values} values
+ * @param {number} past
+ * @param {string} name
+ */
 function checkRange(values, past, name) {
-  require(values.every((value) => Number.isInteger(value) && value >= 0 && value < past), name);
+  require(values.every((value) => isIndex(value, past)), name);
 }
 
+/**
+ * @param {any} value
+ * @param {number} past
+ */
+function isIndex(value, past) {
+  return Number.isInteger(value) && value >= 0 && value < past;
+}
+
+/**
+ * @param {Record<string, DataArray>} arrays
+ * @param {string} name
+ * @param {number} axis
+ */
 function size(arrays, name, axis) {
   require(arrays[name] && arrays[name].shape.length > axis, name);
   return arrays[name].shape[axis];
 }
 
+/**
+ * @param {unknown} value
+ * @param {number} count
+ */
 function numbers(value, count) {
   return Array.isArray(value) && value.length === count && value.every(Number.isFinite);
 }
 
+/**
+ * @param {any} value
+ * @param {string} name
+ * @returns {any[]}
+ */
 function list(value, name) {
   require(Array.isArray(value), name);
   return value;
 }
 
+/**
+ * @param {any} value
+ * @param {string} name
+ * @returns {any}
+ */
 function object(value, name) {
   require(value !== null && typeof value === 'object', name);
   return value;
 }
 
+/**
+ * @param {unknown} holds
+ * @param {string} field
+ */
 function require(holds, field) {
   if (!holds) throw new DataError(`The avatar data is damaged: ${field} is missing or malformed.`);
 }

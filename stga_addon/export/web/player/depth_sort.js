@@ -1,3 +1,4 @@
+// @ts-check
 // Order of the splats from back to front: a radix sort of their depths in 22 bits.
 
 import { FACE_FLOATS } from './face_frames.js';
@@ -7,7 +8,11 @@ const DIGITS = 1 << DIGIT_BITS;
 const MAX_KEY = DIGITS * DIGITS - 1;
 
 export class DepthSort {
-  /** xyz (3·N) of splats sorted by triangle, and how many each triangle has. */
+  /**
+   * xyz (3·N) of splats sorted by triangle, and how many each triangle has.
+   * @param {ArrayLike<number>} xyz
+   * @param {ArrayLike<number>} splatsPerFace
+   */
   constructor(xyz, splatsPerFace) {
     this.xyz = xyz;
     this.splatsPerFace = splatsPerFace;
@@ -20,7 +25,10 @@ export class DepthSort {
     this.high = new Int32Array(DIGITS);
   }
 
-  /** Indices of the splats, farthest first; `frames` as FaceFrames.compose writes them. */
+  /**
+   * Indices of the splats, farthest first; `frames` as FaceFrames.compose writes them.
+   * @param {ArrayLike<number>} frames
+   */
   sort(frames) {
     const { byLow, depth, high, key, low, order } = this;
     const [near, far] = measureDepth(frames, this.xyz, this.splatsPerFace, depth);
@@ -32,7 +40,14 @@ export class DepthSort {
   }
 }
 
-/** Fill `depth`; returns the nearest in front of the camera, and the farthest. */
+/**
+ * Fill `depth`; returns the nearest in front of the camera, and the farthest.
+ * @param {ArrayLike<number>} frames
+ * @param {ArrayLike<number>} xyz
+ * @param {ArrayLike<number>} splatsPerFace
+ * @param {Float32Array} depth
+ * @returns {[number, number]}
+ */
 function measureDepth(frames, xyz, splatsPerFace, depth) {
   let near = Infinity;
   let far = 0;
@@ -52,7 +67,13 @@ function measureDepth(frames, xyz, splatsPerFace, depth) {
   return [Math.min(near, far), far];
 }
 
-/** Whole numbers that grow from 0, for the farthest, to MAX_KEY, for the nearest and those behind the camera. */
+/**
+ * Whole numbers that grow from 0, for the farthest, to MAX_KEY, for the nearest and those behind the camera.
+ * @param {Float32Array} depth
+ * @param {number} near
+ * @param {number} far
+ * @param {Int32Array} key
+ */
 function makeKeys(depth, near, far, key) {
   const scale = MAX_KEY / (far - near || 1);
   for (let i = 0; i < depth.length; i++) {
@@ -61,7 +82,12 @@ function makeKeys(depth, near, far, key) {
   }
 }
 
-/** Where the splats of each digit begin in their order. */
+/**
+ * Where the splats of each digit begin in their order.
+ * @param {Int32Array} key
+ * @param {Int32Array} low
+ * @param {Int32Array} high
+ */
 function countDigits(key, low, high) {
   low.fill(0);
   high.fill(0);

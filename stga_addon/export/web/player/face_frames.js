@@ -1,5 +1,8 @@
+// @ts-check
 // Local frames of the triangles, in which splats are stored.
 // The rules are those of STGA for Blender's embedding.py.
+
+/** @import { Arrays, Values, Vector } from './types.js' */
 
 import { NearbyStrain, Strain } from './strain.js';
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
@@ -10,7 +13,11 @@ const UPRIGHT_COSINE = 0.8;
 export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
 
 export class FaceFrames {
-  /** Arrays of the data file, and the convention of the embedding; strain is computed where splats follow it. */
+  /**
+   * Arrays of the data file, and the convention of the embedding; strain is computed where splats follow it.
+   * @param {Arrays} arrays
+   * @param {string} convention
+   */
   constructor(arrays, convention) {
     const faces = arrays.faces.values;
     const neutral = arrays.neutral.values;
@@ -21,23 +28,27 @@ export class FaceFrames {
     this.neutralArea = neutralAreas(faces, neutral);
     const { strain_color, strain_position, strain_range } = arrays;
     this.strain = strain_color || strain_position ? new Strain(faces, neutral, strain_range?.values) : null;
-    this.nearby = strain_position ? new NearbyStrain(this.strain) : null;
+    this.nearby = this.strain && strain_position ? new NearbyStrain(this.strain) : null;
     this.strainPosition = strain_position?.values; // (9·F): for each component of strain a vector in the frame
   }
 
-  /** Follow the posed vertices (3·V). */
+  /**
+   * Follow the posed vertices (3·V).
+   * @param {Float64Array} vertices
+   */
   update(vertices) {
     this.placeFrames(vertices);
     this.strain?.update(vertices);
-    if (!this.nearby) return;
+    if (!this.nearby || !this.strainPosition) return;
     this.nearby.update();
-    this.moveOrigins();
+    this.moveOrigins(this.nearby.values, this.strainPosition);
   }
 
   /**
    * "stga": axes [first, normal × first, normal], first from the middle to corner 0; scale sqrt(area / neutral area).
    * "gaussian_avatars": axes [first, normal, first × normal], first along the first edge; scale the mean of edge and
    * height.
+   * @param {Float64Array} vertices
    */
   placeFrames(vertices) {
     const { faces, isStga, neutralArea, world } = this;
@@ -102,10 +113,13 @@ export class FaceFrames {
     }
   }
 
-  /** Move the origins with the nearby strain, in each triangle's own axes and unit. */
-  moveOrigins() {
-    const { count, strainPosition, world } = this;
-    const { values } = this.nearby;
+  /**
+   * Move the origins with the nearby strain (3·F), in each triangle's own axes and unit.
+   * @param {Float64Array} values
+   * @param {Values} strainPosition
+   */
+  moveOrigins(values, strainPosition) {
+    const { count, world } = this;
     for (let f = 0; f < count; f++) {
       const from = 9 * f;
       const a = values[3 * f];
@@ -120,7 +134,11 @@ export class FaceFrames {
     }
   }
 
-  /** Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle. */
+  /**
+   * Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle.
+   * @param {ArrayLike<number>} camera
+   * @param {Float32Array} out
+   */
   compose(camera, out) {
     const { world, count } = this;
     for (let row = 0; row < 3; row++) {
@@ -137,7 +155,11 @@ export class FaceFrames {
     }
   }
 
-  /** Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all selected). */
+  /**
+   * Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all selected).
+   * @param {ArrayLike<number> | null} selection
+   * @param {Float32Array} out
+   */
   annotate(selection, out) {
     const strain = this.strain?.values;
     for (let f = 0; f < this.count; f++) {
@@ -148,10 +170,15 @@ export class FaceFrames {
   }
 }
 
-/** Areas of the triangles; 0 for those that count as lines. */
+/**
+ * Areas of the triangles; 0 for those that count as lines.
+ * @param {Values} faces
+ * @param {Values} neutral
+ */
 function neutralAreas(faces, neutral) {
   const areas = new Float64Array(faces.length / 3);
-  const corner = (f, k) => neutral.subarray(3 * faces[3 * f + k], 3 * faces[3 * f + k] + 3);
+  const corner = (/** @type {number} */ f, /** @type {number} */ k) =>
+    neutral.subarray(3 * faces[3 * f + k], 3 * faces[3 * f + k] + 3);
   for (let f = 0; f < areas.length; f++) {
     const u = difference(corner(f, 1), corner(f, 0));
     const v = difference(corner(f, 2), corner(f, 0));
@@ -163,7 +190,14 @@ function neutralAreas(faces, neutral) {
   return areas;
 }
 
-/** Perpendicular unit vectors first and normal (six numbers) of a triangle that is a line, or whose `first` has no length. */
+/**
+ * Perpendicular unit vectors first and normal (six numbers) of a triangle that is a line, or whose `first` has no length.
+ * @param {Vector} first
+ * @param {Vector} normal
+ * @param {boolean} isShort
+ * @param {boolean} isLine
+ * @returns {number[]}
+ */
 function substitutes(first, normal, isShort, isLine) {
   const x = isShort ? [1, 0, 0] : unit(first);
   const isUpright = Math.abs(x[2]) > UPRIGHT_COSINE;

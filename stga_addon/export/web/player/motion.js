@@ -1,9 +1,13 @@
+// @ts-check
 // The recorded motion, and the values by which a person or a program replaces parts of it.
+
+/** @import { Data } from './types.js' */
 
 import { slerpAxisAngle } from './rotation.js';
 
 /** Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded one. */
 export class Motion {
+  /** @param {Data} data */
   constructor({ arrays }) {
     this.frames = arrays.coefficients.shape[0];
     this.recorded = arrays;
@@ -15,7 +19,10 @@ export class Motion {
     this.pinnedPose = new Float64Array(3 * joints).fill(NaN);
   }
 
-  /** Fill coefficients, pose and translation with those of `frame`, between frames on the shortest way. */
+  /**
+   * Fill coefficients, pose and translation with those of `frame`, between frames on the shortest way.
+   * @param {number} frame
+   */
   sample(frame) {
     const first = Math.min(Math.max(Math.floor(frame), 0), this.frames - 1);
     const second = Math.min(first + 1, this.frames - 1);
@@ -27,6 +34,11 @@ export class Motion {
     replacePinned(this.pose, this.pinnedPose);
   }
 
+  /**
+   * @param {number} first
+   * @param {number} second
+   * @param {number} share
+   */
   turn(first, second, share) {
     const [pose, size] = [this.recorded.pose.values, this.pose.length];
     for (let at = 0; at < size; at += 3) {
@@ -42,6 +54,13 @@ export class Motion {
   }
 }
 
+/**
+ * @param {ArrayLike<number>} values
+ * @param {number} first
+ * @param {number} second
+ * @param {number} share
+ * @param {Float64Array} out
+ */
 function blend(values, first, second, share, out) {
   const size = out.length;
   for (let k = 0; k < size; k++) {
@@ -50,6 +69,10 @@ function blend(values, first, second, share, out) {
   }
 }
 
+/**
+ * @param {Float64Array} values
+ * @param {Float64Array} pinned
+ */
 function replacePinned(values, pinned) {
   for (let k = 0; k < values.length; k++) if (!Number.isNaN(pinned[k])) values[k] = pinned[k];
 }

@@ -1,12 +1,26 @@
+// @ts-check
 // The page's controls. Everything that they do is in the public interface of <stga-avatar>.
 
-import './stga-avatar.js';
+/**
+ * @typedef {object} SliderOptions
+ * @property {string} id
+ * @property {string} label
+ * @property {number} low
+ * @property {number} high
+ * @property {() => number} read what plays
+ * @property {(value: number | null) => void} write null: as recorded
+ * @property {(value: number) => string} format
+ */
+
+import { DataError } from './data.js';
+import { StgaAvatar } from './stga-avatar.js';
 
 const SLIDERS_SHOWN = 8;
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
-const THEME_BACKGROUND = { light: null, dark: '#15171b' }; // null: what the avatar was trained against
+const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
 // Joint, axis, smallest and largest angle in radians.
+/** @type {[string, string[], number, number, number][]} */
 const POSE_SLIDERS = [
   ['Jaw open', ['jaw'], 0, -0.1, 0.6],
   ['Nod', ['neck'], 0, -0.5, 0.5],
@@ -16,16 +30,52 @@ const POSE_SLIDERS = [
   ['Look down', ['left_eye', 'right_eye'], 0, -0.5, 0.5],
 ];
 
-const avatar = document.querySelector('stga-avatar');
-const byId = (id) => document.getElementById(id);
-const sliders = []; // { update } of each
+const avatar = element('stga-avatar', StgaAvatar);
+/** @type {{ update: () => void, release: () => void }[]} */
+const sliders = [];
 
+/**
+ * The first element that the selector finds. Throws where there is none of the class.
+ * @template {Element} E
+ * @param {string} selector
+ * @param {new () => E} kind
+ * @param {ParentNode} parent
+ * @returns {E}
+ */
+function element(selector, kind, parent = document) {
+  const found = parent.querySelector(selector);
+  if (!(found instanceof kind)) throw new Error(`The page has no ${selector}.`);
+  return found;
+}
+
+/** @param {string} id */
+function byId(id) {
+  return element(`#${id}`, HTMLElement);
+}
+
+/** @param {string} id */
+function inputOf(id) {
+  return element(`#${id}`, HTMLInputElement);
+}
+
+/** The loaded file's header. */
+function info() {
+  if (!avatar.info) throw new Error('No avatar is loaded.');
+  return avatar.info;
+}
+
+/**
+ * @param {HTMLElement} button
+ * @param {boolean} pressed
+ */
 function setPressed(button, pressed) {
   button.setAttribute('aria-pressed', String(pressed));
 }
 
+/** @param {HTMLInputElement} input */
 function fillTrack(input) {
-  const share = (input.value - input.min) / (input.max - input.min || 1);
+  const [low, high] = [Number(input.min), Number(input.max)];
+  const share = (Number(input.value) - low) / (high - low || 1);
   input.style.setProperty('--done', `${100 * share}%`);
 }
 
@@ -36,9 +86,9 @@ function updateTransport() {
   const frame = Math.min(Math.round(avatar.frame), last);
   setPressed(byId('play'), avatar.playing);
   byId('play').title = avatar.playing ? 'Pause (Space)' : 'Play (Space)';
-  byId('scrub').value = Math.min(avatar.frame, last);
+  inputOf('scrub').value = String(Math.min(avatar.frame, last));
   byId('number').textContent = `${frame + 1} / ${last + 1}`;
-  fillTrack(byId('scrub'));
+  fillTrack(inputOf('scrub'));
 }
 
 function toggle() {
@@ -51,6 +101,7 @@ function toggleLoop() {
   setPressed(byId('loop'), avatar.loop);
 }
 
+/** @param {number} by */
 function step(by) {
   avatar.pause();
   avatar.frame = Math.round(avatar.frame) + by;
@@ -58,13 +109,15 @@ function step(by) {
 
 function addTransport() {
   byId('transport').hidden = avatar.frameCount < 2;
-  byId('scrub').max = avatar.frameCount - 1;
+  inputOf('scrub').max = String(avatar.frameCount - 1);
   byId('play').addEventListener('click', toggle);
   byId('loop').addEventListener('click', toggleLoop);
-  byId('speed').addEventListener('change', (event) => (avatar.speed = Number(event.target.value)));
-  byId('scrub').addEventListener('input', (event) => {
+  const speed = element('#speed', HTMLSelectElement);
+  speed.addEventListener('change', () => (avatar.speed = Number(speed.value)));
+  const scrub = inputOf('scrub');
+  scrub.addEventListener('input', () => {
     avatar.pause();
-    avatar.frame = Number(event.target.value);
+    avatar.frame = Number(scrub.value);
   });
   for (const name of ['frame', 'play', 'pause']) avatar.addEventListener(name, updateTransport);
   updateTransport();
@@ -73,38 +126,43 @@ function addTransport() {
 // View
 
 function addViews() {
-  const names = avatar.info.views.map(({ name }) => name);
-  for (const name of names.length ? names : ['Front']) byId('view').add(new Option(name, name));
-  byId('view').addEventListener('change', (event) => showView(event.target.selectedIndex));
+  const names = info().views.map(({ name }) => name);
+  const list = element('#view', HTMLSelectElement);
+  for (const name of names.length ? names : ['Front']) list.add(new Option(name, name));
+  list.addEventListener('change', () => showView(list.selectedIndex));
   byId('reset').addEventListener('click', resetView);
 }
 
+/** @param {number} index */
 function showView(index) {
-  const view = avatar.info.views[index];
+  const view = info().views[index];
   if (view) avatar.camera = view.name;
   else if (!index) avatar.resetCamera();
-  if (view || !index) byId('view').selectedIndex = index;
+  if (view || !index) element('#view', HTMLSelectElement).selectedIndex = index;
 }
 
 function resetView() {
   avatar.resetCamera();
-  byId('view').selectedIndex = 0;
+  element('#view', HTMLSelectElement).selectedIndex = 0;
 }
 
+/** @type {string | null} */
 let background = null; // chosen by the viewer; null: the theme's
 
+/** @type {Map<HTMLElement, string | null>} */
+const swatches = new Map(); // button → color; null: the theme's
+
 function applyBackground() {
-  const { theme } = document.documentElement.dataset;
-  const trained = `#${avatar.info.background
-    .map((part) =>
+  const dark = document.documentElement.dataset.theme === 'dark';
+  const trained = `#${info()
+    .background.map((part) =>
       Math.round(255 * part)
         .toString(16)
         .padStart(2, '0'),
     )
     .join('')}`;
-  avatar.background = background ?? THEME_BACKGROUND[theme] ?? trained;
-  for (const swatch of document.querySelectorAll('button.swatch'))
-    setPressed(swatch, (swatch.dataset.color || null) === background);
+  avatar.background = background ?? (dark ? DARK_BACKGROUND : trained);
+  for (const [swatch, color] of swatches) setPressed(swatch, color === background);
 }
 
 function addBackgrounds() {
@@ -112,7 +170,7 @@ function addBackgrounds() {
   for (const [name, color] of Object.entries({ 'As the page': '', ...BACKGROUNDS })) {
     const swatch = document.createElement('button');
     Object.assign(swatch, { className: 'swatch', title: name });
-    swatch.dataset.color = color;
+    swatches.set(swatch, color || null);
     swatch.style.setProperty('--color', color || 'linear-gradient(135deg, #fff 50%, #15171b 50%)');
     swatch.addEventListener('click', () => chooseBackground(color || null));
     row.append(swatch);
@@ -127,6 +185,7 @@ function addBackgrounds() {
   applyBackground();
 }
 
+/** @param {string | null} color */
 function chooseBackground(color) {
   background = color;
   applyBackground();
@@ -135,7 +194,7 @@ function chooseBackground(color) {
 function toggleSelection() {
   if (!avatar.hasSelection) return;
   avatar.showSelection = !avatar.showSelection;
-  byId('show-selection').checked = avatar.showSelection;
+  inputOf('show-selection').checked = avatar.showSelection;
 }
 
 function toggleTheme() {
@@ -146,23 +205,28 @@ function toggleTheme() {
 
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
+/**
+ * @param {HTMLElement} parent
+ * @param {SliderOptions} options
+ */
 function addSlider(parent, { id, label, low, high, read, write, format }) {
   const row = document.createElement('label');
   row.className = 'slider';
   row.dataset.name = id;
   row.innerHTML = '<span></span><button class="value" title="Release"></button><input type="range" step="any">';
-  const [name, value, input] = row.children;
+  const [name, value] = [element('span', HTMLElement, row), element('button', HTMLElement, row)];
+  const input = element('input', HTMLInputElement, row);
   name.textContent = label;
-  Object.assign(input, { min: low, max: high });
+  [input.min, input.max] = [String(low), String(high)];
   let pinned = false;
-  const pin = (whether) => {
+  const pin = (/** @type {boolean} */ whether) => {
     pinned = whether;
     row.classList.toggle('pinned', whether);
     byId('released').hidden = !document.querySelector('.pinned');
   };
   const update = () => {
     const current = read();
-    if (!pinned) input.value = current;
+    if (!pinned) input.value = String(current);
     value.textContent = format(pinned ? Number(input.value) : current);
     fillTrack(input);
   };
@@ -182,7 +246,10 @@ function addSlider(parent, { id, label, low, high, read, write, format }) {
   return row;
 }
 
-/** "Expression 3" for expr_003. */
+/**
+ * "Expression 3" for expr_003.
+ * @param {string} name
+ */
 function expressionLabel(name) {
   const number = /^expr_(\d+)$/.exec(name);
   return number ? `Expression ${Number(number[1])}` : name;
@@ -190,8 +257,8 @@ function expressionLabel(name) {
 
 function addExpressions() {
   const section = byId('expressions');
-  const list = section.querySelector('.sliders');
-  const rows = avatar.info.sliders.map(({ name, reach }) =>
+  const list = element('.sliders', HTMLElement, section);
+  const rows = info().sliders.map(({ name, reach }) =>
     addSlider(list, {
       id: name,
       label: expressionLabel(name),
@@ -214,8 +281,8 @@ function addExpressions() {
 }
 
 function addPose() {
-  const known = POSE_SLIDERS.filter(([, joints]) => joints.every((joint) => avatar.info.joints.includes(joint)));
-  const list = byId('pose').querySelector('.sliders');
+  const known = POSE_SLIDERS.filter(([, joints]) => joints.every((joint) => info().joints.includes(joint)));
+  const list = element('.sliders', HTMLElement, byId('pose'));
   for (const [label, joints, axis, low, high] of known) {
     addSlider(list, {
       id: label,
@@ -230,8 +297,14 @@ function addPose() {
   byId('pose').hidden = !known.length;
 }
 
+/** @type {Record<string, (number | null)[]>} */
 const pinnedAngles = {}; // joint → three angles, null: as recorded
 
+/**
+ * @param {string} joint
+ * @param {number} axis
+ * @param {number | null} value
+ */
 function replaced(joint, axis, value) {
   pinnedAngles[joint] ??= [null, null, null];
   pinnedAngles[joint][axis] = value;
@@ -246,6 +319,7 @@ function releaseAll() {
 
 // Keyboard, panel and facts
 
+/** @type {Record<string, () => unknown>} */
 const KEYS = {
   ' ': toggle,
   k: toggle,
@@ -263,8 +337,10 @@ const KEYS = {
   x: releaseAll,
 };
 
+/** @param {KeyboardEvent} event */
 function press(event) {
-  const isTyping = event.target.matches('select') || (event.target.matches('input') && event.key.startsWith('Arrow'));
+  const isArrow = event.key.startsWith('Arrow');
+  const isTyping = event.target instanceof Element && event.target.matches(isArrow ? 'select, input' : 'select');
   if (isTyping || event.ctrlKey || event.metaKey || event.altKey || !avatar.info) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const action = /^[1-9]$/.test(key) ? () => showView(Number(key) - 1) : KEYS[key];
@@ -286,7 +362,7 @@ function toggleFullscreen() {
 
 function showFacts() {
   const splats = avatar.splatCount.toLocaleString('en');
-  const rate = avatar.frameCount > 1 ? ` · ${Number(avatar.info.fps.toFixed(2))} fps` : '';
+  const rate = avatar.frameCount > 1 ? ` · ${Number(info().fps.toFixed(2))} fps` : '';
   byId('facts').innerHTML =
     `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms of JavaScript a frame</span>`;
 }
@@ -323,15 +399,19 @@ addEventListener('keydown', press);
 avatar.addEventListener('load', start, { once: true });
 avatar.addEventListener('error', fail);
 
-function bytesOfBase64(text) {
-  const binary = atob(text.trim());
-  const bytes = new Uint8Array(binary.length);
-  for (let k = 0; k < bytes.length; k++) bytes[k] = binary.charCodeAt(k);
-  return bytes;
+/** The data file that the page holds as base64. Throws DataError where it was cut off or altered. */
+async function embeddedData() {
+  const text = document.querySelector('#data')?.textContent?.trim();
+  if (!text) throw new DataError('This page holds no avatar data.');
+  try {
+    return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+  } catch {
+    throw new DataError('The avatar data is damaged.');
+  }
 }
 
 try {
-  await avatar.load(bytesOfBase64(byId('data').textContent));
+  await avatar.load(embeddedData());
 } catch (error) {
   console.error(error);
 }

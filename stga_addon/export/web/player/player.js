@@ -1,4 +1,7 @@
+// @ts-check
 // One avatar on one canvas: follows motion and camera, and draws when something has changed.
+
+/** @import { Camera, Color, Data } from './types.js' */
 
 import { cameraOfView, fitted, frontCamera, bounds } from './camera.js';
 import { DepthSort } from './depth_sort.js';
@@ -10,12 +13,16 @@ import { Rig } from './rig.js';
 const TIMING_SHARE = 0.1; // of the newest frame in the running mean
 
 export class Player {
-  /** `data` of readData. Throws RendererError where the browser cannot draw it. */
+  /**
+   * `data` of readData. Throws RendererError where the browser cannot draw it.
+   * @param {HTMLCanvasElement} canvas
+   * @param {Data} data
+   */
   constructor(canvas, data) {
     const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
-    this.gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
-    if (!this.gl)
-      throw new RendererError('This page needs WebGL 2, which this browser or graphics driver does not offer.');
+    const gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
+    if (!gl) throw new RendererError('This page needs WebGL 2, which this browser or graphics driver does not offer.');
+    this.gl = gl;
     const { header, arrays } = data;
     this.canvas = canvas;
     this.data = data;
@@ -24,16 +31,20 @@ export class Player {
     this.faceFrames = new FaceFrames(arrays, header.convention);
     this.depthSort = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values);
     this.renderer = new Renderer(this.gl, data);
+    /** @type {Color} */
     this.background = [...header.background, 1];
     this.showSelection = false;
+    /** @type {number | null} */
     this.posed = null; // frame that faceFrames hold
     this.frame = 0;
     this.milliseconds = 0;
     this.pose();
-    [this.middle] = bounds(this.rig.vertices);
+    const [middle] = bounds(this.rig.vertices);
+    this.middle = middle;
     const [view] = header.views;
     this.home = view ? cameraOfView(view) : frontCamera(this.rig.vertices, header.up);
-    this.resetCamera();
+    this.camera = this.home;
+    this.pivot = this.middle;
   }
 
   get frameCount() {
@@ -55,7 +66,10 @@ export class Player {
     this.milliseconds += (this.milliseconds ? TIMING_SHARE : 1) * (spent - this.milliseconds);
   }
 
-  /** Pixels of the current frame from `camera`, which has its own size (Renderer.read). */
+  /**
+   * Pixels of the current frame from `camera`, which has its own size (Renderer.read).
+   * @param {Camera} camera
+   */
   read(camera) {
     return this.renderer.read(this.prepare(camera), camera, this.background, this.showSelection);
   }
@@ -65,6 +79,7 @@ export class Player {
     this.posed = null;
   }
 
+  /** @param {Camera} camera */
   prepare(camera) {
     this.pose();
     const values = this.renderer.frameValues;

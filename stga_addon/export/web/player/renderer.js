@@ -1,4 +1,7 @@
+// @ts-check
 // Splats on a WebGL2 canvas: blended back to front into a float target, then over the background.
+
+/** @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js' */
 
 import {
   FACE_TEXELS,
@@ -16,7 +19,11 @@ const SH_C0 = 0.28209479177387814;
 export class RendererError extends Error {}
 
 export class Renderer {
-  /** Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw them. */
+  /**
+   * Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw them.
+   * @param {WebGL2RenderingContext} gl
+   * @param {Data} data
+   */
   constructor(gl, data) {
     if (!gl.getExtension('EXT_color_buffer_float')) {
       throw new RendererError('This browser cannot draw to float textures, which the avatar needs.');
@@ -34,16 +41,17 @@ export class Renderer {
     this.tailTexture = texture(gl, gl.RGBA16F, tailValues(arrays, tailTexels(harmonics, strains)));
     this.frameValues = new Float32Array(paddedLength(this.faces * FACE_TEXELS));
     this.frameTexture = texture(gl, gl.RGBA32F, this.frameValues);
-    this.makeIndexArray();
+    this.vertexArray = gl.createVertexArray();
+    this.indexBuffer = gl.createBuffer();
+    this.fillIndexArray();
+    /** @type {Target | null} */
     this.target = null;
     this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
-  makeIndexArray() {
+  fillIndexArray() {
     const gl = this.gl;
-    this.vertexArray = gl.createVertexArray();
     gl.bindVertexArray(this.vertexArray);
-    this.indexBuffer = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(0);
@@ -55,25 +63,32 @@ export class Renderer {
    * Draw `order` (back to front) of the splats on the frames in `frameValues`.
    * camera: { size, focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas;
    * format: of the target in which they are blended.
+   * @param {Uint32Array} order
+   * @param {Camera} camera
+   * @param {Color} background
+   * @param {boolean} showSelection
+   * @param {WebGLFramebuffer | null} [framebuffer]
+   * @param {number} [format]
    */
   draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
     const gl = this.gl;
     const [width, height] = camera.size;
-    this.resizeTarget(width, height, format);
+    const target = this.resizedTarget(width, height, format);
     this.upload(order);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     this.drawSplats(camera, showSelection);
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.useProgram(this.overProgram.program);
-    bindTexture(gl, 0, this.target.texture, this.overProgram.uniforms.uPicture);
+    bindTexture(gl, 0, target.texture, this.overProgram.uniforms.uPicture);
     const [red, green, blue, alpha] = background;
     gl.uniform4f(this.overProgram.uniforms.uBackground, red * alpha, green * alpha, blue * alpha, alpha);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  /** @param {Uint32Array} order */
   upload(order) {
     const gl = this.gl;
     gl.activeTexture(gl.TEXTURE0);
@@ -85,6 +100,10 @@ export class Renderer {
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
   }
 
+  /**
+   * @param {Camera} camera
+   * @param {boolean} showSelection
+   */
   drawSplats(camera, showSelection) {
     const gl = this.gl;
     const { program, uniforms } = this.splatProgram;
@@ -98,22 +117,34 @@ export class Renderer {
     gl.uniform2f(uniforms.uFocal, ...camera.focal);
     gl.uniform2f(uniforms.uCenter, ...camera.center);
     gl.uniform2f(uniforms.uSize, ...camera.size);
-    gl.uniform1i(uniforms.uAntialiased, this.antialiased);
-    gl.uniform1i(uniforms.uShowSelection, showSelection);
+    gl.uniform1i(uniforms.uAntialiased, Number(this.antialiased));
+    gl.uniform1i(uniforms.uShowSelection, Number(showSelection));
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
     gl.disable(gl.BLEND);
   }
 
-  resizeTarget(width, height, format) {
+  /**
+   * @param {number} width
+   * @param {number} height
+   * @param {number} format
+   */
+  resizedTarget(width, height, format) {
     const { target } = this;
-    if (target?.width === width && target.height === height && target.format === format) return;
+    if (target?.width === width && target.height === height && target.format === format) return target;
     if (target) deleteTarget(this.gl, target);
     this.target = makeTarget(this.gl, format, width, height);
+    return this.target;
   }
 
-  /** The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied with alpha. */
+  /**
+   * The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied with alpha.
+   * @param {Uint32Array} order
+   * @param {Camera} camera
+   * @param {Color} background
+   * @param {boolean} showSelection
+   */
   read(order, camera, background, showSelection) {
     const gl = this.gl;
     const [width, height] = camera.size;
@@ -141,6 +172,7 @@ export class Renderer {
   }
 }
 
+/** @param {Arrays} arrays */
 function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_scale, opacity, color }) {
   const values = new Float32Array(paddedLength(xyz.shape[0] * SPLAT_TEXELS));
   for (let face = 0, splat = 0; face < splats_per_face.values.length; face++) {
@@ -160,7 +192,11 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_sca
   return values;
 }
 
-/** The unit quaternion whose parts but the largest, which is positive, are `smaller`. */
+/**
+ * The unit quaternion whose parts but the largest, which is positive, are `smaller`.
+ * @param {Values} smaller
+ * @param {number} largest
+ */
 function wholeQuaternion(smaller, largest) {
   const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
   const whole = Array.from(smaller);
@@ -168,6 +204,10 @@ function wholeQuaternion(smaller, largest) {
   return whole;
 }
 
+/**
+ * @param {Arrays} arrays
+ * @param {number} texels
+ */
 function tailValues({ xyz, sh, strain_color }, texels) {
   const values = new Float32Array(paddedLength(Math.max(1, xyz.shape[0] * texels)));
   let offset = 0;
@@ -182,17 +222,27 @@ function tailValues({ xyz, sh, strain_color }, texels) {
   return values;
 }
 
+/** @param {number} texels */
 function paddedLength(texels) {
   return 4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
 }
 
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {string} vertex
+ * @param {string} fragment
+ * @returns {Program}
+ */
 function program(gl, vertex, fragment) {
   const made = gl.createProgram();
-  for (const [kind, source] of [
+  /** @type {[number, string][]} */
+  const stages = [
     [gl.VERTEX_SHADER, vertex],
     [gl.FRAGMENT_SHADER, fragment],
-  ]) {
+  ];
+  for (const [kind, source] of stages) {
     const shader = gl.createShader(kind);
+    if (!shader) continue; // the context is lost
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
     gl.attachShader(made, shader);
@@ -201,18 +251,24 @@ function program(gl, vertex, fragment) {
   gl.bindAttribLocation(made, 0, 'splatIndex');
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
-    const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
+    const logs = (gl.getAttachedShaders(made) ?? []).map((shader) => gl.getShaderInfoLog(shader));
     throw new RendererError(`The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`);
   }
+  /** @type {Program['uniforms']} */
   const uniforms = {};
   const count = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) ?? 0;
   for (let k = 0; k < count; k++) {
-    const { name } = gl.getActiveUniform(made, k);
-    uniforms[name] = gl.getUniformLocation(made, name);
+    const name = gl.getActiveUniform(made, k)?.name;
+    if (name) uniforms[name] = gl.getUniformLocation(made, name);
   }
   return { program: made, uniforms };
 }
 
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {number} format
+ * @param {Float32Array} values
+ */
 function texture(gl, format, values) {
   const height = values.length / (4 * TEXTURE_WIDTH);
   if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
@@ -226,12 +282,25 @@ function texture(gl, format, values) {
   return made;
 }
 
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {number} unit
+ * @param {WebGLTexture} bound
+ * @param {WebGLUniformLocation | null} [uniform]
+ */
 function bindTexture(gl, unit, bound, uniform) {
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, bound);
   gl.uniform1i(uniform ?? null, unit);
 }
 
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {number} format
+ * @param {number} width
+ * @param {number} height
+ * @returns {Target}
+ */
 function makeTarget(gl, format, width, height) {
   const made = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0);
@@ -245,6 +314,10 @@ function makeTarget(gl, format, width, height) {
   return { texture: made, framebuffer, format, width, height };
 }
 
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {Target} target
+ */
 function deleteTarget(gl, target) {
   gl.deleteFramebuffer(target.framebuffer);
   gl.deleteTexture(target.texture);

@@ -1,8 +1,12 @@
+// @ts-check
 // The mesh of a pose: blend shapes, pose correctives, linear blend skinning, translation.
+
+/** @import { Data } from './types.js' */
 
 import { matrixFromAxisAngle } from './rotation.js';
 
 export class Rig {
+  /** @param {Data} data */
   constructor({ header, arrays }) {
     this.parents = header.parents;
     this.base = arrays.base.values;
@@ -20,7 +24,12 @@ export class Rig {
     this.placed = new Float64Array(3 * joints);
   }
 
-  /** Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3). */
+  /**
+   * Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
+   * @param {ArrayLike<number>} coefficients
+   * @param {ArrayLike<number>} pose
+   * @param {ArrayLike<number>} translation
+   */
   pose(coefficients, pose, translation) {
     this.shaped.set(this.base);
     this.joints.set(this.jointRest);
@@ -64,6 +73,7 @@ export class Rig {
     }
   }
 
+  /** @param {ArrayLike<number>} translation */
   skinVertices(translation) {
     const { shaped, weights, skin, vertices } = this;
     const joints = this.parents.length;
@@ -89,10 +99,18 @@ export class Rig {
   }
 }
 
-/** target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than the sums. */
+/**
+ * target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than the sums.
+ * @param {Float64Array} target
+ * @param {ArrayLike<number>} shapes
+ * @param {ArrayLike<number>} factors
+ */
 function addShapes(target, shapes, factors) {
   const size = target.length;
-  const [offset, factor] = [[], []];
+  /** @type {number[]} */
+  const offset = [];
+  /** @type {number[]} */
+  const factor = [];
   for (let k = 0; k < factors.length; k++) {
     if (factors[k] === 0) continue;
     offset.push(k * size);

@@ -1,8 +1,17 @@
+// @ts-check
 // Rotations as axis-angle vectors, unit quaternions (w, x, y, z) and 3×3 matrices, row by row.
+
+/** @import { Vector } from './types.js' */
 
 const SMALL_ANGLE = 1e-8;
 
-/** Write the matrix of the axis-angle vector at `from` of `vectors` to `out` (9 numbers from `to`). */
+/**
+ * Write the matrix of the axis-angle vector at `from` of `vectors` to `out` (9 numbers from `to`).
+ * @param {ArrayLike<number>} vectors
+ * @param {number} from
+ * @param {Float64Array} out
+ * @param {number} to
+ */
 export function matrixFromAxisAngle(vectors, from, out, to) {
   const [x, y, z] = [vectors[from], vectors[from + 1], vectors[from + 2]];
   const angle = Math.hypot(x, y, z);
@@ -20,7 +29,13 @@ export function matrixFromAxisAngle(vectors, from, out, to) {
   out[to + 8] = 1 - second * (x * x + y * y);
 }
 
-/** Axis-angle vector on the shortest arc from axis-angle vector `a` to `b`, at `share` of the way. */
+/**
+ * Axis-angle vector on the shortest arc from axis-angle vector `a` to `b`, at `share` of the way.
+ * @param {ArrayLike<number>} a
+ * @param {ArrayLike<number>} b
+ * @param {number} share
+ * @returns {Vector}
+ */
 export function slerpAxisAngle(a, b, share) {
   const p = quaternionFromAxisAngle(a);
   let q = quaternionFromAxisAngle(b);
@@ -36,12 +51,21 @@ export function slerpAxisAngle(a, b, share) {
   return axisAngleFromQuaternion(p.map((part, k) => before * part + after * q[k]));
 }
 
-function quaternionFromAxisAngle([x, y, z]) {
+/**
+ * @param {ArrayLike<number>} vector
+ * @returns {number[]}
+ */
+function quaternionFromAxisAngle(vector) {
+  const [x, y, z] = [vector[0], vector[1], vector[2]];
   const angle = Math.hypot(x, y, z);
   const factor = angle < SMALL_ANGLE ? 0.5 : Math.sin(angle / 2) / angle;
   return [Math.cos(angle / 2), factor * x, factor * y, factor * z];
 }
 
+/**
+ * @param {number[]} quaternion
+ * @returns {Vector}
+ */
 function axisAngleFromQuaternion([w, x, y, z]) {
   const length = Math.hypot(x, y, z);
   const angle = 2 * Math.atan2(length, w);

@@ -1,3 +1,4 @@
+// @ts-check
 // GLSL of the renderer: splats as quads, then the picture over its background.
 
 export const TEXTURE_WIDTH = 2048;
@@ -23,18 +24,26 @@ const SH = [
   '-0.5900435899266435 * x * (xx - 3.0 * yy)',
 ];
 
-/** Texels a splat needs for its view-dependent and strain-dependent colors. */
+/**
+ * Texels a splat needs for its view-dependent and strain-dependent colors.
+ * @param {number} harmonics
+ * @param {number} strains
+ */
 export function tailTexels(harmonics, strains) {
   return Math.ceil((3 * (harmonics + strains)) / 4);
 }
 
-/** Sum of coefficients times basis functions, unrolled: dynamic indices are slow on many GPUs. */
+/**
+ * Sum of coefficients times basis functions, unrolled: dynamic indices are slow on many GPUs.
+ * @param {number} harmonics
+ * @param {number} strains
+ */
 function tailColor(harmonics, strains) {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
   for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
-  const part = (k) => `t${k >> 2}.${'xyzw'[k & 3]}`;
-  const triple = (k) => `vec3(${part(3 * k)}, ${part(3 * k + 1)}, ${part(3 * k + 2)})`;
+  const part = (/** @type {number} */ k) => `t${k >> 2}.${'xyzw'[k & 3]}`;
+  const triple = (/** @type {number} */ k) => `vec3(${part(3 * k)}, ${part(3 * k + 1)}, ${part(3 * k + 2)})`;
   if (harmonics) {
     lines.push('vec3 d = normalize(uToWorld * center);');
     lines.push('float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;');
@@ -44,7 +53,11 @@ function tailColor(harmonics, strains) {
   return lines.join('\n  ');
 }
 
-/** The limits and constants are those of the renderer that trained the splats (raster/reference.py). */
+/**
+ * The limits and constants are those of the renderer that trained the splats (raster/reference.py).
+ * @param {number} harmonics
+ * @param {number} strains
+ */
 export function splatVertexShader(harmonics, strains) {
   return `#version 300 es
 precision highp float;

@@ -1,4 +1,7 @@
+// @ts-check
 // <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element (docs/web.md).
+
+/** @import { Camera } from './types.js' */
 
 import { cameraOfView } from './camera.js';
 import { addControls } from './controls.js';
@@ -17,24 +20,27 @@ p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 
   font: 16px/1.5 system-ui, sans-serif; }
 [hidden] { display: none; }`;
 
-class StgaAvatar extends HTMLElement {
+export class StgaAvatar extends HTMLElement {
   static observedAttributes = ['src', 'loop', 'speed', 'background'];
 
+  /** @type {Player | null} */
   #player = null;
   #playing = false;
   #time = 0; // in frames
   #last = 0;
   #request = 0;
   #loading = 0;
-  #canvas;
-  #message;
+  #canvas = document.createElement('canvas');
+  #message = document.createElement('p');
 
   constructor() {
     super();
     const root = this.attachShadow({ mode: 'open' });
-    root.innerHTML = `<style>${STYLE}</style><canvas></canvas><p role="alert" hidden></p>`;
-    this.#canvas = root.querySelector('canvas');
-    this.#message = root.querySelector('p');
+    const style = document.createElement('style');
+    style.textContent = STYLE;
+    this.#message.role = 'alert';
+    this.#message.hidden = true;
+    root.append(style, this.#canvas, this.#message);
     this.speed = 1;
     this.loop = false;
     addControls(
@@ -47,6 +53,11 @@ class StgaAvatar extends HTMLElement {
     new ResizeObserver(() => this.#resize()).observe(this);
   }
 
+  /**
+   * @param {string} name
+   * @param {string | null} before
+   * @param {string | null} value
+   */
   attributeChangedCallback(name, before, value) {
     if (name === 'src' && value) this.load(value).catch(() => {});
     if (name === 'loop') this.loop = value !== null;
@@ -54,11 +65,15 @@ class StgaAvatar extends HTMLElement {
     if (name === 'background' && value && this.#player) this.background = value;
   }
 
-  /** Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array). Rejects, and says why on the page. */
+  /**
+   * Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of one). Rejects, and
+   * says why on the page.
+   * @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>} source
+   */
   async load(source) {
     const loading = ++this.#loading;
     try {
-      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(source);
+      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(await source);
       const data = await readData(bytes);
       if (loading !== this.#loading) return; // another load has begun
       this.#show(new Player(this.#canvas, data));
@@ -107,28 +122,38 @@ class StgaAvatar extends HTMLElement {
     this.#changed('pause');
   }
 
-  /** Replace an expression (its name or component) by a value; null: as recorded. */
+  /**
+   * Replace an expression (its name or component) by a value; null: as recorded.
+   * @param {string | number} name
+   * @param {number | null} value
+   */
   setExpression(name, value) {
     const component = this.#component(name);
-    this.#player.motion.pinnedCoefficients[component] = value ?? NaN;
+    this.#loaded.motion.pinnedCoefficients[component] = value ?? NaN;
     this.#posed();
   }
 
+  /** @param {string | number} name */
   getExpression(name) {
-    return this.#player.motion.coefficients[this.#component(name)];
+    return this.#loaded.motion.coefficients[this.#component(name)];
   }
 
-  /** Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded; null: all parts. */
+  /**
+   * Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded; null: all parts.
+   * @param {string} joint
+   * @param {ArrayLike<number | null> | null} rotation
+   */
   setPose(joint, rotation) {
     const at = 3 * this.#joint(joint);
-    const { pinnedPose } = this.#player.motion;
+    const { pinnedPose } = this.#loaded.motion;
     for (let k = 0; k < 3; k++) pinnedPose[at + k] = rotation?.[k] ?? NaN;
     this.#posed();
   }
 
+  /** @param {string} joint */
   getPose(joint) {
     const at = 3 * this.#joint(joint);
-    return Array.from(this.#player.motion.pose.subarray(at, at + 3));
+    return Array.from(this.#loaded.motion.pose.subarray(at, at + 3));
   }
 
   /** Give expressions and joints back to the recorded motion. */
@@ -137,17 +162,22 @@ class StgaAvatar extends HTMLElement {
     this.#posed();
   }
 
-  /** { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes, meters). */
+  /**
+   * { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes, meters).
+   * @returns {Camera | null}
+   */
   get camera() {
     return this.#player?.camera ?? null;
   }
 
-  /** A camera as above, or the name of one of the file's views. */
+  /**
+   * A camera as above, or the name of one of the file's views.
+   * @param {Camera | string} value
+   */
   set camera(value) {
-    const view = typeof value === 'string' ? this.info.views.find(({ name }) => name === value) : null;
-    if (typeof value === 'string' && !view) throw new RangeError(`There is no view "${value}".`);
-    this.#player.camera = view ? cameraOfView(view) : value;
-    this.#player.pivot = this.#player.middle;
+    const player = this.#loaded;
+    player.camera = typeof value === 'string' ? cameraOfView(this.#view(value)) : value;
+    player.pivot = player.middle;
     this.#changed('camerachange');
   }
 
@@ -159,7 +189,7 @@ class StgaAvatar extends HTMLElement {
   /** "#rrggbb" or "transparent". */
   get background() {
     const [red, green, blue, alpha] = this.#player?.background ?? [1, 1, 1, 1];
-    const hex = (part) =>
+    const hex = (/** @type {number} */ part) =>
       Math.round(255 * part)
         .toString(16)
         .padStart(2, '0');
@@ -167,12 +197,10 @@ class StgaAvatar extends HTMLElement {
   }
 
   set background(value) {
-    const parts = /^#(..)(..)(..)$/
-      .exec(value)
-      ?.slice(1)
-      .map((part) => parseInt(part, 16) / 255);
-    if (!parts && value !== 'transparent') throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
-    if (this.#player) this.#player.background = parts ? [...parts, 1] : [0, 0, 0, 0];
+    const digits = /^#([0-9a-f]{6})$/i.exec(value)?.[1];
+    if (!digits && value !== 'transparent') throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
+    const part = (/** @type {number} */ at) => parseInt((digits ?? '').slice(at, at + 2), 16) / 255;
+    if (this.#player) this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
     this.#request ||= requestAnimationFrame((now) => this.#tick(now));
   }
 
@@ -199,12 +227,16 @@ class StgaAvatar extends HTMLElement {
     return this.#player?.milliseconds ?? 0;
   }
 
-  /** The current frame as a PNG (Blob) from `camera`, by default the current one at its own size. */
-  async snapshot(camera = this.camera) {
-    const pixels = this.#player.read(camera);
+  /**
+   * The current frame as a PNG (Blob) from `camera`, by default the current one at its own size.
+   * @param {Camera} [camera]
+   * @returns {Promise<Blob | null>}
+   */
+  async snapshot(camera = this.#loaded.camera) {
+    const pixels = this.#loaded.read(camera);
     const picture = document.createElement('canvas');
     [picture.width, picture.height] = camera.size;
-    picture.getContext('2d').putImageData(new ImageData(pixels, ...camera.size), 0, 0);
+    picture.getContext('2d')?.putImageData(new ImageData(pixels, ...camera.size), 0, 0);
     return new Promise((resolve) => picture.toBlob(resolve, 'image/png'));
   }
 
@@ -213,18 +245,34 @@ class StgaAvatar extends HTMLElement {
     return this.#player;
   }
 
+  /** The player. Throws where no avatar is loaded. */
+  get #loaded() {
+    if (!this.#player) throw new Error('No avatar is loaded.');
+    return this.#player;
+  }
+
+  /** @param {string} name */
+  #view(name) {
+    const view = this.#loaded.data.header.views.find((found) => found.name === name);
+    if (!view) throw new RangeError(`There is no view "${name}".`);
+    return view;
+  }
+
+  /** @param {string | number} name */
   #component(name) {
-    const slider = this.info.sliders.find((found) => found.name === name || found.component === name);
+    const slider = this.#loaded.data.header.sliders.find((found) => found.name === name || found.component === name);
     if (!slider) throw new RangeError(`There is no expression "${name}".`);
     return slider.component;
   }
 
+  /** @param {string} name */
   #joint(name) {
-    const index = this.info.joints.indexOf(name);
+    const index = this.#loaded.data.header.joints.indexOf(name);
     if (index < 0) throw new RangeError(`There is no joint "${name}".`);
     return index;
   }
 
+  /** @param {Player} player */
   #show(player) {
     this.#player?.dispose();
     this.#player = null;
@@ -241,7 +289,10 @@ class StgaAvatar extends HTMLElement {
     this.#changed('frame'); // the first one is drawn once, as whoever waited for "load" wants it
   }
 
-  /** The graphics driver was restarted. */
+  /**
+   * The graphics driver was restarted.
+   * @param {Event} event
+   */
   #lose(event) {
     event.preventDefault(); // so that it will be given back
     this.#message.textContent = 'The graphics driver was restarted. Waiting for it …';
@@ -253,20 +304,27 @@ class StgaAvatar extends HTMLElement {
     if (!this.#player) return;
     const { camera, pivot, background, showSelection, data, motion } = this.#player;
     try {
-      this.#player = new Player(this.#canvas, data);
+      this.#player = Object.assign(new Player(this.#canvas, data), {
+        camera,
+        pivot,
+        background,
+        showSelection,
+        motion,
+      });
     } catch (error) {
       this.#fail(error);
       return;
     }
-    Object.assign(this.#player, { camera, pivot, background, showSelection, motion });
     this.#player.invalidate();
     this.#message.hidden = true;
     this.#changed('frame');
   }
 
+  /** @param {unknown} error */
   #fail(error) {
     const known = error instanceof DataError || error instanceof RendererError;
-    this.#message.textContent = known ? error.message : `The avatar cannot be shown: ${error.message}`;
+    const text = error instanceof Error ? error.message : String(error);
+    this.#message.textContent = known ? text : `The avatar cannot be shown: ${text}`;
     this.#message.hidden = false;
     this.#canvas.hidden = true;
     this.dispatchEvent(new CustomEvent('error', { detail: error }));
@@ -277,25 +335,32 @@ class StgaAvatar extends HTMLElement {
     this.#changed('frame');
   }
 
+  /** @param {string} event */
   #changed(event) {
     if (this.#player) this.#request ||= requestAnimationFrame((now) => this.#tick(now));
     this.#player?.motion.sample(this.#time); // what listeners ask for is that of the new frame
     this.dispatchEvent(new CustomEvent(event));
   }
 
+  /** @param {number} now */
   #tick(now) {
     this.#request = 0;
-    if (!this.#player || this.#player.gl.isContextLost()) return;
-    if (this.#playing) this.#advance(now);
-    this.#player.frame = this.#time;
-    this.#player.draw();
+    const player = this.#player;
+    if (!player || player.gl.isContextLost()) return;
+    if (this.#playing) this.#advance(now, player.data.header.fps);
+    player.frame = this.#time;
+    player.draw();
     if (this.#playing) this.#changed('frame');
   }
 
-  #advance(now) {
+  /**
+   * @param {number} now
+   * @param {number} fps
+   */
+  #advance(now, fps) {
     const step = this.#last ? Math.min(Math.max((now - this.#last) / 1000, 0), MAX_STEP_S) : 0;
     this.#last = now;
-    this.#time += step * this.info.fps * this.speed;
+    this.#time += step * fps * this.speed;
     const end = this.loop ? this.frameCount : this.frameCount - 1;
     if (this.#time < end) return;
     if (this.loop) this.#time %= this.frameCount;
@@ -312,6 +377,7 @@ class StgaAvatar extends HTMLElement {
   }
 }
 
+/** @param {string} address */
 async function fetchBytes(address) {
   const response = await fetch(address);
   if (!response.ok) throw new DataError(`${address} cannot be loaded (${response.status}).`);

@@ -1,6 +1,9 @@
+// @ts-check
 // Green's strain of the triangles against the neutral mesh, averaged over neighbors: three components, clipped; and
 // nearby strain, the same less that at rest, averaged over triangles that share an edge.
 // The rules are those of STGA for Blender's strain.py.
+
+/** @import { Values } from './types.js' */
 
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
@@ -10,7 +13,12 @@ const AVERAGING_ROUNDS = 3; // of nearby strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
 export class Strain {
-  /** faces (3·F), neutral (3·V) meters, range (6·F: lowest three, highest three) of strain; ±MAX_STRAIN without one. */
+  /**
+   * faces (3·F), neutral (3·V) meters, range (6·F: lowest three, highest three) of strain; ±MAX_STRAIN without one.
+   * @param {Values} faces
+   * @param {Values} neutral
+   * @param {Values} [range]
+   */
   constructor(faces, neutral, range) {
     this.faces = faces;
     const count = faces.length / 3;
@@ -26,8 +34,13 @@ export class Strain {
     for (let f = 0; f < count; f++) this.prepare(f, neutral);
   }
 
+  /**
+   * @param {number} f
+   * @param {Values} neutral
+   */
   prepare(f, neutral) {
-    const corner = (k) => neutral.subarray(3 * this.faces[3 * f + k], 3 * this.faces[3 * f + k] + 3);
+    const corner = (/** @type {number} */ k) =>
+      neutral.subarray(3 * this.faces[3 * f + k], 3 * this.faces[3 * f + k] + 3);
     const u = difference(corner(1), corner(0));
     const v = difference(corner(2), corner(0));
     this.gram.set([dotProduct(u, u), dotProduct(u, v), dotProduct(v, v)], 3 * f);
@@ -48,13 +61,19 @@ export class Strain {
     for (let k = 0; k < 18; k++) if (k % 6 > 2) this.toPlane[18 * f + k] *= 2;
   }
 
-  /** Follow the posed vertices (3·V). */
+  /**
+   * Follow the posed vertices (3·V).
+   * @param {Float64Array} vertices
+   */
   update(vertices) {
     this.spread(vertices);
     this.gather();
   }
 
-  /** Add every triangle's tensor to its three vertices, each of which takes its mean. */
+  /**
+   * Add every triangle's tensor to its three vertices, each of which takes its mean.
+   * @param {Float64Array} vertices
+   */
   spread(vertices) {
     const { faces, gram, toTensor, atVertex, share } = this;
     atVertex.fill(0);
@@ -109,7 +128,10 @@ export class Strain {
 
 /** Strain around each triangle, which positions follow: 0 for a mesh at rest. */
 export class NearbyStrain {
-  /** Of `strain` (Strain), which is to be updated first. */
+  /**
+   * Of `strain` (Strain), which is to be updated first.
+   * @param {Strain} strain
+   */
   constructor(strain) {
     const { faces, range } = strain;
     const count = faces.length / 3;
@@ -128,7 +150,10 @@ export class NearbyStrain {
     this.weigh(edgeCount);
   }
 
-  /** The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor` leaves it once. */
+  /**
+   * The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor` leaves it once.
+   * @param {number} edgeCount
+   */
   weigh(edgeCount) {
     const { edges, ownFactor, share } = this;
     const touching = new Int32Array(edgeCount);
@@ -177,20 +202,33 @@ export class NearbyStrain {
   }
 }
 
-/** [three times the index of the edge from each corner to the next (3·F), number of edges], by the edges' ends. */
+/**
+ * [three times the index of the edge from each corner to the next (3·F), number of edges], by the edges' ends.
+ * @param {Values} faces
+ * @returns {[Int32Array, number]}
+ */
 function edgesOf(faces) {
   const vertices = faces.reduce((most, vertex) => Math.max(most, vertex), 0) + 1;
+  /** @type {Map<number, number>} */
   const index = new Map();
   const edges = Int32Array.from(faces, (vertex, c) => {
     const next = faces[c % 3 < 2 ? c + 1 : c - 2];
     const ends = Math.min(vertex, next) * vertices + Math.max(vertex, next);
-    if (!index.has(ends)) index.set(ends, 3 * index.size);
-    return index.get(ends);
+    const known = index.get(ends) ?? 3 * index.size;
+    index.set(ends, known);
+    return known;
   });
   return [edges, index.size];
 }
 
-/** Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx. */
+/**
+ * Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
+ * @param {ArrayLike<number>} a
+ * @param {ArrayLike<number>} b
+ * @param {number} factor
+ * @param {Float32Array} out
+ * @param {number} at
+ */
 function symmetricProduct(a, b, factor, out, at) {
   for (let k = 0; k < 3; k++) {
     const next = (k + 1) % 3;

@@ -1,0 +1,109 @@
+// Types of the player, for `make lint-web`; the page holds none of them.
+
+export type Vector = [number, number, number];
+
+/** What the player uses of a Float32Array or Int32Array. */
+export interface Values extends ArrayLike<number>, Iterable<number> {
+  subarray(begin?: number, end?: number): Values;
+  every(test: (value: number) => boolean): boolean;
+  reduce(add: (sum: number, value: number) => number, start: number): number;
+}
+
+export interface DataArray {
+  shape: number[];
+  values: Values;
+}
+
+/** Entry of an array in the header of a data file (docs/formats.md), before it is checked. */
+export interface Entry {
+  type: unknown;
+  shape: number[];
+  planes: number;
+  low: number;
+  step: number;
+}
+
+export interface View {
+  name: string;
+  size: [number, number];
+  focal: [number, number];
+  center: [number, number];
+  world_to_camera: number[];
+}
+
+export interface Slider {
+  name: string;
+  component: number;
+  reach: number;
+}
+
+/** Header of a data file, checked. */
+export interface Header {
+  title: string;
+  convention: 'stga' | 'gaussian_avatars';
+  antialiased: boolean;
+  background: Vector;
+  fps: number;
+  up: Vector;
+  joints: string[];
+  parents: number[];
+  sliders: Slider[];
+  views: View[];
+}
+
+/** Arrays of a data file, checked. */
+export interface Arrays {
+  xyz: DataArray;
+  rotation: DataArray;
+  rotation_largest: DataArray;
+  log_scale: DataArray;
+  opacity: DataArray;
+  color: DataArray;
+  faces: DataArray;
+  neutral: DataArray;
+  splats_per_face: DataArray;
+  base: DataArray;
+  basis: DataArray;
+  correctives: DataArray;
+  weights: DataArray;
+  joint_rest: DataArray;
+  joint_basis: DataArray;
+  coefficients: DataArray;
+  pose: DataArray;
+  translation: DataArray;
+  selection?: DataArray;
+  sh?: DataArray;
+  strain_color?: DataArray;
+  strain_position?: DataArray;
+  strain_range?: DataArray;
+}
+
+export interface Data {
+  header: Header;
+  arrays: Arrays;
+}
+
+/** Pixels, and world to camera (16, row-major, OpenCV axes, meters). */
+export interface Camera {
+  size: [number, number];
+  focal: [number, number];
+  center: [number, number];
+  matrix: Float64Array;
+}
+
+/** Red, green, blue and alpha, 0 to 1. */
+export type Color = [number, number, number, number];
+
+export interface Program {
+  program: WebGLProgram;
+  uniforms: Record<string, WebGLUniformLocation | null>;
+}
+
+/** Texture that splats are blended into. */
+export interface Target {
+  texture: WebGLTexture;
+  framebuffer: WebGLFramebuffer;
+  format: number;
+  width: number;
+  height: number;
+}
