@@ -7,7 +7,8 @@ import numpy as np
 from ...capture.model import Capture, View
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
-from .backend import Batch, make_backend
+from .backend import Batch
+from .backends import make_backend
 from .flame_refinement import RefinementState, refinable_tracking, refinement_rate
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
