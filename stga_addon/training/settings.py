@@ -11,7 +11,8 @@ from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
 from ..schema import MAX_COUNT, build, complaint, setting, validate_fields
 from ..selection import SelectionOptions
-from .effects.decisions import CHOICES, EFFECTS
+from .effects.catalog import EFFECT_NAMES
+from .effects.decisions import CHOICES
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
 CONTINUATIONS = ("refine", "extend")
@@ -240,7 +241,7 @@ def validate(settings: TrainingSettings) -> None:
         if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
             raise StgaError(complaint("exposure", "rows of a camera index, three gains above 0, three offsets", row))
     effects = settings.effects or {}
-    if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
+    if not (set(effects) <= set(EFFECT_NAMES) and set(effects.values()) <= set(CHOICES)):
         raise StgaError(complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects)))
     if effects and (settings.schedule == "paper" or settings.strategy == "gaussian-avatars"):
         other = "--schedule paper" if settings.schedule == "paper" else "--strategy gaussian-avatars"
