@@ -88,7 +88,7 @@ class TrainingSettings:
     stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
-    strain_position  splats move with the strain around their triangle (`avatar.strain.nearby_strain`)
+    strain_position  splats move with the strain around their triangle (`avatar.strain.smoothed_strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its

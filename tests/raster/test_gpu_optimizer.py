@@ -63,7 +63,7 @@ def random_state(count: int = 700, seed: int = 1) -> State:
 
 def on_device(
     device: Device, state: State, weights: tuple[float, float, float] = (0, 0, 0), statistics: bool = False,
-    newest: float = 0.05, epsilon: float = EPSILON,
+    ema_share: float = 0.05, epsilon: float = EPSILON,
 ) -> State:  # fmt: skip
     """The state after a step; weights: of scale, distance, opacity."""
     n, upload = len(state.steps), device.upload
@@ -76,7 +76,7 @@ def on_device(
         traits=upload("test traits", np.stack([state.unbound, state.share], 1).astype(np.float32)),
     )  # fmt: skip
     splats, gradients = upload("test splats", state.splats), upload("test gradients", state.gradients)
-    upload_step(device, RATES, (BETA1, BETA2), epsilon, newest, weights, statistics)
+    upload_step(device, RATES, (BETA1, BETA2), epsilon, ema_share, weights, statistics)
     with device.record() as work:
         optimize(
             work, n, STRIDE, tables, any(weights[:2]), view=upload("view", view, "uniform"), splats=splats,
@@ -91,7 +91,7 @@ def on_device(
     )  # fmt: skip
 
 
-def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), newest: float = 0.05) -> State:
+def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), ema_share: float = 0.05) -> State:
     """The same by the CPU's kernels."""
     state, rows = state.copy(), np.flatnonzero(state.wanted).astype(np.int32)
     splats, gradients = split_rows(state.splats, COEFFICIENTS), split_rows(state.gradients, COEFFICIENTS)
@@ -108,7 +108,7 @@ def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), newest
         row[:] = RATES[name]
     rates[4, 3:] = RATES["sh_rest"]
     flat = [tuple(part.reshape(len(part), -1) for part in table) for table in (splats, gradients, *tables)]
-    adam_rows(rows, state.steps, *flat, rates, BETA1, BETA2, EPSILON, np.float32(newest))
+    adam_rows(rows, state.steps, *flat, rates, BETA1, BETA2, EPSILON, np.float32(ema_share))
     names = ("splats", "gradients", "first", "second", "average")
     rows_of = {name: splat_rows(table) for name, table in zip(names, (splats, gradients, *tables), strict=True)}
     return replace(state, **rows_of)
@@ -167,7 +167,7 @@ def test_a_step_at_any_age(device: Device, steps: int) -> None:
     """Catches 1 − βⁿ computed as a difference of nearly equal numbers; compared with float64."""
     state = random_state(64)
     state.wanted[:], state.steps[:] = True, steps
-    got = on_device(device, state, newest=0.0)
+    got = on_device(device, state, ema_share=0.0)
     n, beta1, beta2 = steps + 1.0, float(BETA1), float(BETA2)
     first = beta1 * state.first.astype(float) + (1 - beta1) * state.gradients
     second = beta2 * state.second.astype(float) + (1 - beta2) * state.gradients.astype(float) ** 2

@@ -17,19 +17,19 @@ MAX_GRADIENT = np.float32(1e18)
 @jit
 def adam_rows(
     first_row, past_row, rows, steps, parameters, gradients, firsts, seconds, averages, rates, beta1, beta2, epsilon,
-    newest,
+    ema_share,
 ):  # fmt: skip
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
     parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
-    (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
-    `newest`, or 4 / (steps + 3) where that is more, because the first steps are long. Rows that are
-    not listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that
-    parameter, its moments and its average.
+    (P, max D): learning rate by parameter and column. The stepped value enters its exponential moving average with the
+    share `ema_share`, or 4 / (steps + 3) where that is more, because the first steps are long. Rows that are not
+    listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter,
+    its moments and its average.
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(beta1), math.log(beta2)
-    correct1, correct2, blend = (
+    correct1, correct2, ema_shares = (
         np.empty(ROWS_PER_BLOCK, np.float32),
         np.empty(ROWS_PER_BLOCK, np.float32),
         np.empty(ROWS_PER_BLOCK, np.float32),
@@ -41,17 +41,17 @@ def adam_rows(
             count = np.float64(steps[rows[n]])
             correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
             correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
-            blend[n - begin] = max(np.float64(newest), 4.0 / (count + 3.0))
+            ema_shares[n - begin] = max(np.float64(ema_share), 4.0 / (count + 3.0))
         for p in range(len(parameters)):
             _adam_block(
                 rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], averages[p],
-                correct1, correct2, blend, rates[p], beta1, beta2, epsilon,
+                correct1, correct2, ema_shares, rates[p], beta1, beta2, epsilon,
             )  # fmt: skip
 
 
 @part_jit
 def _adam_block(
-    rows, parameter, gradient, first, second, average, correct1, correct2, blend, rates, beta1, beta2, epsilon
+    rows, parameter, gradient, first, second, average, correct1, correct2, ema_shares, rates, beta1, beta2, epsilon
 ):
     """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorizes."""
     width = parameter.shape[1]
@@ -62,7 +62,7 @@ def _adam_block(
             invalid += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
         if invalid != ZERO:
             continue
-        scale1, scale2, share = correct1[n], correct2[n], blend[n]
+        scale1, scale2, share = correct1[n], correct2[n], ema_shares[n]
         for c in range(width):
             g = gradient[i, c]
             m = beta1 * first[i, c] + (ONE - beta1) * g

@@ -148,7 +148,9 @@ def strain_color(facts: CaptureFacts) -> Verdict:
 
 def strain_position(facts: CaptureFacts) -> Verdict:
     return _undeformed(facts, "positions follow") or _dependent(
-        "triangles' colors depend on deformation around them", facts.nearby_dependence, facts.nearby_dependence_known
+        "triangles' colors depend on deformation around them",
+        facts.smoothed_strain_dependence,
+        facts.smoothed_strain_dependence_known,
     )
 
 

@@ -21,13 +21,13 @@ def step(
     state: TrainState,
     rows: np.ndarray,
     rates: Mapping[str, float],
-    averaging: float = 1.0,
+    ema_share: float = 1.0,
     epsilon: np.float32 = EPSILON,
 ) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
-    averaging  weight of the stepped row in its running average; with 1, the average is the row
+    ema_share  least share of the stepped row in its exponential moving average; with 1, the average is the row
     epsilon    added to the root of the second moment; `image_epsilon` in training
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
@@ -40,7 +40,7 @@ def step(
             row[3:] = rates["sh_rest"]
     adam_rows(
         rows, state.steps.numpy(), _tables(state.parameters), _tables(state.gradients), _tables(state.first),
-        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, epsilon, np.float32(averaging),
+        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, epsilon, np.float32(ema_share),
     )  # fmt: skip
 
 

@@ -50,4 +50,4 @@ class Backend(Protocol):
         """Forward, backward and optimizer step. Returns the latest image loss that has become available, if any."""
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' running average: a new (3, H, W) float32 image over background (3,)."""
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over background (3,)."""

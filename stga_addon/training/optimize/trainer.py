@@ -125,7 +125,7 @@ class Trainer:
         return loss
 
     def render(self, view: View, progress: float = 1.0) -> np.ndarray:
-        """The view with the splats' running average: a new (3, H, W) float32 image over the background."""
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
     def _post_step(self, progress: float) -> None:
