@@ -7,7 +7,14 @@ import pytest
 
 from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.cpu.optimizer import adam_rows, distance_limit, opacity_weight, scale_limit
+from stga_addon.raster.cpu.optimizer import (
+    AdamOptions,
+    AdamTables,
+    adam_rows,
+    distance_limit,
+    opacity_weight,
+    scale_limit,
+)
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import VIEW, splat_rows, split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
@@ -103,12 +110,15 @@ def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), ema_sh
     if weights[1]:
         distance_limit(rows, splats.xyz, *given, state.limits[2].copy(), weights[1], gradients.xyz)
     tables = [split_rows(table, COEFFICIENTS) for table in (state.first, state.second, state.average)]
-    rates = np.zeros((6, 3 * COEFFICIENTS), np.float32)
-    for row, name in zip(rates, Parameters._fields, strict=True):
-        row[:] = RATES[name]
-    rates[4, 3:] = RATES["sh_rest"]
-    flat = [tuple(part.reshape(len(part), -1) for part in table) for table in (splats, gradients, *tables)]
-    adam_rows(rows, state.steps, *flat, rates, BETA1, BETA2, EPSILON, np.float32(ema_share))
+    parameters = []
+    for name, *parts in zip(Parameters._fields, splats, gradients, *tables, strict=True):
+        flat = [part.reshape(len(part), -1) for part in parts]
+        rates = np.full(flat[0].shape[1], RATES[name], np.float32)
+        if name == "sh":
+            rates[3:] = RATES["sh_rest"]
+        parameters.append(AdamTables(*flat, rates))
+    options = AdamOptions(BETA1, BETA2, EPSILON, np.float32(ema_share))
+    adam_rows(rows, state.steps, tuple(parameters), options)
     names = ("splats", "gradients", "first", "second", "average")
     rows_of = {name: splat_rows(table) for name, table in zip(names, (splats, gradients, *tables), strict=True)}
     return replace(state, **rows_of)

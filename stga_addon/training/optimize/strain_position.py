@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...raster.cpu.optimizer import adam_rows, sum_by_triangle
+from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
 from .adam import BETA1, BETA2
 from .state import StrainPosition
 
@@ -29,14 +29,8 @@ def step(
     total, trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
     sum_by_triangle(rows, face, xyz_gradient, total, trained)
     gradient = smoothed[:, :, None] * total[:, None, :]
-    rates = np.full((1, gradient[0].size), RATE_SHARE * position_rate, np.float32)
-    adam_rows(
-        np.flatnonzero(trained).astype(np.int32), state.steps, _table(state.value), _table(gradient),
-        _table(state.first), _table(state.second), _table(state.average), rates, BETA1, BETA2, epsilon,
-        np.float32(ema_share),
-    )  # fmt: skip
-
-
-def _table(array: np.ndarray) -> tuple[np.ndarray]:
-    """(F, 9), which shares memory with the array (F, 3, 3)."""
-    return (array.reshape(len(array), -1),)
+    rates = np.full(gradient[0].size, RATE_SHARE * position_rate, np.float32)
+    arrays = (state.value, gradient, state.first, state.second, state.average)
+    tables = AdamTables(*(array.reshape(count, -1) for array in arrays), rates)
+    options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
+    adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)
