@@ -131,7 +131,7 @@ def kernel_table(backend: GpuBackend, batch: Batch, repeats: int) -> dict[str, f
     if "timestamp-query" not in device.gpu.features:
         print("No times of kernels: the adapter has no timestamps")
         return {}
-    device.kernel_times = KernelTimes(device)
+    device.kernel_times = KernelTimes(device.gpu)
     for _ in range(repeats):
         backend.step(batch)
     found = {name: ms / repeats for name, ms in device.kernel_times.read().items()}

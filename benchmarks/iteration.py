@@ -35,7 +35,8 @@ from stga_addon.raster.cpu.threads import threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.backend import Backend, Batch, make_backend
+from stga_addon.training.optimize.backend import Backend, Batch
+from stga_addon.training.optimize.backends import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.losses import image_gradient, whole_image
 from stga_addon.training.optimize.state import new_state

@@ -8,16 +8,15 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.worker.environment import (
+from ..stga_addon.requests.environment_job import (
     PYPI_SIZE_GB,
     SIZE_GB,
     TRACKING_GB,
     check_arguments,
-    find_training_python,
     make_arguments,
-    status_folder,
 )
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.worker.environment import find_training_python, status_folder
 from ..stga_addon.worker.launch import prepare_status_folder, start_worker
 from ..stga_addon.worker.status import WorkerState, inspect_worker, request_cancel
 from . import ids, monitor

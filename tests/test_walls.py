@@ -1,6 +1,7 @@
 """The walls between the packages, read from the source's imports."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,8 @@ SHIPPED = ("__init__.py", "operators", "ui", "stga_addon")
 SOURCES = sorted(
     path for name in SHIPPED for path in ([ROOT / name] if name.endswith(".py") else (ROOT / name).rglob("*.py"))
 )
+MODULE_NAME = re.compile(r"(?:(\.+)|stga_addon\.)([a-z_]\w*(?:\.[a-z_]\w*)*)", re.ASCII)
+"""A string that may name a module, relative or absolute."""
 BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
 HEAVY = {"torch", "numba", "wgpu"}
 # A module may import from layers before its own; a package counts as its first name.
@@ -36,6 +39,8 @@ LAYERS = (
     {"development"},
     {"__main__", "__init__"},
 )
+NAMED_WHERE_THERE = {"stga_addon/cli/main.py": "development"}
+"""Files that name modules of a room after their own, because the extension's zip leaves that room out."""
 LIGHT = (
     "errors",
     "files",
@@ -62,6 +67,56 @@ def imports(path: Path) -> Iterator[tuple[str, int]]:
         elif isinstance(node, ast.ImportFrom):
             prefix = f"{node.module}." if node.module else ""
             yield from ((prefix + alias.name, node.level) for alias in node.names)
+
+
+def imports_by_name(path: Path) -> Iterator[tuple[str, int]]:
+    """The same for every string that is the name of a module, whatever reads it: `import_module`, `find_spec`, a table
+    of them, or another Python after `-m`."""
+    depth = len(path.relative_to(ROOT).parts)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = node.value if isinstance(node, ast.Constant) else None
+        found = MODULE_NAME.fullmatch(text) if isinstance(text, str) else None
+        if found is None:
+            continue
+        module, level = (found[2], len(found[1])) if found[1] else (f"stga_addon.{found[2]}", depth)
+        if level <= depth and module_file(path.parents[level - 1].joinpath(*module.split("."))):
+            inside = level == depth and path.is_relative_to(ROOT / "stga_addon")  # has no name for the folder above
+            yield (module.removeprefix("stga_addon."), level - 1) if inside else (module, level)
+
+
+def module_file(path: Path) -> Path | None:
+    """The source of the module or package at a path without suffix."""
+    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
+
+
+def imported_file(path: Path, module: str, level: int) -> Path | None:
+    """The source file that an import in `path` is of; None where it is none of this package's."""
+    if level == 0:
+        return None
+    target = path.parents[level - 1].joinpath(*module.split("."))
+    return module_file(target) or module_file(target.parent)
+
+
+def import_graph() -> dict[Path, set[Path]]:
+    """File -> the other files that it imports."""
+    return {
+        path: {
+            found
+            for each in (*imports(path), *imports_by_name(path))
+            if (found := imported_file(path, *each)) not in (None, path)
+        }
+        for path in SOURCES
+    }
+
+
+def reached(graph: dict[Path, set[Path]], path: Path) -> set[Path]:
+    """All files that a file imports, or that those import in turn."""
+    seen, left = set[Path](), [path]
+    while left:
+        new = graph[left.pop()] - seen
+        seen |= new
+        left += new
+    return seen
 
 
 def test_the_walls_are_looked_at():
@@ -105,7 +160,9 @@ def test_imports_run_one_way(path):
     """Catches cycles, and an engine that knows of the scene or the command line."""
     parts = path.relative_to(ROOT / "stga_addon").with_suffix("").parts
     own = layer(parts[0])
-    for module, level in imports(path):
+    optional = NAMED_WHERE_THERE.get(name_of(path))
+    named = [each for each in imports_by_name(path) if each[0].split(".")[0] != optional]
+    for module, level in (*imports(path), *named):
         # level 1 from stga_addon/x.py, level 2 from stga_addon/x/y.py, 3 from stga_addon/x/y/z.py reach stga_addon
         if level == 0 or level < len(parts):
             continue
@@ -114,6 +171,40 @@ def test_imports_run_one_way(path):
         if other == parts[0]:
             continue
         assert layer(other) < own or {parts[0], other} <= {"avatar", "selection"}, f"{name_of(path)} imports {module}"
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    """Catches circles inside a room, those of types only, and those through modules that are loaded by name."""
+    graph = import_graph()
+    assert not [name_of(path) for path in SOURCES if path in reached(graph, path)]
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        ("from . import b", "a/b.py"),
+        ("from .b import name", "a/b.py"),
+        ("def run():\n    from ..c import name", "c/__init__.py"),
+        ("if TYPE_CHECKING:\n    from ..c.d import name", "c/d.py"),
+        ("import_module('..c.d', __package__)", "c/d.py"),
+        ("NAMES = ('.b',)", "a/b.py"),
+        ("command = ['stga_addon.c.d', 'check']", "c/d.py"),
+        ("command = [f'{__package__}.b']", "a/b.py"),
+    ],
+)
+def test_every_way_to_import_is_seen(source, target, tmp_path, monkeypatch):
+    """Catches a circle that hides: in a function, behind TYPE_CHECKING, or in a string."""
+    files = [
+        tmp_path / "stga_addon" / name for name in ("a/a.py", "a/b.py", "a/__init__.py", "c/__init__.py", "c/d.py")
+    ]
+    for path in files:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(source if path.name == "a.py" else "NAME = '.npz', 'stga_addon.none', '..c.none'\n")
+    monkeypatch.setitem(globals(), "ROOT", tmp_path)
+    monkeypatch.setitem(globals(), "SOURCES", files)
+    graph = import_graph()
+    assert graph.pop(files[0]) == {tmp_path / "stga_addon" / target}
+    assert not any(graph.values())
 
 
 def layer(name: str) -> int:

@@ -12,9 +12,9 @@ import numpy as np
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
-from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames, position_shift, shifted_frames
+from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames, shifted_frames, strain_offset
 from .splats import MAX_SH_DEGREE, Splats
-from .strain import STRAIN_COMPONENTS, StrainBasis, nearby_strain, strain_basis
+from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain, strain_basis
 
 FORMAT = "stga-avatar"
 VERSION = 2
@@ -36,8 +36,8 @@ class Avatar:
     principal_point  convention of the capture that it was trained on (`read_transforms`)
     strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and positions follow
                 (`avatar.strain`); None: the same for all, ±MAX_STRAIN
-    strain_position  (F, 3, 3) float32 how far a triangle's splats move with its `nearby_strain`: for each component of
-                strain a vector in the triangle's frame; None where positions follow the mesh alone
+    strain_position  (F, 3, 3) float32 how far a triangle's splats move with its `smoothed_strain`: for each component
+                a vector in the triangle's frame; None where positions follow the mesh alone
     """
 
     splats: Splats
@@ -63,7 +63,7 @@ class Avatar:
         frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
         if self.strain_position is None or basis is None:
             return frames
-        return shifted_frames(frames, position_shift(self.strain_position, nearby_strain(basis, frames.strain)))
+        return shifted_frames(frames, strain_offset(self.strain_position, smoothed_strain(basis, frames.strain)))
 
     @cached_property
     def _areas(self) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,21 @@ RANGE_MARGIN = 1.2
 """How far from rest splats follow a triangle's strain, as a multiple of what was seen: training may have seen a few
 timesteps more than were measured, and refined tracking moves them."""
 AVERAGING_ROUNDS = 3
-"""How often `nearby_strain` averages over triangles that share an edge: a bulge moves more than one triangle."""
+"""How often `smoothed_strain` averages over triangles that share an edge: a bulge moves more than one triangle."""
 MIN_SQUARED_NORMAL = 1e-24
 """Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
+
+
+class IndexLists(NamedTuple):
+    """Lists of indices, compressed: the i-th is indices[indptr[i] : indptr[i + 1]]."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Length of each list."""
+        return np.diff(self.indptr)
 
 
 @dataclass(frozen=True)
@@ -35,12 +47,11 @@ class StrainBasis:
     to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
     to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear; both float32.
     corners (3, F): `faces` by corner.
-    rank (3, F): the same, with vertices counted by how many triangles touch them, most first.
-    touching: of each of the first vertices in that order its first triangle, of those with two their second, …
-    share (T, 1): a third of one over how many triangles touch each vertex in that order.
+    vertex_faces: V lists of the triangles that touch a vertex.
+    vertex_weight (V,): a third of one over how many these are.
     range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
-    neighbors: arrays (F,): a triangle that shares an edge with each triangle, another one, …; F where there is none.
-    neighbor_share (F, 1): one over how many neighbors a triangle has and itself.
+    neighbors: `edge_neighbors`.
+    neighbor_weight (F,): one over how many neighbors a triangle has and itself.
     """
 
     faces: np.ndarray
@@ -48,12 +59,11 @@ class StrainBasis:
     to_tensor: np.ndarray
     to_plane: np.ndarray
     corners: np.ndarray
-    rank: np.ndarray
-    touching: list[np.ndarray]
-    share: np.ndarray
+    vertex_faces: IndexLists
+    vertex_weight: np.ndarray
     range: np.ndarray
-    neighbors: list[np.ndarray]
-    neighbor_share: np.ndarray
+    neighbors: IndexLists
+    neighbor_weight: np.ndarray
 
 
 def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None) -> StrainBasis:
@@ -71,9 +81,8 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
     along = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, _dot(d1, d1))))[:, None] * d1
     across = np.cross(normal, along) * np.sqrt(inverse)
     corners = np.ascontiguousarray(faces.T, np.intp)
-    order, count, touching = _touching(corners, len(neutral))
+    vertex_faces = _index_lists(corners.ravel(), np.tile(np.arange(len(faces)), 3), len(neutral))
     neighbors = edge_neighbors(faces)
-    sharing = sum((column < len(faces) for column in neighbors), np.zeros(len(faces), np.float32))
     twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
     if strain_range is None:
         ends = np.array([[-MAX_STRAIN], [MAX_STRAIN]], np.float32)
@@ -89,27 +98,29 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
             np.float32,
         ),
         corners=corners,
-        rank=np.argsort(order)[corners],
-        touching=touching,
-        share=(1 / (3 * count[:, None])).astype(np.float32),
+        vertex_faces=vertex_faces,
+        vertex_weight=(1 / (3 * np.maximum(vertex_faces.counts, 1))).astype(np.float32),
         range=_by_component(strain_range),
         neighbors=neighbors,
-        neighbor_share=(1 / (1 + sharing))[:, None].astype(np.float32),
+        neighbor_weight=(1 / (1 + neighbors.counts)).astype(np.float32),
     )
 
 
-def _touching(corners: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Vertices by how many triangles touch them, most first; how many, where any do; `StrainBasis.touching`."""
-    count = np.bincount(corners.ravel(), minlength=n_vertices)
-    order = np.argsort(-count, kind="stable")
-    triangles = np.argsort(corners.ravel(), kind="stable") % corners.shape[1]
-    first, sorted_count = (np.cumsum(count) - count)[order], count[order]
-    touching = [triangles[first[sorted_count > nth] + nth] for nth in range(max(sorted_count[0], 1))]
-    return order, sorted_count[sorted_count > 0], touching
+def _index_lists(owners: np.ndarray, indices: np.ndarray, count: int) -> IndexLists:
+    """The lists of `count` owners, from pairs of an owner (N,) and an index (N,), which stay in order."""
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=count))])
+    return IndexLists(indptr, indices[np.argsort(owners, kind="stable")])
 
 
-def edge_neighbors(faces: np.ndarray) -> list[np.ndarray]:
-    """Arrays (F,) of the triangles that share an edge with each of faces (F, 3), once an edge; F where there is none.
+def _add_listed(lists: IndexLists, rows: np.ndarray, total: np.ndarray) -> None:
+    """Add to the columns of total (·, L) the columns of rows (·, N) that each of L lists names, in the list's order."""
+    owner = np.repeat(np.arange(len(lists.counts)), lists.counts)
+    for row, sums in zip(rows, total, strict=True):
+        np.add.at(sums, owner, np.take(row, lists.indices))
+
+
+def edge_neighbors(faces: np.ndarray) -> IndexLists:
+    """F lists of the triangles that share an edge with each of faces (F, 3), once an edge.
 
     An edge of more than two triangles makes all of them neighbors.
     """
@@ -119,35 +130,27 @@ def edge_neighbors(faces: np.ndarray) -> list[np.ndarray]:
     order = np.argsort(edge, kind="stable")
     owner, size = order // 3, count[edge[order]]
     place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
-    pairs = []
+    pairs = [np.zeros((0, 2), np.intp)]
     for step in range(1, int(count.max(initial=1))):
         other = owner[np.arange(len(order)) - place + (place + step) % size]
         shared = (size > step) & (other != owner)
         pairs.append(np.stack([owner[shared], other[shared]], -1))
-    one, other = np.concatenate([*pairs, np.zeros((0, 2), np.intp)]).T
-    by_one = np.argsort(one, kind="stable")
-    one, other = one[by_one], other[by_one]
-    rank = np.arange(len(one)) - np.searchsorted(one, one)
-    neighbors = [np.full(len(faces), len(faces), np.intp) for _ in range(int(rank.max(initial=-1)) + 1)]
-    for nth, column in enumerate(neighbors):
-        column[one[rank == nth]] = other[rank == nth]
-    return neighbors
+    one, other = np.concatenate(pairs).T
+    return _index_lists(one, other, len(faces))
 
 
-def nearby_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
+def smoothed_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
     """Strain (F, 3) float32 around each triangle, which positions follow: 0 for a mesh at rest.
 
     strain (F, 3): of `face_strain`. Less that at rest, then AVERAGING_ROUNDS times the mean of a triangle and those
     that share an edge with it, component by component.
     """
-    rows = np.zeros((len(strain) + 1, STRAIN_COMPONENTS), np.float32)  # the last one for a neighbor that is missing
-    rows[:-1] = strain - rest_strain(basis.range)
+    smoothed = np.ascontiguousarray((strain - rest_strain(basis.range)).T, np.float32)
     for _ in range(AVERAGING_ROUNDS):
-        total = rows[:-1].copy()
-        for column in basis.neighbors:
-            total += np.take(rows, column, axis=0)
-        np.multiply(total, basis.neighbor_share, out=rows[:-1])
-    return rows[:-1]
+        total = smoothed.copy()
+        _add_listed(basis.neighbors, smoothed, total)
+        smoothed = total * basis.neighbor_weight
+    return np.ascontiguousarray(smoothed.T)
 
 
 def color_range(count: int) -> np.ndarray:
@@ -197,15 +200,10 @@ def gram_strain(basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.nd
     # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time of short columns.
     change = np.asarray(np.stack([d11, d12, d22]) - basis.gram.T, np.float32)
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
-    tensors = np.ascontiguousarray(tensor.T)  # as rows again: what is gathered lies side by side
-    at_vertex = np.take(tensors, basis.touching[0], axis=0)
-    for triangles in basis.touching[1:]:
-        at_vertex[: len(triangles)] += np.take(tensors, triangles, axis=0)
-    at_vertex *= basis.share
-    averaged = np.take(at_vertex, basis.rank[0], axis=0)
-    for corner in basis.rank[1:]:
-        averaged += np.take(at_vertex, corner, axis=0)
-    strain = np.einsum("df,kdf->kf", np.ascontiguousarray(averaged.T), basis.to_plane.transpose(1, 2, 0))
+    at_vertex = np.zeros((len(tensor), len(basis.vertex_weight)), np.float32)
+    _add_listed(basis.vertex_faces, tensor, at_vertex)
+    p0, p1, p2 = np.take(at_vertex * basis.vertex_weight, basis.corners, axis=1).transpose(1, 0, 2)
+    strain = np.einsum("df,kdf->kf", p0 + p1 + p2, basis.to_plane.transpose(1, 2, 0))
     lowest, highest = basis.range.transpose(1, 2, 0)
     within = np.minimum(np.maximum(np.float32(STRAIN_GAIN) * strain, lowest), highest)
     return np.ascontiguousarray(within.T)

@@ -11,17 +11,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from ..errors import StgaError
+from ..requests.environment_job import check_python, make_arguments, remove_environment, store_choice
 from ..requests.open_head import OpenHead
-from ..worker.environment import (
-    PYTHON_VARIABLE,
-    check_python,
-    find_training_python,
-    made_python,
-    make_arguments,
-    remove_environment,
-    status_folder,
-    store_choice,
-)
+from ..worker.environment import PYTHON_VARIABLE, find_training_python, made_python, status_folder
 from ..worker.launch import prepare_status_folder, start_worker
 from ..worker.status import inspect_worker, request_cancel
 from .arguments import usable_path

@@ -10,7 +10,8 @@ from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
-from .effects.decisions import CHOICES, EFFECTS
+from .effects.catalog import EFFECT_NAMES
+from .effects.decisions import CHOICES
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
 CONTINUATIONS = ("refine", "extend")
@@ -86,7 +87,7 @@ class TrainingSettings:
     stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
-    strain_position  splats move with the strain around their triangle (`avatar.strain.nearby_strain`)
+    strain_position  splats move with the strain around their triangle (`avatar.strain.smoothed_strain`)
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
@@ -153,7 +154,7 @@ class TrainingSettings:
                 expected = "rows of a camera index, three gains above 0, three offsets"
                 raise StgaError(complaint("exposure", expected, row))
         effects = self.effects or {}
-        if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
+        if not (set(effects) <= set(EFFECT_NAMES) and set(effects.values()) <= set(CHOICES)):
             raise StgaError(complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects)))
         if effects and (self.schedule == "paper" or self.strategy == "gaussian-avatars"):
             other = "--schedule paper" if self.schedule == "paper" else "--strategy gaussian-avatars"

@@ -18,8 +18,8 @@ from stga_addon.avatar.strain import (
     color_range,
     edge_neighbors,
     face_strain,
-    nearby_strain,
     seen_range,
+    smoothed_strain,
     strain_basis,
 )
 from stga_addon.capture.camera import Camera
@@ -199,26 +199,56 @@ def following(neutral: np.ndarray, seed: int = 0) -> Avatar:
 def test_neighbors_share_an_edge() -> None:
     """Catches triangles that touch at a corner only, an edge of three triangles, and one that is its own neighbor."""
     fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [4, 1, 5], [5, 6, 7], [8, 8, 9]])
-    found = [sorted(int(column[f]) for column in edge_neighbors(fan) if column[f] < len(fan)) for f in range(len(fan))]
+    indptr, indices = edge_neighbors(fan)
+    found = [sorted(indices[indptr[f] : indptr[f + 1]].tolist()) for f in range(len(fan))]
     edges = [{frozenset((int(a), int(b))) for a, b in zip(face, np.roll(face, -1), strict=True)} for face in fan]
     expected = [[g for g in range(len(fan)) if g != f and edges[f] & edges[g]] for f in range(len(fan))]
     assert found == expected == [[1, 2], [0, 2], [0, 1, 3], [2], [], []]
 
 
-def test_nearby_strain_is_averaged_over_edges() -> None:
+def finned_sheet(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a mesh with a boundary, an edge of three triangles, and a vertex without any."""
+    faces = np.concatenate([FACES[[2, 0]], [[2, 1, 5]], FACES[[3, 1]]])
+    return np.concatenate([sheet(seed), [[0.01, 0.006, 0.012], [1, 1, 1]]]), faces
+
+
+def test_strain_is_averaged_over_whatever_touches() -> None:
+    """Catches lists of another vertex or triangle, and a weight that is not one over their length: plain loops over a
+    mesh with a boundary, an edge of three triangles, and a vertex that no triangle touches."""
+    (neutral, faces), (posed, _) = finned_sheet(), finned_sheet(3)
+    axes, tensors = [], []
+    for face in faces:
+        first, second = neutral[face[1]] - neutral[face[0]], neutral[face[2]] - neutral[face[0]]
+        normal = np.cross(first, second)
+        axes.append((first / np.linalg.norm(first), np.cross(normal, first) / np.linalg.norm(np.cross(normal, first))))
+        (along, across), edges = axes[-1], np.stack([first, second, normal], 1)
+        moved = np.stack([posed[face[1]] - posed[face[0]], posed[face[2]] - posed[face[0]]], 1)
+        deformation = moved @ np.linalg.pinv(edges[:, :2])
+        plane = np.outer(along, along) + np.outer(across, across)
+        tensors.append((deformation.T @ deformation - plane) / 2)
+    at_vertex = [np.mean([t for t, face in zip(tensors, faces, strict=True) if v in face], 0) for v in range(6)]
+    for f, (along, across) in enumerate(axes):
+        mean = np.mean([at_vertex[v] for v in faces[f]], 0)
+        expected = 5 * np.array([along @ mean @ along, across @ mean @ across, along @ mean @ across])
+        assert np.abs(expected).max() > 0.1
+        found = face_strain(strain_basis(neutral, faces), posed)[f]
+        np.testing.assert_allclose(found, np.clip(expected, -MAX_STRAIN, MAX_STRAIN), atol=1e-5)
+
+
+def test_smoothed_strain_is_averaged_over_edges() -> None:
     """Catches another weight or number of rounds, and a mesh at rest that is not zero."""
-    neutral, posed = sheet(), sheet(3)
-    basis = strain_basis(neutral, FACES, color_range(len(FACES)))
+    (neutral, faces), (posed, _) = finned_sheet(), finned_sheet(3)
+    basis = strain_basis(neutral, faces, color_range(len(faces)))
     strain = face_strain(basis, posed)
-    average = np.zeros((len(FACES), len(FACES)))
-    for f, columns in enumerate(zip(*edge_neighbors(FACES), strict=True)):
-        members = [f, *(int(g) for g in columns if g < len(FACES))]
+    average = np.zeros((len(faces), len(faces)))
+    for f in range(len(faces)):
+        members = [g for g in range(len(faces)) if len(set(faces[f]) & set(faces[g])) >= 2]
         average[f, members] = 1 / len(members)
     expected = np.linalg.matrix_power(average, AVERAGING_ROUNDS) @ (strain - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0])
-    np.testing.assert_allclose(nearby_strain(basis, strain), expected, atol=1e-6)
+    np.testing.assert_allclose(smoothed_strain(basis, strain), expected, atol=1e-6)
     assert np.abs(expected).max() > 0.1
     turned = neutral @ Rotation.from_rotvec([0.3, 1, -2]).as_matrix().T
-    np.testing.assert_allclose(nearby_strain(basis, face_strain(basis, turned)), 0, atol=1e-6)
+    np.testing.assert_allclose(smoothed_strain(basis, face_strain(basis, turned)), 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -229,9 +259,9 @@ def test_positions_follow_strain(convention: str, tmp_path: Path) -> None:
     write_avatar(tmp_path / "a.npz", avatar)
     found = read_avatar(tmp_path / "a.npz")
     basis = strain_basis(neutral, FACES)
-    nearby = nearby_strain(basis, face_strain(basis, posed)).astype(np.float64)
+    smoothed = smoothed_strain(basis, face_strain(basis, posed)).astype(np.float64)
     assert avatar.strain_position is not None
-    shift = [sum(nearby[f, k] * avatar.strain_position[f, k] for k in range(3)) for f in range(len(FACES))]
+    shift = [sum(smoothed[f, k] * avatar.strain_position[f, k] for k in range(3)) for f in range(len(FACES))]
     shifted = replace(avatar.splats, xyz=(avatar.splats.xyz + np.array(shift)[avatar.splats.face]).astype(np.float32))
     plain = face_frames(posed, FACES, neutral, convention)
     baked = to_world(found.splats, found.frames(posed))

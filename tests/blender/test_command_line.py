@@ -179,7 +179,7 @@ def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_p
     place = tmp_path / "environment"
     for module in (operators, extension.operators.command_line):
         monkeypatch.setattr(module, "environment_folder", lambda create=False: place)
-    monkeypatch.setattr(worker, "check_python", lambda python, folder: "good")
+    monkeypatch.setattr(extension.stga_addon.requests.environment_job, "check_python", lambda python, folder: "good")
     assert stga("environment", "use", sys.executable) == 0
     assert capsys.readouterr().out == f"{sys.executable}: good\n"
     assert operators.training_python(bpy.context) == sys.executable

@@ -7,7 +7,14 @@ import pytest
 
 from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.cpu.optimizer import adam_rows, distance_limit, opacity_weight, scale_limit
+from stga_addon.raster.cpu.optimizer import (
+    AdamOptions,
+    AdamTables,
+    adam_rows,
+    distance_limit,
+    opacity_weight,
+    scale_limit,
+)
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import VIEW, splat_rows, split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
@@ -63,7 +70,7 @@ def random_state(count: int = 700, seed: int = 1) -> State:
 
 def on_device(
     device: Device, state: State, weights: tuple[float, float, float] = (0, 0, 0), statistics: bool = False,
-    newest: float = 0.05, epsilon: float = EPSILON,
+    ema_share: float = 0.05, epsilon: float = EPSILON,
 ) -> State:  # fmt: skip
     """The state after a step; weights: of scale, distance, opacity."""
     n, upload = len(state.steps), device.upload
@@ -76,7 +83,7 @@ def on_device(
         traits=upload("test traits", np.stack([state.unbound, state.share], 1).astype(np.float32)),
     )  # fmt: skip
     splats, gradients = upload("test splats", state.splats), upload("test gradients", state.gradients)
-    upload_step(device, RATES, (BETA1, BETA2), epsilon, newest, weights, statistics)
+    upload_step(device, RATES, (BETA1, BETA2), epsilon, ema_share, weights, statistics)
     with device.record() as work:
         optimize(
             work, n, STRIDE, tables, any(weights[:2]), view=upload("view", view, "uniform"), splats=splats,
@@ -91,7 +98,7 @@ def on_device(
     )  # fmt: skip
 
 
-def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), newest: float = 0.05) -> State:
+def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), ema_share: float = 0.05) -> State:
     """The same by the CPU's kernels."""
     state, rows = state.copy(), np.flatnonzero(state.wanted).astype(np.int32)
     splats, gradients = split_rows(state.splats, COEFFICIENTS), split_rows(state.gradients, COEFFICIENTS)
@@ -103,12 +110,15 @@ def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), newest
     if weights[1]:
         distance_limit(rows, splats.xyz, *given, state.limits[2].copy(), weights[1], gradients.xyz)
     tables = [split_rows(table, COEFFICIENTS) for table in (state.first, state.second, state.average)]
-    rates = np.zeros((6, 3 * COEFFICIENTS), np.float32)
-    for row, name in zip(rates, Parameters._fields, strict=True):
-        row[:] = RATES[name]
-    rates[4, 3:] = RATES["sh_rest"]
-    flat = [tuple(part.reshape(len(part), -1) for part in table) for table in (splats, gradients, *tables)]
-    adam_rows(rows, state.steps, *flat, rates, BETA1, BETA2, EPSILON, np.float32(newest))
+    parameters = []
+    for name, *parts in zip(Parameters._fields, splats, gradients, *tables, strict=True):
+        flat = [part.reshape(len(part), -1) for part in parts]
+        rates = np.full(flat[0].shape[1], RATES[name], np.float32)
+        if name == "sh":
+            rates[3:] = RATES["sh_rest"]
+        parameters.append(AdamTables(*flat, rates))
+    options = AdamOptions(BETA1, BETA2, EPSILON, np.float32(ema_share))
+    adam_rows(rows, state.steps, tuple(parameters), options)
     names = ("splats", "gradients", "first", "second", "average")
     rows_of = {name: splat_rows(table) for name, table in zip(names, (splats, gradients, *tables), strict=True)}
     return replace(state, **rows_of)
@@ -167,7 +177,7 @@ def test_a_step_at_any_age(device: Device, steps: int) -> None:
     """Catches 1 − βⁿ computed as a difference of nearly equal numbers; compared with float64."""
     state = random_state(64)
     state.wanted[:], state.steps[:] = True, steps
-    got = on_device(device, state, newest=0.0)
+    got = on_device(device, state, ema_share=0.0)
     n, beta1, beta2 = steps + 1.0, float(BETA1), float(BETA2)
     first = beta1 * state.first.astype(float) + (1 - beta1) * state.gradients
     second = beta2 * state.second.astype(float) + (1 - beta2) * state.gradients.astype(float) ** 2

@@ -18,7 +18,7 @@ from stga_addon.training.optimize.state import StrainPosition
 from .test_gpu_optimizer import RATES, STRIDE
 
 TRIANGLES, SPLATS = 300, 900
-EPSILON, NEWEST = np.float32(1e-3), 0.02
+EPSILON, EMA_SHARE = np.float32(1e-3), 0.02
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +35,13 @@ def random_state(seed: int = 0) -> StrainPosition:
 
 def stepped(
     device: Device, state: StrainPosition, face: np.ndarray, wanted: np.ndarray, gradients: np.ndarray,
-    nearby: np.ndarray, rate: float,
+    smoothed: np.ndarray, rate: float,
 ) -> StrainPosition:  # fmt: skip
     """The state after a step on the device."""
     view = np.zeros(1, VIEW)
     view["splats"], view["coefficients"], view["strain_colors"] = SPLATS, 4, 2
     upload_step(
-        device, RATES, (BETA1, BETA2), EPSILON, NEWEST, (0, 0, 0), False, TRIANGLES, on_cpu.RATE_SHARE * rate
+        device, RATES, (BETA1, BETA2), EPSILON, EMA_SHARE, (0, 0, 0), False, TRIANGLES, on_cpu.RATE_SHARE * rate
     )  # fmt: skip
     tables = StrainPositionTables(
         **{name: device.upload(f"test position {name}", table) for name, table in vars(state).items()},
@@ -51,7 +51,7 @@ def stepped(
         on_device.step(
             work, TRIANGLES, tables, view=device.upload("view", view, "uniform"),
             wanted=device.upload("test wanted", wanted.astype(np.uint32)),
-            gradients=device.upload("test gradients", gradients), nearby=device.upload("test nearby", nearby),
+            gradients=device.upload("test gradients", gradients), smoothed=device.upload("test smoothed", smoothed),
         )  # fmt: skip
     arrays = vars(state).items()
     return StrainPosition(**{k: device.read(getattr(tables, k), was.shape, was.dtype) for k, was in arrays})
@@ -66,18 +66,18 @@ def test_a_step_is_the_cpus(device: Device) -> None:
     face[face == 7] = 8  # one without splats
     for number in range(4):
         gradients = rng.normal(size=(SPLATS, STRIDE)).astype(np.float32)
-        nearby = rng.normal(size=(TRIANGLES, 3)).astype(np.float32)
+        smoothed = rng.normal(size=(TRIANGLES, 3)).astype(np.float32)
         wanted = rng.random(SPLATS) < 0.5
         gradients[~wanted] = np.nan  # written in another iteration
         broken = np.flatnonzero(wanted)[:5]
         gradients[broken, 1] = np.float32([np.nan, np.inf, -np.inf, 3e18, 1e30])
-        nearby[face[broken]] = [1, -1, 0.5]
-        nearby[face[broken[1]]] = 0  # times infinity
+        smoothed[face[broken]] = [1, -1, 0.5]
+        smoothed[face[broken[1]]] = 0  # times infinity
         before = deepcopy(state)
-        state = stepped(device, state, face, wanted, gradients, nearby, 0.02)
+        state = stepped(device, state, face, wanted, gradients, smoothed, 0.02)
         with np.errstate(invalid="ignore", over="ignore"):
             rows, xyz = np.flatnonzero(wanted).astype(np.int32), gradients[:, :3].copy()
-            on_cpu.step(expected, rows, face, xyz, nearby, 0.02, NEWEST, EPSILON)
+            on_cpu.step(expected, rows, face, xyz, smoothed, 0.02, EMA_SHARE, EPSILON)
         np.testing.assert_array_equal(state.steps, expected.steps, err_msg=str(number))
         for name in ("value", "first", "second", "average"):
             got, want = getattr(state, name), getattr(expected, name)

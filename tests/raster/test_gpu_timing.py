@@ -36,7 +36,7 @@ def test_every_dispatch_is_timed(device: Device, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(timing, "MAX_DISPATCHES", 90)
     count = 500_000
     mark(device, count, 1)
-    device.kernel_times = times = KernelTimes(device)
+    device.kernel_times = times = KernelTimes(device.gpu)
     try:
         begin = perf_counter()
         for repeats in (1, 50, 7):

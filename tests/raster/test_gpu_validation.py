@@ -22,7 +22,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
 from training.test_gpu_backend import batch_of
 from training.test_gpu_strain_position import position_settings, state_of
-from stga_addon.training.optimize.backend import make_backend
+from stga_addon.training.optimize.backends import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.losses import limit_units
 

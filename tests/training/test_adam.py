@@ -60,7 +60,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
         theirs.step()
-        adam.step(state, listed, RATES, averaging=0.2, epsilon=np.float32(1e-5))
+        adam.step(state, listed, RATES, ema_share=0.2, epsilon=np.float32(1e-5))
         for n in listed:
             history[n].append(rows[n]["xyz"].detach().clone())
     for n, values in enumerate(history):

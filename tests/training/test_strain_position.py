@@ -87,28 +87,31 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
 def test_the_step_is_adam_in_float64() -> None:
     """Catches a bias correction, an average or a count that is not each triangle's own, gradients of splats that were
     not trained, and a broken gradient that gets in."""
-    rng, faces, rate, newest, epsilon = np.random.default_rng(2), 6, 0.02, 0.1, np.float32(1e-3)
+    rng, faces, rate, ema_share, epsilon = np.random.default_rng(2), 6, 0.02, 0.1, np.float32(1e-3)
     state = new_strain_position(rng.normal(0, 1, (faces, 3, 3)))
     value, average = state.value.astype(np.float64), state.value.astype(np.float64)
     first, second, steps = np.zeros_like(value), np.zeros_like(value), np.zeros(faces, int)
     for number in range(8):
         face = rng.choice([0, 1, 3, 4] if number % 2 else [0, 2, 3], 40).astype(np.int32)
         rows = rng.permutation(40).astype(np.int32)[:25]
-        gradient, nearby = rng.normal(0, 1, (40, 3)).astype(np.float32), rng.normal(0, 1, (faces, 3)).astype(np.float32)
+        gradient, smoothed = (
+            rng.normal(0, 1, (40, 3)).astype(np.float32),
+            rng.normal(0, 1, (faces, 3)).astype(np.float32),
+        )
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
-        strain_position.step(state, rows, face, gradient, nearby, rate, newest, epsilon)
+        strain_position.step(state, rows, face, gradient, smoothed, rate, ema_share, epsilon)
         for f in np.unique(face[rows]):
             steps[f] += 1
             summed = sum(gradient[i].astype(np.float64) for i in rows if face[i] == f)
-            g = nearby[f][:, None] * summed
+            g = smoothed[f][:, None] * summed
             if not np.isfinite(g).all():
                 continue
             first[f] = 0.9 * first[f] + 0.1 * g
             second[f] = 0.999 * second[f] + 0.001 * g**2
             m, v = first[f] / (1 - 0.9 ** steps[f]), second[f] / (1 - 0.999 ** steps[f])
             value[f] -= strain_position.RATE_SHARE * rate * m / (np.sqrt(v) + epsilon)
-            average[f] += max(newest, 4 / (steps[f] + 3)) * (value[f] - average[f])
+            average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
     np.testing.assert_array_equal(state.steps, steps)
     assert steps.min() == 0
     for found, expected in ((state.value, value), (state.first, first), (state.average, average)):

@@ -1,5 +1,6 @@
 """Demo: make a synthetic capture, train an avatar on it, show it in Blender and compare the pictures."""
 
+from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
@@ -70,13 +71,13 @@ def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
 
     Needs the landmark detector. Raises StgaError.
     """
-    from ...cli.main import make_parser
+    from ...cli import avatar
 
     model = ["--model", str(out / "capture/flame_model.npz"), "--cameras", str(out / "capture/transforms.json")]
     more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED), "--device", device]
-    options = make_parser().parse_args(["avatar", str(out / "capture"), *model, *more])
-    options.head = None
-    options.run(options)
+    parser = ArgumentParser()
+    avatar.add_arguments(parser, None)
+    avatar.run(parser.parse_args([str(out / "capture"), *model, *more], Namespace(head=None)))
 
 
 def _advance(bar: "tqdm[None]", done: int, total: int) -> None:

@@ -1,6 +1,7 @@
 """Optimizer kernels: Adam on listed rows only, and the limits of scale and distance."""
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,23 +14,43 @@ MAX_GRADIENT = np.float32(1e18)
 """A row with a larger gradient is skipped: its square would make the second moment infinite, and the row NaN."""
 
 
+class AdamTables(NamedTuple):
+    """A parameter in training: its values (N, D) float32 and, of the same shape, what Adam keeps for them.
+
+    gradient, first, second, average  first and second moment, and the exponential moving average of the values
+    rates  (D,) float32 learning rate of each column
+    """
+
+    value: Any
+    gradient: Any
+    first: Any
+    second: Any
+    average: Any
+    rates: Any
+
+
+class AdamOptions(NamedTuple):
+    """Adam's constants, and the least share of a step in the exponential moving average; all float32."""
+
+    beta1: np.float32
+    beta2: np.float32
+    epsilon: np.float32
+    ema_share: np.float32
+
+
 @parallel(lambda rows, *_: len(rows))
 @jit
-def adam_rows(
-    first_row, past_row, rows, steps, parameters, gradients, firsts, seconds, averages, rates, beta1, beta2, epsilon,
-    newest,
-):  # fmt: skip
+def adam_rows(first_row, past_row, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
-    parameters, gradients, firsts, seconds, averages: equally long tuples of (N, D) arrays; steps (N,) int32; rates
-    (P, max D): learning rate by parameter and column. The stepped value enters its running average with the share
-    `newest`, or 4 / (steps + 3) where that is more, because the first steps are long. Rows that are
-    not listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that
-    parameter, its moments and its average.
+    parameters: tuple of AdamTables; steps (N,) int32; options: AdamOptions. The stepped value enters its exponential
+    moving average with the share `ema_share`, or 4 / (steps + 3) where that is more, because the first steps are long.
+    Rows that are not listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps
+    that parameter, its moments and its average.
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
-    log1, log2 = math.log(beta1), math.log(beta2)
-    correct1, correct2, blend = (
+    log1, log2 = math.log(options.beta1), math.log(options.beta2)
+    correct1, correct2, ema_shares = (
         np.empty(ROWS_PER_BLOCK, np.float32),
         np.empty(ROWS_PER_BLOCK, np.float32),
         np.empty(ROWS_PER_BLOCK, np.float32),
@@ -41,20 +62,17 @@ def adam_rows(
             count = np.float64(steps[rows[n]])
             correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
             correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
-            blend[n - begin] = max(np.float64(newest), 4.0 / (count + 3.0))
+            ema_shares[n - begin] = max(np.float64(options.ema_share), 4.0 / (count + 3.0))
         for p in range(len(parameters)):
-            _adam_block(
-                rows[begin:end], parameters[p], gradients[p], firsts[p], seconds[p], averages[p],
-                correct1, correct2, blend, rates[p], beta1, beta2, epsilon,
-            )  # fmt: skip
+            _adam_block(rows[begin:end], parameters[p], correct1, correct2, ema_shares, options)
 
 
 @part_jit
-def _adam_block(
-    rows, parameter, gradient, first, second, average, correct1, correct2, blend, rates, beta1, beta2, epsilon
-):
+def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
     """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorizes."""
-    width = parameter.shape[1]
+    values, gradient, first, second, average, rates = parameter
+    beta1, beta2, epsilon, _ = options
+    width = values.shape[1]
     for n in range(len(rows)):
         i = rows[n]
         invalid = ZERO
@@ -62,15 +80,15 @@ def _adam_block(
             invalid += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
         if invalid != ZERO:
             continue
-        scale1, scale2, share = correct1[n], correct2[n], blend[n]
+        scale1, scale2, share = correct1[n], correct2[n], ema_shares[n]
         for c in range(width):
             g = gradient[i, c]
             m = beta1 * first[i, c] + (ONE - beta1) * g
             v = beta2 * second[i, c] + (ONE - beta2) * g * g
             first[i, c] = m
             second[i, c] = v
-            value = parameter[i, c] - rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
-            parameter[i, c] = value
+            value = values[i, c] - rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
+            values[i, c] = value
             average[i, c] += share * (value - average[i, c])
 
 

@@ -15,7 +15,7 @@ from functools import cache
 from importlib.resources import files
 from time import sleep
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import wgpu
@@ -23,9 +23,7 @@ from wgpu.backends.wgpu_native.extras import set_instance_extras
 
 from ...errors import DeviceError, StgaError
 from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
-
-if TYPE_CHECKING:
-    from .timing import KernelTimes
+from .timing import KernelTimes
 
 NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
 """What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""

@@ -5,14 +5,13 @@ from typing import Any
 import numpy as np
 
 from ...avatar import embedding
-from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, StrainBasis
+from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, IndexLists, StrainBasis
 from ...capture.camera import Camera
 from .device import Device, Recording
 from .layout import FRAME_STRAIN
 
 POSE = np.dtype(
-    [("rows", np.float32, (3, 4))]
-    + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "neighbors")]
+    [("rows", np.float32, (3, 4))] + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "padding")]
 )
 """The uniform of pose.wgsl."""
 INCLUDE = ("pose",)
@@ -29,21 +28,21 @@ class Embedding:
             raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
         self.strains = 0 if basis is None else STRAIN_COMPONENTS
         self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
-        rows = np.zeros(0) if basis is None else _basis_rows(basis)
-        neighbors = [] if basis is None else basis.neighbors
-        self._neighbors = device.upload("neighbors", np.array(neighbors, np.uint32)), len(neighbors)
+        none = np.zeros(0, np.uint32)
+        rows = none if basis is None else _basis_rows(basis)
+        self._neighbors = device.upload("neighbors", none if basis is None else _words(basis.neighbors))
         self._buffers = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
             "neutral_area": device.upload("neutral area", _area(neutral, faces)),
             "basis": device.upload("strain basis", rows.astype(np.float32)),
-            "touching": device.upload("touching", _touching(faces, len(neutral))),
+            "vertex_faces": device.upload("vertex faces", none if basis is None else _words(basis.vertex_faces)),
             "tensors": device.buffer("strain tensors", 6 * len(faces) if self.strains else 0),
         }
-        self._rounds = [device.buffer(f"nearby strain {n}", len(faces) * self.strains) for n in range(2)]
+        self._rounds = [device.buffer(f"smoothed strain {n}", len(faces) * self.strains) for n in range(2)]
 
     @property
-    def nearby(self) -> Any:
-        """`nearby_strain` (F, 3) of the mesh whose frames were moved by it last."""
+    def smoothed_strain(self) -> Any:
+        """`smoothed_strain` (F, 3) of the mesh whose frames were moved by it last."""
         return self._rounds[AVERAGING_ROUNDS % 2]
 
     def upload(self, vertices: np.ndarray, camera: Camera) -> None:
@@ -61,7 +60,6 @@ class Embedding:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         pose["rows"] = np.c_[turn, turn @ center + shift]
         pose["triangles"], pose["strains"], pose["area_scales"] = self._count, self.strains, self._area_scales
-        pose["neighbors"] = self._neighbors[1]
         self._device.upload("pose", pose, "uniform")
 
     def compose(self, work: Recording, strain_position: Any | None = None) -> Any:
@@ -75,7 +73,7 @@ class Embedding:
             "pose": device.buffer("pose", POSE.itemsize // 4, "uniform"),
             "vertices": device.buffer("vertices", 0),
             "frames": device.buffer("frames", self._count * (FRAME_STRAIN + self.strains)),
-            "nearby": self._rounds[0],
+            "strain_from_rest": self._rounds[0],
         }
         work.dispatch(device.kernel("frames", "compose", INCLUDE), groups, **buffers)
         if self.strains:
@@ -88,11 +86,13 @@ class Embedding:
         """Record the frames' move by strain."""
         assert self.strains
         device, groups, rounds = self._device, self._device.groups(self._count), self._rounds
-        shared = {"pose": pose, "neighbors": self._neighbors[0], "coefficients": strain_position, "frames": frames}
-        average, shift = (device.kernel("nearby_strain", entry, INCLUDE) for entry in ("average", "shift"))
+        shared = {"pose": pose, "neighbors": self._neighbors, "coefficients": strain_position, "frames": frames}
+        average, shift = (device.kernel("smoothed_strain", entry, INCLUDE) for entry in ("average", "shift"))
         for n in range(AVERAGING_ROUNDS):
-            work.dispatch(average, groups, **shared, nearby=rounds[n % 2], averaged=rounds[(n + 1) % 2])
-        work.dispatch(shift, groups, **shared, nearby=self.nearby, averaged=rounds[(AVERAGING_ROUNDS + 1) % 2])
+            work.dispatch(average, groups, **shared, smoothed=rounds[n % 2], averaged=rounds[(n + 1) % 2])
+        work.dispatch(
+            shift, groups, **shared, smoothed=self.smoothed_strain, averaged=rounds[(AVERAGING_ROUNDS + 1) % 2]
+        )
 
 
 def compile_kernels(device: Device) -> None:
@@ -100,7 +100,7 @@ def compile_kernels(device: Device) -> None:
     for entry in ("compose", "average_strain"):
         device.kernel("frames", entry, INCLUDE)
     for entry in ("average", "shift"):
-        device.kernel("nearby_strain", entry, INCLUDE)
+        device.kernel("smoothed_strain", entry, INCLUDE)
 
 
 def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -116,9 +116,6 @@ def _basis_rows(basis: StrainBasis) -> np.ndarray:
     return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
 
-def _touching(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """The triangles that touch each vertex, in order, behind where each vertex's begin in this same array."""
-    corners = faces.ravel()
-    by_vertex = np.argsort(corners, kind="stable")
-    start = np.searchsorted(corners[by_vertex], np.arange(vertices + 1)) + vertices + 1
-    return np.asarray(np.concatenate([start, by_vertex // 3]), np.uint32)
+def _words(lists: IndexLists) -> np.ndarray:
+    """Where each list begins in this same array, and the last one ends; then the lists."""
+    return np.asarray(np.concatenate([lists.indptr + len(lists.indptr), lists.indices]), np.uint32)

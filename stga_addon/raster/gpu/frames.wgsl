@@ -14,12 +14,12 @@
 // (F, 21 + 8·S): `gram`, `to_tensor`, `to_plane` and `range` of the `StrainBasis`.
 @group(0) @binding(4) var<storage, read> basis: array<f32>;
 // (V + 1 + 3·F): where the triangles that touch a vertex begin in this array, then those triangles.
-@group(0) @binding(5) var<storage, read> touching: array<u32>;
+@group(0) @binding(5) var<storage, read> vertex_faces: array<u32>;
 // (F, 6): a triangle's own strain as xx, yy, zz, xy, yz, zx.
 @group(0) @binding(6) var<storage, read_write> tensors: array<f32>;
 @group(0) @binding(7) var<storage, read_write> frames: array<f32>;
-// (F, S): strain less that at rest, which positions follow where it is averaged (nearby_strain.wgsl).
-@group(0) @binding(8) var<storage, read_write> nearby: array<f32>;
+// (F, S): strain less that at rest, which positions follow where it is averaged (smoothed_strain.wgsl).
+@group(0) @binding(8) var<storage, read_write> strain_from_rest: array<f32>;
 
 const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
@@ -151,11 +151,11 @@ fn average_strain(
   var mean: array<f32, TENSOR>;
   for (var corner = 0u; corner < 3u; corner++) {
     let vertex = faces[3u * f + corner];
-    let end = touching[vertex + 1u];
-    let share = 1.0 / (3.0 * f32(max(end - touching[vertex], 1u)));
-    for (var n = touching[vertex]; n < end; n++) {
+    let end = vertex_faces[vertex + 1u];
+    let share = 1.0 / (3.0 * f32(max(end - vertex_faces[vertex], 1u)));
+    for (var n = vertex_faces[vertex]; n < end; n++) {
       for (var d = 0u; d < TENSOR; d++) {
-        mean[d] += share * tensors[TENSOR * touching[n] + d];
+        mean[d] += share * tensors[TENSOR * vertex_faces[n] + d];
       }
     }
   }
@@ -170,6 +170,6 @@ fn average_strain(
     // Rounding of a rigid triangle is no strain: Adam would take its sign for a gradient and step at full rate.
     strain = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
     frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = strain;
-    nearby[f * pose.strains + k] = strain - clamp(0.0, basis[range], basis[range + pose.strains]);
+    strain_from_rest[f * pose.strains + k] = strain - clamp(0.0, basis[range], basis[range + pose.strains]);
   }
 }

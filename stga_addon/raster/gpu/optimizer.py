@@ -15,7 +15,7 @@ RATES = (*Parameters._fields, "sh_rest")
 """Learning rates in the order of the kernels; the last is that of the harmonics above the constant one."""
 STEP = np.dtype(
     [("rates", np.float32, 8)]
-    + [(name, np.float32) for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "newest")]
+    + [(name, np.float32) for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "ema_share")]
     + [(name, np.float32) for name in ("scale_weight", "distance_weight", "opacity_weight")]
     + [("statistics", np.uint32), ("triangles", np.uint32), ("strain_position_rate", np.float32)]
 )
@@ -44,7 +44,7 @@ def upload_step(
     rates: Mapping[str, float],
     betas: tuple[float, float],
     epsilon: float,
-    newest: float,
+    ema_share: float,
     weights: tuple[float, float, float],
     statistics: bool,
     triangles: int = 0,
@@ -52,15 +52,15 @@ def upload_step(
 ) -> None:
     """Send the numbers of the next step.
 
-    rates by name; newest: least share of a step in the running average; weights: of the limits of scale, distance and,
-    divided by the number of splats, opacity; statistics: collect the screen gradients. triangles,
+    rates by name; ema_share: least share of a step in the exponential moving average; weights: of the limits of scale,
+    distance and, divided by the number of splats, opacity; statistics: collect the screen gradients. triangles,
     strain_position_rate: see `strain_position.step`.
     """
     step = np.zeros(1, STEP)
     step["rates"][0, : len(RATES)] = [rates[name] for name in RATES]
     step["beta1"], step["beta2"] = betas
     step["log_beta1"], step["log_beta2"] = (math.log(beta) for beta in betas)
-    step["epsilon"], step["newest"], step["statistics"] = epsilon, newest, statistics
+    step["epsilon"], step["ema_share"], step["statistics"] = epsilon, ema_share, statistics
     step["triangles"], step["strain_position_rate"] = triangles, strain_position_rate
     step["scale_weight"], step["distance_weight"], step["opacity_weight"] = weights
     device.upload("step", step, "uniform")

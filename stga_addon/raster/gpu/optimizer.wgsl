@@ -7,7 +7,7 @@ struct Step {
   log_beta1: f32,
   log_beta2: f32,
   epsilon: f32,
-  newest: f32, // least share of a step in the running average
+  ema_share: f32, // least share of a step in the exponential moving average
   scale_weight: f32,
   distance_weight: f32,
   opacity_weight: f32, // already divided by the number of splats
@@ -39,7 +39,7 @@ fn corrections_at(step: Step, count: u32) -> vec3f {
   return vec3f(
     1.0 / one_minus_exp(n * step.log_beta1),
     1.0 / sqrt(one_minus_exp(n * step.log_beta2)),
-    max(step.newest, 4.0 / (n + 3.0)),
+    max(step.ema_share, 4.0 / (n + 3.0)),
   );
 }
 

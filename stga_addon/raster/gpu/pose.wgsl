@@ -8,5 +8,5 @@ struct Pose {
   triangles: u32,
   strains: u32, // components of strain, 0 where neither colors nor positions follow it
   area_scales: u32, // 1: the convention "stga", 0: "gaussian_avatars"
-  neighbors: u32, // most triangles that share an edge with one
+  padding: u32,
 }

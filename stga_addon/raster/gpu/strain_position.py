@@ -13,7 +13,7 @@ INCLUDE = ("numbers", "optimizer")
 class StrainPositionTables(NamedTuple):
     """Tables of F triangles in training, on the device.
 
-    value, first, second, average  (F, 3, 3) float32 coefficients, Adam's moments and the running average
+    value, first, second, average  (F, 3, 3) float32 coefficients, Adam's moments and the exponential moving average
     steps      (F,) uint32
     splats_of  of `splats_by_triangle`
     """
@@ -38,16 +38,17 @@ def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
 
 def step(
     work: Recording, triangles: int, tables: StrainPositionTables, *, view: Any, wanted: Any, gradients: Any,
-    nearby: Any,
+    smoothed: Any,
 ) -> None:  # fmt: skip
     """Record a step of the triangles that have a wanted splat, with the numbers of `upload_step`.
 
-    gradients: the splats', without those of the limits; nearby (F, 3): `nearby_strain`.
+    gradients: the splats', without those of the limits; smoothed (F, 3): `smoothed_strain`.
     """
     device = work.device
     work.dispatch(
         device.kernel("strain_position", include=INCLUDE), device.groups(triangles), **tables._asdict(), view=view,
-        step=device.buffer("step", STEP.itemsize // 4, "uniform"), wanted=wanted, gradients=gradients, nearby=nearby,
+        step=device.buffer("step", STEP.itemsize // 4, "uniform"), wanted=wanted, gradients=gradients,
+        smoothed=smoothed,
     )  # fmt: skip
 
 

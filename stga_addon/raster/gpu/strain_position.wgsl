@@ -9,9 +9,9 @@
 @group(0) @binding(3) var<storage, read> gradients: array<f32>; // of the splats
 // (F + 1 + N): where each triangle's splats begin in this array, then those splats.
 @group(0) @binding(4) var<storage, read> splats_of: array<u32>;
-@group(0) @binding(5) var<storage, read> nearby: array<f32>; // (F, 3) see nearby_strain.wgsl
+@group(0) @binding(5) var<storage, read> smoothed: array<f32>; // (F, 3) see smoothed_strain.wgsl
 @group(0) @binding(6) var<storage, read_write> steps: array<u32>; // (F,)
-// (F, 3, 3), as are the moments and the running average.
+// (F, 3, 3), as are the moments and the exponential moving average.
 @group(0) @binding(7) var<storage, read_write> value: array<f32>;
 @group(0) @binding(8) var<storage, read_write> first: array<f32>;
 @group(0) @binding(9) var<storage, read_write> second: array<f32>;
@@ -49,7 +49,7 @@ fn main(
   var gradient: array<f32, COEFFICIENTS>;
   var broken = false;
   for (var c = 0u; c < COEFFICIENTS; c++) {
-    gradient[c] = nearby[f * STRAIN_COMPONENTS + c / 3u] * moved[c % 3u];
+    gradient[c] = smoothed[f * STRAIN_COMPONENTS + c / 3u] * moved[c % 3u];
     broken = broken || is_too_large(gradient[c]);
   }
   if broken {

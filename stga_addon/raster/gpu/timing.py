@@ -7,8 +7,6 @@ import numpy as np
 import wgpu
 from wgpu.backends.wgpu_native import lib
 
-from .device import Device
-
 MAX_DISPATCHES = 2048
 """Dispatches that are timed between two readings; later ones are not."""
 
@@ -16,16 +14,16 @@ MAX_DISPATCHES = 2048
 class KernelTimes:
     """Times what is recorded for a device while this is its `kernel_times`, each dispatch in a pass of its own."""
 
-    def __init__(self, device: Device) -> None:
-        """Raises ValueError where the adapter has no timestamps."""
-        if "timestamp-query" not in device.gpu.features:
-            raise ValueError(f"{device.name} has no timestamp queries")
-        self._device, self._names = device, list[str]()
+    def __init__(self, gpu: Any) -> None:
+        """gpu: `Device.gpu`. Raises ValueError where the adapter has no timestamps."""
+        if "timestamp-query" not in gpu.features:
+            raise ValueError(f"{gpu.adapter.info['device']} has no timestamp queries")
+        self._gpu, self._names = gpu, list[str]()
         self._resolved = 0
-        self._queries = device.gpu.create_query_set(type="timestamp", count=2 * MAX_DISPATCHES)
+        self._queries = gpu.create_query_set(type="timestamp", count=2 * MAX_DISPATCHES)
         usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
-        self._stamps = device.gpu.create_buffer(size=16 * MAX_DISPATCHES, usage=usage)
-        self._period_ns = float(lib.wgpuQueueGetTimestampPeriod(device.gpu.queue._internal))
+        self._stamps = gpu.create_buffer(size=16 * MAX_DISPATCHES, usage=usage)
+        self._period_ns = float(lib.wgpuQueueGetTimestampPeriod(gpu.queue._internal))
 
     def writes(self, name: str) -> dict[str, Any] | None:
         """The `timestamp_writes` of the pass that the next dispatch is alone in."""
@@ -53,7 +51,7 @@ class KernelTimes:
         """kernel -> milliseconds since the last call, after all submitted work, longest first."""
         total: Counter[str] = Counter()
         if self._names:
-            data = self._device.gpu.queue.read_buffer(self._stamps, 0, 16 * len(self._names))
+            data = self._gpu.queue.read_buffer(self._stamps, 0, 16 * len(self._names))
             stamps = np.frombuffer(data, np.uint64).reshape(-1, 2)
             for name, (begin, end) in zip(self._names, stamps.tolist(), strict=True):
                 total[name] += 1e-6 * self._period_ns * max(end - begin, 0)

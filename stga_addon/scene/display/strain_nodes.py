@@ -48,7 +48,7 @@ def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
 
 
 def _with_nearby_strain(nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with `avatar.strain.nearby_strain` stored; mesh: from `_strained`."""
+    """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
     change = nodes.vector("SUBTRACT", nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0)))
     # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge with it.
     inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}

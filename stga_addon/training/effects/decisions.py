@@ -5,27 +5,9 @@ from dataclasses import dataclass
 
 from ...errors import StgaError
 from ...schema import complaint
+from .catalog import EFFECT_NAMES
 
 CHOICES = ("auto", "on", "off")
-EFFECTS = (
-    "view-color",
-    "exposure",
-    "antialiasing",
-    "background",
-    "hull-points",
-    "depth-limits",
-    "density",
-    "selection",
-    "strain-color",
-    "strain-position",
-    "teeth",
-    "neck",
-    "jaw",
-    "eyes",
-    "dynamic-offsets",
-    "tracking",
-)
-"""Names of all effects."""
 TRACKING = "tracking.npz"
 """File of a run folder with refined FLAME parameters."""
 
@@ -34,7 +16,7 @@ TRACKING = "tracking.npz"
 class EffectDecision:
     """The decision about one effect.
 
-    effect  name, as in `--effect NAME=on`
+    effect  one of EFFECT_NAMES
     choice  the user's: one of CHOICES
     on      the decision
     reason  with the figure that it rests on
@@ -62,9 +44,9 @@ def parse_choices(texts: Sequence[str]) -> dict[str, str]:
     choices = {}
     for text in texts:
         name, _, choice = text.partition("=")
-        if name not in EFFECTS or choice not in CHOICES:
+        if name not in EFFECT_NAMES or choice not in CHOICES:
             raise StgaError(
-                f"--effect: '{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}"
+                f"--effect: '{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECT_NAMES)}"
             )
         choices[name] = choice
     return choices

@@ -78,23 +78,23 @@ class CaptureFacts:
         return self._strain_evidence(self.samples.camera) if self.cameras > 1 else None
 
     @cached_property
-    def nearby_dependence(self) -> Evidence:
+    def smoothed_strain_dependence(self) -> Evidence:
         """As `strain_dependence`, on the strain around a triangle: what moves over it changes its color as well."""
-        return self._nearby_evidence(self.samples.timestep)
+        return self._smoothed_strain_evidence(self.samples.timestep)
 
     @cached_property
-    def nearby_dependence_known(self) -> Evidence | None:
+    def smoothed_strain_dependence_known(self) -> Evidence | None:
         """As `strain_dependence_known`, on the strain around a triangle."""
-        return self._nearby_evidence(self.samples.camera) if self.cameras > 1 else None
+        return self._smoothed_strain_evidence(self.samples.camera) if self.cameras > 1 else None
 
     def _strain_evidence(self, group: np.ndarray) -> Evidence:
         """Within the range of strain that a training on the views that are not left out would write."""
         rest = rest_strain(color_range(len(self.samples.faces)))
         return linear_evidence(self.matched_colors, self.samples.strain, group, rest=rest)
 
-    def _nearby_evidence(self, group: np.ndarray) -> Evidence:
-        nearby = self.samples.nearby
-        return linear_evidence(self.matched_colors, nearby, group, rest=np.zeros_like(nearby[0]))
+    def _smoothed_strain_evidence(self, group: np.ndarray) -> Evidence:
+        smoothed = self.samples.smoothed_strain
+        return linear_evidence(self.matched_colors, smoothed, group, rest=np.zeros_like(smoothed[0]))
 
     @cached_property
     def pixel_range(self) -> float:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 from ...capture.model import Capture
 from ...errors import StgaError
 from ..settings import TrainingSettings
+from .catalog import EFFECTS, Effect
 from .decisions import EffectDecision
 from .facts import CaptureFacts
-from .rules import EFFECTS, Effect, Verdict
+from .rules import RULES, Verdict
 
 if TYPE_CHECKING:
     from ..run.folder import Run
@@ -42,7 +43,7 @@ def with_effects_of_takes(run: "Run", capture: Capture) -> "Run":
     for effect in EFFECTS:
         before = plan.get(effect.name)
         if effect.name in ADDED_LATER and before is not None and not before.on and before.choice == "auto":
-            verdict = effect.rule(facts)
+            verdict = RULES[effect.name](facts)
             assert verdict is not None
             plan[effect.name] = replace(before, on=verdict.on, reason=verdict.reason)
             settings = replace(settings, **(effect.on if verdict.on else effect.off))
@@ -60,7 +61,7 @@ def plan_effects(
     changes: dict[str, object] = {}
     plan = []
     for effect in EFFECTS:
-        choice, verdict = choices.get(effect.name, "auto"), effect.rule(facts)
+        choice, verdict = choices.get(effect.name, "auto"), RULES[effect.name](facts)
         if verdict is None:
             if choice == "on":
                 raise StgaError(f"--effect {effect.name}=on: {capture.root} has none: {_needs(effect)}")

@@ -55,19 +55,8 @@ class Verdict:
     changes: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Effect:
-    """An effect: its name, its cost while it is on, its rule, and the settings that switch it.
-
-    rule     returns None where the effect does not apply to the capture
-    on, off  changes to `TrainingSettings`
-    """
-
-    name: str
-    cost: str
-    rule: Callable[[CaptureFacts], Verdict | None]
-    on: Mapping[str, Any] = field(default_factory=dict)
-    off: Mapping[str, Any] = field(default_factory=dict)
+Rule = Callable[[CaptureFacts], Verdict | None]
+"""Decides one effect; None where the effect does not apply to the capture."""
 
 
 def view_color(facts: CaptureFacts) -> Verdict:
@@ -159,7 +148,9 @@ def strain_color(facts: CaptureFacts) -> Verdict:
 
 def strain_position(facts: CaptureFacts) -> Verdict:
     return _undeformed(facts, "positions follow") or _dependent(
-        "triangles' colors depend on deformation around them", facts.nearby_dependence, facts.nearby_dependence_known
+        "triangles' colors depend on deformation around them",
+        facts.smoothed_strain_dependence,
+        facts.smoothed_strain_dependence_known,
     )
 
 
@@ -189,16 +180,24 @@ def teeth(facts: CaptureFacts) -> Verdict | None:
     return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
 
 
-def joint(name: str, *joints: int) -> Effect:
-    """Bones of Blender's rig that move, and the shape keys that correct the mesh where they do."""
+def neck(facts: CaptureFacts) -> Verdict | None:
+    return _turning(facts, 1)
 
-    def rule(facts: CaptureFacts) -> Verdict | None:
-        if not facts.frames:
-            return None
-        turn = facts.joint_angle(*joints)
-        return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
 
-    return Effect(name, f"{9 * len(joints)} shape keys and drivers in Blender", rule)
+def jaw(facts: CaptureFacts) -> Verdict | None:
+    return _turning(facts, 2)
+
+
+def eyes(facts: CaptureFacts) -> Verdict | None:
+    return _turning(facts, 3, 4)
+
+
+def _turning(facts: CaptureFacts, *joints: int) -> Verdict | None:
+    """On where one of these FLAME joints turns."""
+    if not facts.frames:
+        return None
+    turn = facts.joint_angle(*joints)
+    return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
 
 
 def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
@@ -224,68 +223,9 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     return Verdict(facts.outside > MAX_OUTSIDE_SHARE, f"{facts.outside:.2%} of the mesh sticks out of the masks")
 
 
-EFFECTS = (
-    Effect(
-        "view-color",
-        "3, 8 or 15 coefficients more a splat and channel",
-        view_color,
-        off={"sh_degree": 0, "sh_steps": ()},
-    ),
-    Effect("exposure", "a pass over each image when it is read", exposure),
-    Effect("antialiasing", "a root a splat", antialiasing, on={"antialiased": True}, off={"antialiased": False}),
-    Effect(
-        "background",
-        "a pass over the image in every iteration",
-        background,
-        on={"random_background": True},
-        off={"random_background": False},
-    ),
-    Effect(
-        "hull-points",
-        "a splat for every 4 mm beside the mesh",
-        hull_points,
-        on={"hull_points": True},
-        off={"hull_points": False},
-    ),
-    Effect(
-        "depth-limits",
-        "none: splats are smaller and nearer to their triangles",
-        depth_limits,
-        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03},
-    ),
-    Effect("density", "up to a quarter more splats, more in the preset final", density, off={"density_interval": 0}),
-    Effect(
-        "selection",
-        "none: local iterations are cheaper than global ones",
-        selection,
-        on={"strategy": "selective"},
-        off={"strategy": "global"},
-    ),
-    Effect(
-        "strain-color",
-        "3 coefficients more a splat and channel, and the strain of every frame",
-        strain_color,
-        on={"strain_color": True},
-        off={"strain_color": False},
-    ),
-    Effect(
-        "strain-position",
-        "9 coefficients a triangle, and the strain of every frame",
-        strain_position,
-        on={"strain_position": True},
-        off={"strain_position": False},
-    ),
-    Effect("teeth", "splats on 168 triangles", teeth, on={"teeth": True}, off={"teeth": False}),
-    joint("neck", 1),
-    joint("jaw", 2),
-    joint("eyes", 3, 4),
-    Effect("dynamic-offsets", "a mesh a frame beside the parameters", dynamic_offsets),
-    Effect(
-        "tracking",
-        "a pass through FLAME and back in every global iteration; the run's tracking.npz is then the head's motion",
-        tracking,
-        on={"tracking": True},
-        off={"tracking": False},
-    ),
-)
-"""In display order."""
+_RULES: tuple[Rule, ...] = (
+    view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection, strain_color,
+    strain_position, teeth, neck, jaw, eyes, dynamic_offsets, tracking,
+)  # fmt: skip
+RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
+"""Effect -> its rule, a function of that name."""

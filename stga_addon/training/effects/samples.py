@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, uniform_filter
 
-from ...avatar.strain import color_range, face_strain, nearby_strain, strain_basis
+from ...avatar.strain import color_range, face_strain, smoothed_strain, strain_basis
 from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.model import Capture, View, evenly_spread
@@ -38,7 +38,7 @@ class Samples:
     color      (S, K, 3) float32 from 0 to 255, mean around the triangle's center; NaN where it is not visible
     direction  (S, K, 3) unit vectors from the camera to the triangle, world axes
     strain     (S, K, 3) of the triangles, as far as colors follow it (`avatar.strain`)
-    nearby     (S, K, 3) strain around the triangles, as positions follow it (`avatar.strain.nearby_strain`)
+    smoothed_strain  (S, K, 3) strain around the triangles, as positions follow it (`avatar.strain.smoothed_strain`)
     pixels     (S, K) area of the triangle in pixels; NaN where it is not visible
     pixel_width  (S,) meters that a pixel spans at the head; NaN for a head behind the camera
     foreground (S,) pixels inside the mask; NaN without one, like the following
@@ -56,7 +56,7 @@ class Samples:
     color: np.ndarray
     direction: np.ndarray
     strain: np.ndarray
-    nearby: np.ndarray
+    smoothed_strain: np.ndarray
     pixels: np.ndarray
     pixel_width: np.ndarray
     foreground: np.ndarray
@@ -98,14 +98,14 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
     faces = np.sort(rng.permutation(count)[:MAX_FACES])
     basis = strain_basis(capture.neutral, capture.faces, color_range(count))
     strain = {t: face_strain(basis, capture.mesh(t)) for t in {view.timestep for view in views}}
-    nearby = {t: nearby_strain(basis, found)[faces] for t, found in strain.items()}
+    smoothed = {t: smoothed_strain(basis, found)[faces] for t, found in strain.items()}
     rows = [_sample_view(capture, view, faces) for view in views]
     return Samples(
         faces,
         np.array([view.camera_index for view in views]),
         np.array([view.timestep for view in views]),
         strain=np.stack([strain[view.timestep][faces] for view in views]),
-        nearby=np.stack([nearby[view.timestep] for view in views]),
+        smoothed_strain=np.stack([smoothed[view.timestep] for view in views]),
         **{name: np.stack([row[name] for row in rows]) for name in rows[0]},
     )
 

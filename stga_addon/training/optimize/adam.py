@@ -6,7 +6,7 @@ import numpy as np
 
 from ...capture.camera import Camera
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import adam_rows
+from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows
 from .state import TrainState
 
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
@@ -21,27 +21,28 @@ def step(
     state: TrainState,
     rows: np.ndarray,
     rates: Mapping[str, float],
-    averaging: float = 1.0,
+    ema_share: float = 1.0,
     epsilon: np.float32 = EPSILON,
 ) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
-    averaging  weight of the stepped row in its running average; with 1, the average is the row
+    ema_share  least share of the stepped row in its exponential moving average; with 1, the average is the row
     epsilon    added to the root of the second moment; `image_epsilon` in training
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    columns = max(tensor[0].numel() for tensor in state.parameters)
-    by_column = np.zeros((len(state.parameters), columns), np.float32)
-    for row, name in zip(by_column, state.parameters._fields, strict=True):
-        row[:] = rates[name]
+    tables = zip(
+        *map(_tables, (state.parameters, state.gradients, state.first, state.second, state.average)), strict=True
+    )
+    parameters = []
+    for name, arrays in zip(state.parameters._fields, tables, strict=True):
+        by_column = np.full(arrays[0].shape[1], rates[name], np.float32)
         if name == "sh":
-            row[3:] = rates["sh_rest"]
-    adam_rows(
-        rows, state.steps.numpy(), _tables(state.parameters), _tables(state.gradients), _tables(state.first),
-        _tables(state.second), _tables(state.average), by_column, BETA1, BETA2, epsilon, np.float32(averaging),
-    )  # fmt: skip
+            by_column[3:] = rates["sh_rest"]
+        parameters.append(AdamTables(*arrays, by_column))
+    options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
+    adam_rows(rows, state.steps.numpy(), tuple(parameters), options)
 
 
 def _tables(tensors: Parameters) -> tuple[np.ndarray, ...]:

@@ -1,4 +1,4 @@
-"""Interface between the trainer and the device that computes an iteration."""
+"""Interface between the trainer and the backends, which compute an iteration on a device."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,10 +7,6 @@ from typing import Protocol
 import numpy as np
 
 from ...capture.model import View
-from ...errors import StgaError
-from ...render.device import adapter_name
-from ..settings import TrainingSettings
-from .frames import FrameStore
 from .state import TrainState
 
 
@@ -54,23 +50,4 @@ class Backend(Protocol):
         """Forward, backward and optimizer step. Returns the latest image loss that has become available, if any."""
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' running average: a new (3, H, W) float32 image over background (3,)."""
-
-
-def make_backend(
-    device: str, settings: TrainingSettings, units: np.ndarray, frames: FrameStore, state: TrainState
-) -> Backend:
-    """The backend of a device of `choose_device`.
-
-    units (F,): see `losses.limit_units`. Raises StgaError if the device does not support the settings.
-    """
-    if device == "cpu":
-        from .cpu_backend import CpuBackend
-
-        return CpuBackend(settings, units, frames, state)
-    if settings.tracking:
-        raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
-    from ...raster.gpu.device import Device
-    from .gpu_backend import GpuBackend
-
-    return GpuBackend(Device(adapter_name(device)), settings, units, frames, state)
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over background (3,)."""

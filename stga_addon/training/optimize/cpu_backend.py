@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...avatar.embedding import FaceFrames, frame_backward, position_shift, shifted_frames
+from ...avatar.embedding import FaceFrames, frame_backward, shifted_frames, strain_offset
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
@@ -50,7 +50,7 @@ class CpuBackend:
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' running average: a new (3, H, W) float32 image."""
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image."""
         average = Parameters(*(tensor.numpy() for tensor in self.state.average))
         frames = self._moved_frames(view.timestep, averaged=True)
         return self._forward(average, frames, view, background, sh_degree).image.copy()
@@ -84,12 +84,12 @@ class CpuBackend:
         return rows, screen, loss if focus is None else None
 
     def _moved_frames(self, timestep: int, averaged: bool = False) -> FaceFrames:
-        """The timestep's frames, moved by strain where positions follow it; averaged: by the running average."""
+        """The timestep's frames, moved by strain where positions follow it; averaged: by the moving average."""
         frames, following = self._frames.of(timestep), self.state.strain_position
         if following is None:
             return frames
         coefficients = following.average if averaged else following.value
-        return shifted_frames(frames, position_shift(coefficients, self._frames.nearby(timestep)))
+        return shifted_frames(frames, strain_offset(coefficients, self._frames.smoothed_strain(timestep)))
 
     def _forward(
         self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray, sh_degree: int,
@@ -108,7 +108,7 @@ class CpuBackend:
         frames, gradients = store.of(timestep), Parameters(*(g.numpy() for g in state.gradients))
         splats, face = state.arrays(), state.face.numpy()
         if state.strain_position is not None:
-            shift = position_shift(state.strain_position.value, store.nearby(timestep))
+            shift = strain_offset(state.strain_position.value, store.smoothed_strain(timestep))
             splats = splats._replace(xyz=splats.xyz + shift[face])
         gradients_of_frames = frame_gradient(splats, face, gradients, rows, frames)
         vertex_gradient = frame_backward(store.mesh(timestep), store.capture.faces, frames, *gradients_of_frames)
@@ -124,7 +124,8 @@ class CpuBackend:
         if state.strain_position is not None:
             strain_position.step(
                 state.strain_position, rows, state.face.numpy(), state.gradients.xyz.numpy(),
-                self._frames.nearby(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
+                self._frames.smoothed_strain(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share,
+                epsilon,
             )  # fmt: skip
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, face_frames
-from ...avatar.strain import color_range, nearby_strain, strain_basis
+from ...avatar.strain import color_range, smoothed_strain, strain_basis
 from ...capture.model import Capture
 from .flame_refinement import Tracking
 
@@ -17,7 +17,7 @@ CACHED_TIMESTEPS = 12
 class _Timestep:
     mesh: np.ndarray
     frames: FaceFrames | None = None
-    nearby: np.ndarray | None = None
+    smoothed_strain: np.ndarray | None = None
 
 
 class FrameStore:
@@ -41,13 +41,13 @@ class FrameStore:
             entry.frames = face_frames(entry.mesh, capture.faces, capture.neutral, self.convention, self.strain)
         return entry.frames
 
-    def nearby(self, timestep: int) -> np.ndarray:
-        """(F, 3) `nearby_strain`; only where there is a `strain` basis."""
+    def smoothed_strain(self, timestep: int) -> np.ndarray:
+        """(F, 3) `smoothed_strain`; only where there is a `strain` basis."""
         assert self.strain is not None
         frames, entry = self.of(timestep), self._latest(timestep)
-        if entry.nearby is None:
-            entry.nearby = nearby_strain(self.strain, frames.strain)
-        return entry.nearby
+        if entry.smoothed_strain is None:
+            entry.smoothed_strain = smoothed_strain(self.strain, frames.strain)
+        return entry.smoothed_strain
 
     def mesh(self, timestep: int) -> np.ndarray:
         """(V, 3) that the frames of the timestep are computed from."""

@@ -144,7 +144,7 @@ class GpuBackend:
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' running average after all queued iterations: a new (3, H, W) float32 image."""
+        """The view with the splats' moving average after all queued iterations: a new (3, H, W) float32 image."""
         self._finish_all()
         average = replace(self._splats, rows=self._tables.average)
         moved = None if self._following is None else self._following.average
@@ -193,7 +193,7 @@ class GpuBackend:
             if self._following is not None:
                 strain_position_stage.step(
                     work, self._triangles, self._following, view=rendering.view, wanted=rendering.lists.wanted,
-                    gradients=self._gradients, nearby=self._embedding.nearby,
+                    gradients=self._gradients, smoothed=self._embedding.smoothed_strain,
                 )  # fmt: skip
             limited = bool(self._settings.scale_weight or self._settings.distance_weight)
             optimize(

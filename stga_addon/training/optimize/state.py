@@ -16,8 +16,8 @@ from ...raster.cpu.layout import Parameters
 class StrainPosition:
     """`Avatar.strain_position` of a mesh's F triangles in training.
 
-    value, first, second, average  (F, 3, 3) float32 coefficients, Adam's two moments, and the running average from
-                                   which the avatar is made
+    value, first, second, average  (F, 3, 3) float32 coefficients, Adam's two moments, and the exponential moving
+                                   average from which the avatar is made
     steps                          (F,) int32 Adam steps of each triangle
     """
 
@@ -40,7 +40,7 @@ class TrainState:
     """N splats in training: CPU tensors with N rows each.
 
     parameters, gradients, first, second  values, latest gradients and Adam's two moments, shaped as in `Splats`
-    average  running average of the parameters over their steps, from which the avatar is made
+    average  exponential moving average of the parameters over their steps, from which the avatar is made
     steps    (N,) int32 Adam steps per row
     face, unbound    (N,) int32 and (N,) bool, as in `Splats`
     unseen_share     (N,) float32 share of the cameras that did not see an unbound splat where training put it or its
@@ -75,7 +75,7 @@ class TrainState:
         return self._copy(self.parameters)
 
     def averaged(self) -> Splats:
-        """A copy of the splats' running average."""
+        """A copy of the splats' exponential moving average."""
         return self._copy(self.average)
 
     def _copy(self, parameters: Parameters) -> Splats:

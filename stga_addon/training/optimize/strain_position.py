@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...raster.cpu.optimizer import adam_rows, sum_by_triangle
+from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
 from .adam import BETA1, BETA2
 from .state import StrainPosition
 
@@ -15,28 +15,22 @@ def step(
     rows: np.ndarray,
     face: np.ndarray,
     xyz_gradient: np.ndarray,
-    nearby: np.ndarray,
+    smoothed: np.ndarray,
     position_rate: float,
-    newest: float,
+    ema_share: float,
     epsilon: np.float32,
 ) -> None:
     """Adam step of the triangles face (N,) of the listed splats rows (M,), whose positions have xyz_gradient (N, 3).
 
-    nearby (F, 3): `nearby_strain`; position_rate: the splats'; newest, epsilon: as in `adam_rows`. A triangle moves all
-    its splats alike, so its gradient is their sum.
+    smoothed (F, 3): `smoothed_strain`; position_rate: the splats'; ema_share, epsilon: as in `adam_rows`. A triangle
+    moves all its splats alike, so its gradient is their sum.
     """
     count = len(state.steps)
     total, trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
     sum_by_triangle(rows, face, xyz_gradient, total, trained)
-    gradient = nearby[:, :, None] * total[:, None, :]
-    rates = np.full((1, gradient[0].size), RATE_SHARE * position_rate, np.float32)
-    adam_rows(
-        np.flatnonzero(trained).astype(np.int32), state.steps, _table(state.value), _table(gradient),
-        _table(state.first), _table(state.second), _table(state.average), rates, BETA1, BETA2, epsilon,
-        np.float32(newest),
-    )  # fmt: skip
-
-
-def _table(array: np.ndarray) -> tuple[np.ndarray]:
-    """(F, 9), which shares memory with the array (F, 3, 3)."""
-    return (array.reshape(len(array), -1),)
+    gradient = smoothed[:, :, None] * total[:, None, :]
+    rates = np.full(gradient[0].size, RATE_SHARE * position_rate, np.float32)
+    arrays = (state.value, gradient, state.first, state.second, state.average)
+    tables = AdamTables(*(array.reshape(count, -1) for array in arrays), rates)
+    options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
+    adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)

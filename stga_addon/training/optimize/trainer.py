@@ -7,7 +7,8 @@ import numpy as np
 from ...capture.model import Capture, View
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
-from .backend import Batch, make_backend
+from .backend import Batch
+from .backends import make_backend
 from .flame_refinement import RefinementState, refinable_tracking, refinement_rate
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
@@ -124,7 +125,7 @@ class Trainer:
         return loss
 
     def render(self, view: View, progress: float = 1.0) -> np.ndarray:
-        """The view with the splats' running average: a new (3, H, W) float32 image over the background."""
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
     def _post_step(self, progress: float) -> None:

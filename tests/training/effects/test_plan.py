@@ -1,6 +1,5 @@
 """Effect plan: decided once, printed, stored with the run and kept on resume."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -49,11 +48,7 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
     run = with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
     setting = effect.replace("-", "_")
     assert not getattr(run.settings, setting)
-    called_for = [
-        replace(each, rule=lambda facts: Verdict(True, "two takes say so")) if each.name == effect else each
-        for each in planning.EFFECTS
-    ]
-    monkeypatch.setattr(planning, "EFFECTS", called_for)
+    monkeypatch.setitem(planning.RULES, effect, lambda facts: Verdict(True, "two takes say so"))
     extended = with_effects_of_takes(run, capture)
     assert getattr(extended.settings, setting) == expected
     changed = [now for now, then in zip(extended.effect_plan, run.effect_plan, strict=True) if now != then]

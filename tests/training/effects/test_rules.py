@@ -11,7 +11,8 @@ from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
 from stga_addon.training.effects import rules
-from stga_addon.training.effects.decisions import EFFECTS, parse_choices
+from stga_addon.training.effects.catalog import EFFECT_NAMES
+from stga_addon.training.effects.decisions import parse_choices
 from stga_addon.training.effects.evidence import fit_cameras, stable_colors
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
@@ -198,7 +199,7 @@ def with_frames(*frames):
 
 
 def looked(facts, name):
-    return next(effect for effect in rules.EFFECTS if effect.name == name).rule(facts)
+    return rules.RULES[name](facts)
 
 
 @pytest.mark.parametrize(
@@ -280,8 +281,8 @@ def test_overrides(painted):
 
 
 def test_names():
-    """Catches an effect that the command line does not know, or knows in vain."""
-    assert tuple(effect.name for effect in rules.EFFECTS) == EFFECTS
+    """Catches an effect without a rule, and a rule without an effect."""
+    assert tuple(rules.RULES) == EFFECT_NAMES
     assert parse_choices(["jaw=off", "hull-points=on"]) == {"jaw": "off", "hull-points": "on"}
     for wrong in ("jaws=on", "jaw", "jaw=maybe"):
         with pytest.raises(StgaError, match=f"'{wrong}' is not NAME=on"):

@@ -1,4 +1,4 @@
-"""Reports as JSON which packages and device an interpreter has: `python -m stga_addon.worker.environment_check`."""
+"""Reports as JSON which packages and device an interpreter has: `python -m stga_addon.requests.environment_check`."""
 
 import importlib
 import json
@@ -6,7 +6,7 @@ import os
 import platform
 from importlib.util import find_spec
 
-from .requirements import REQUIREMENTS
+from ..worker.requirements import REQUIREMENTS
 
 
 def main() -> None:
@@ -31,15 +31,15 @@ def _adapters() -> tuple[list[str], str]:
     """The GPUs that can train, as `--device gpu:NAME` names them, and the device to report: the first GPU, or the CPU.
 
     Whether that GPU is right and faster than the CPU is tried before each training (`choose_device`), not here.
-    The module that knows is imported by name, like the packages: it fails to load where one of them is missing.
     """
     cpu = f"CPU with {os.cpu_count()} threads"
     try:
-        device = importlib.import_module("..raster.gpu.device", __package__)
-        found = device.adapters()
-    except Exception:  # the package is missing, or a driver fails: the CPU trains
+        from ..raster.gpu.device import adapters, is_software
+
+        found = adapters()
+    except Exception:  # a package is missing, or a driver fails: the CPU trains
         return [], cpu
-    return list(found), next((name for name, adapter in found.items() if not device.is_software(adapter)), cpu)
+    return list(found), next((name for name, adapter in found.items() if not is_software(adapter)), cpu)
 
 
 if __name__ == "__main__":

@@ -9,22 +9,25 @@ from pathlib import Path
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.requests import environment_job
+from stga_addon.requests.environment_job import (
+    InstallStep,
+    check_arguments,
+    check_python,
+    describe_check,
+    install_steps,
+    make_environment,
+    remove_environment,
+    store_choice,
+)
 from stga_addon.worker import environment
 from stga_addon.worker.environment import (
     ADAPTERS_FILE,
     CHOICE_FILE,
     PYTHON_VARIABLE,
-    InstallStep,
-    check_arguments,
-    check_python,
-    describe_check,
     find_training_python,
-    install_steps,
     made_python,
-    make_environment,
-    remove_environment,
     status_folder,
-    store_choice,
     stored_adapters,
     stored_choice,
     venv_python,
@@ -76,7 +79,7 @@ def test_install_steps_of_tracking(tmp_path):
 @pytest.mark.parametrize(("newest", "status"), [((3, 11), 0), ((99, 0), 1)])
 def test_old_python_is_refused_first(newest, status, tmp_path, monkeypatch):
     """Catches gigabytes downloaded for a Python that cannot use them."""
-    monkeypatch.setattr(environment, "MIN_PYTHON", newest)
+    monkeypatch.setattr(environment_job, "MIN_PYTHON", newest)
     looking = install_steps(tmp_path, sys.executable, None)[0]
     done = subprocess.run(looking.command, capture_output=True, text=True)
     assert done.returncode == status
@@ -135,16 +138,16 @@ def test_check_in_a_worker(tmp_path):
 @pytest.fixture
 def tiny(monkeypatch):
     """An installation of the virtual environment alone, without pip."""
-    monkeypatch.setattr(environment, "SIZE_GB", 0.0)
+    monkeypatch.setattr(environment_job, "SIZE_GB", 0.0)
     made = [sys.executable, "-m", "venv", "--without-pip"]
     monkeypatch.setattr(
-        environment, "install_steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])]
+        environment_job, "install_steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])]
     )
 
 
 def test_environment_is_made(tiny, tmp_path, monkeypatch):
     """Catches an environment used before it passed the check, or not found afterwards."""
-    monkeypatch.setattr(environment, "check_python", lambda python, folder: f"good {Path(python).exists()}")
+    monkeypatch.setattr(environment_job, "check_python", lambda python, folder: f"good {Path(python).exists()}")
     python = venv_python(tmp_path / "venv-1")
     python.parent.mkdir(parents=True)
     python.touch()
@@ -168,7 +171,7 @@ def test_failed_environment_is_removed(tiny, tmp_path):
 def test_failed_attempt_keeps_the_environment(tiny, tmp_path, monkeypatch):
     """Catches a working environment lost when making a newer one fails."""
     with monkeypatch.context() as patched:
-        patched.setattr(environment, "check_python", lambda python, folder: "good")
+        patched.setattr(environment_job, "check_python", lambda python, folder: "good")
         make_environment(tmp_path, sys.executable)
     before = made_python(tmp_path)
     with pytest.raises(StgaError, match="lacks numpy, torch"):
@@ -200,7 +203,7 @@ def test_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypa
     log = status_folder(tmp_path) / LOG_FILE
     script = f"import sys; open({str(log)!r}, 'a').write({printed + chr(10)!r}); sys.exit(1)"
     monkeypatch.setattr(
-        environment, "install_steps", lambda *_: [InstallStep("installing torch", [sys.executable, "-c", script])]
+        environment_job, "install_steps", lambda *_: [InstallStep("installing torch", [sys.executable, "-c", script])]
     )
     with pytest.raises(StgaError, match=f"installing torch failed: .*{reason}"):
         make_environment(tmp_path, sys.executable)
@@ -208,10 +211,10 @@ def test_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypa
 
 def test_optional_step_may_fail(tiny, tmp_path, monkeypatch):
     """Catches a failure where pytorch.org cannot be reached, but PyPI can."""
-    monkeypatch.setattr(environment, "check_python", lambda python, folder: "good")
+    monkeypatch.setattr(environment_job, "check_python", lambda python, folder: "good")
     failing = InstallStep("failing", [sys.executable, "-c", "raise SystemExit(1)"], optional=True)
-    making = environment.install_steps
-    monkeypatch.setattr(environment, "install_steps", lambda *given: [*making(*given), failing])
+    making = environment_job.install_steps
+    monkeypatch.setattr(environment_job, "install_steps", lambda *given: [*making(*given), failing])
     assert make_environment(tmp_path, sys.executable) == "good"
 
 
@@ -225,7 +228,7 @@ def test_cancel_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
         ),
         InstallStep("waiting", [sys.executable, "-c", script]),
     ]
-    monkeypatch.setattr(environment, "install_steps", lambda *_: steps)
+    monkeypatch.setattr(environment_job, "install_steps", lambda *_: steps)
     assert make_environment(tmp_path, sys.executable) == ""
     assert inspect_worker(folder).state == WorkerState.CANCELLED
     assert not list(tmp_path.glob("venv*"))
@@ -233,7 +236,7 @@ def test_cancel_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
 
 def test_small_disk_is_refused(tmp_path, monkeypatch):
     """Catches a full disk after half an hour of downloading."""
-    monkeypatch.setattr(environment.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
+    monkeypatch.setattr(environment_job.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
     with pytest.raises(StgaError, match=r"has 0\.1 GB free, the environment needs 1\.5 GB"):
         make_environment(tmp_path, sys.executable, "cpu")
 
@@ -241,7 +244,7 @@ def test_small_disk_is_refused(tmp_path, monkeypatch):
 def test_check_prints_json():
     """Catches a check whose last line is not one JSON object."""
     done = subprocess.run(
-        [sys.executable, "-m", "stga_addon.worker.environment_check"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "stga_addon.requests.environment_check"], capture_output=True, text=True, check=True
     )
     assert set(json.loads(done.stdout.splitlines()[-1])) == set(FOUND)
 
@@ -250,7 +253,7 @@ def test_check_prints_json():
 def chosen(tmp_path, monkeypatch):
     """An environment folder and a check that every interpreter passes."""
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
-    monkeypatch.setattr(environment, "check_python", lambda python, folder: "good")
+    monkeypatch.setattr(environment_job, "check_python", lambda python, folder: "good")
     return tmp_path / "environment"
 
 
@@ -332,9 +335,9 @@ def test_environment_is_removed(chosen, tiny):
 def test_installation_does_not_see_other_packages(tiny, tmp_path, monkeypatch):
     """Catches pip that takes packages on the worker's path for installed ones."""
     monkeypatch.setenv("PYTHONPATH", "/bundled")
-    monkeypatch.setattr(environment, "check_python", lambda python, folder: "good")
+    monkeypatch.setattr(environment_job, "check_python", lambda python, folder: "good")
     code = "import os, sys; sys.exit('PYTHONPATH' in os.environ)"
-    making = environment.install_steps
+    making = environment_job.install_steps
     step = InstallStep("looking", [sys.executable, "-c", code])
-    monkeypatch.setattr(environment, "install_steps", lambda *given: [*making(*given), step])
+    monkeypatch.setattr(environment_job, "install_steps", lambda *given: [*making(*given), step])
     assert make_environment(tmp_path, sys.executable) == "good"

@@ -1,12 +1,12 @@
 // Strain around each triangle, and frames moved by it, as `avatar/strain.py` and `avatar/embedding.py` define them.
 
 @group(0) @binding(0) var<uniform> pose: Pose;
-// (M, F): a triangle that shares an edge with each triangle, another one, …; F where there is none.
+// (F + 1 + N): where the triangles that share an edge with a triangle begin in this array, then those triangles.
 @group(0) @binding(1) var<storage, read> neighbors: array<u32>;
 // (F, S, 3): `Avatar.strain_position`.
 @group(0) @binding(2) var<storage, read> coefficients: array<f32>;
 // (F, S): strain less that at rest, averaged in the rounds so far.
-@group(0) @binding(3) var<storage, read> nearby: array<f32>;
+@group(0) @binding(3) var<storage, read> smoothed: array<f32>;
 // (F, S): the same, averaged once more.
 @group(0) @binding(4) var<storage, read_write> averaged: array<f32>;
 @group(0) @binding(5) var<storage, read_write> frames: array<f32>;
@@ -23,20 +23,16 @@ fn average(
     return;
   }
   for (var k = 0u; k < pose.strains; k++) {
-    var total = nearby[f * pose.strains + k];
-    var count = 1.0;
-    for (var n = 0u; n < pose.neighbors; n++) {
-      let other = neighbors[n * pose.triangles + f];
-      if other < pose.triangles {
-        total += nearby[other * pose.strains + k];
-        count += 1.0;
-      }
+    var total = smoothed[f * pose.strains + k];
+    let end = neighbors[f + 1u];
+    for (var n = neighbors[f]; n < end; n++) {
+      total += smoothed[neighbors[n] * pose.strains + k];
     }
-    averaged[f * pose.strains + k] = total / count;
+    averaged[f * pose.strains + k] = total / f32(1u + end - neighbors[f]);
   }
 }
 
-// Move a triangle's origin by Σ nearby · coefficients, in the triangle's axes and unit.
+// Move a triangle's origin by Σ smoothed · coefficients, in the triangle's axes and unit.
 @compute @workgroup_size(WORKGROUP)
 fn shift(
   @builtin(workgroup_id) workgroup: vec3u,
@@ -50,7 +46,7 @@ fn shift(
   var moved = vec3f(0.0);
   for (var k = 0u; k < pose.strains; k++) {
     let row = f * pose.strains + k;
-    moved += nearby[row] * vec3f(coefficients[3u * row], coefficients[3u * row + 1u], coefficients[3u * row + 2u]);
+    moved += smoothed[row] * vec3f(coefficients[3u * row], coefficients[3u * row + 1u], coefficients[3u * row + 2u]);
   }
   let at = f * (FRAME_STRAIN + pose.strains);
   for (var axis = 0u; axis < 3u; axis++) {

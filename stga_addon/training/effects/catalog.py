@@ -1,0 +1,78 @@
+"""Catalog of effects: what each costs, and the settings that switch it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect: its name, as in `--effect NAME=on`, its cost while it is on, and the settings that switch it.
+
+    on, off  changes to `TrainingSettings`
+    """
+
+    name: str
+    cost: str
+    on: Mapping[str, Any] = field(default_factory=dict)
+    off: Mapping[str, Any] = field(default_factory=dict)
+
+
+EFFECTS = (
+    Effect(
+        "view-color",
+        "3, 8 or 15 coefficients more a splat and channel",
+        off={"sh_degree": 0, "sh_steps": ()},
+    ),
+    Effect("exposure", "a pass over each image when it is read"),
+    Effect("antialiasing", "a root a splat", on={"antialiased": True}, off={"antialiased": False}),
+    Effect(
+        "background",
+        "a pass over the image in every iteration",
+        on={"random_background": True},
+        off={"random_background": False},
+    ),
+    Effect(
+        "hull-points",
+        "a splat for every 4 mm beside the mesh",
+        on={"hull_points": True},
+        off={"hull_points": False},
+    ),
+    Effect(
+        "depth-limits",
+        "none: splats are smaller and nearer to their triangles",
+        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03},
+    ),
+    Effect("density", "up to a quarter more splats, more in the preset final", off={"density_interval": 0}),
+    Effect(
+        "selection",
+        "none: local iterations are cheaper than global ones",
+        on={"strategy": "selective"},
+        off={"strategy": "global"},
+    ),
+    Effect(
+        "strain-color",
+        "3 coefficients more a splat and channel, and the strain of every frame",
+        on={"strain_color": True},
+        off={"strain_color": False},
+    ),
+    Effect(
+        "strain-position",
+        "9 coefficients a triangle, and the strain of every frame",
+        on={"strain_position": True},
+        off={"strain_position": False},
+    ),
+    Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
+    Effect("neck", "9 shape keys and drivers in Blender"),
+    Effect("jaw", "9 shape keys and drivers in Blender"),
+    Effect("eyes", "18 shape keys and drivers in Blender"),
+    Effect("dynamic-offsets", "a mesh a frame beside the parameters"),
+    Effect(
+        "tracking",
+        "a pass through FLAME and back in every global iteration; the run's tracking.npz is then the head's motion",
+        on={"tracking": True},
+        off={"tracking": False},
+    ),
+)
+"""In display order."""
+EFFECT_NAMES = tuple(effect.name for effect in EFFECTS)
