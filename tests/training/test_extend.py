@@ -142,6 +142,18 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
+def test_a_resumed_extension_needs_no_parent(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches a run that fails at its next evaluation because the run that it began with was moved, or that takes over
+    another avatar that lies there now."""
+    beside = Path(shutil.copytree(parent, tmp_path / "parent"))
+    out = extend(beside, takes[1], tmp_path / "extended", stop=7)
+    before = read_avatar(out / "avatar.npz").strain_range
+    shutil.rmtree(beside)
+    opened = open_run(out)
+    train(opened.capture, out, opened.run, resume=True)
+    np.testing.assert_array_equal(read_avatar(out / "avatar.npz").strain_range, before)
+
+
 def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Path], tmp_path: Path) -> None:
     """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they change at once."""
     capture = open_capture(takes[0])

@@ -42,7 +42,13 @@ from .open_run import check_identity
 from .progress import Progress, Report
 from .replay import continued_order
 from .residual_file import write_residuals
-from .strain_range import require_color_range, trained_strain_range
+from .strain_range import (
+    STRAIN_RANGE,
+    read_strain_range,
+    require_color_range,
+    trained_strain_range,
+    write_strain_range,
+)
 
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
@@ -152,7 +158,7 @@ class _Loop:
         self.psnr: float | None = None
         self.speed = 0.0
         self.forecast_text = ""
-        self.measured_strain: np.ndarray | None = None
+        self.strain_range: np.ndarray | None = None
 
     def begin(self, selection: dict[int, np.ndarray] | None) -> None:
         """Start a new run: select triangles, place splats, and write the run's files."""
@@ -164,7 +170,8 @@ class _Loop:
         if continuation is not None:
             state = starting_state(continuation, self.settings, len(self.capture.faces))
             self._check(state)
-        self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device)
+        self._measure_strain()
+        self.trainer = Trainer(self.capture, self.settings, selection, state, self.run.device, self.strain_range)
         for stale in (TRACKING, CHECKPOINT, METRICS):  # of a run whose run.json was removed
             (self.out / stale).unlink(missing_ok=True)
         if continuation is not None and (continuation.parent / TRACKING).exists():
@@ -182,7 +189,10 @@ class _Loop:
             raise StgaError(f"{self.out / CHECKPOINT}: {OTHER_RUN}")
         selection = read_selection(self.out, len(self.capture.faces), self.digest)
         self._check(checkpoint.state)
-        self.trainer = Trainer(self.capture, self.settings, selection, checkpoint.state, self.run.device)
+        self._read_or_measure_strain()
+        self.trainer = Trainer(
+            self.capture, self.settings, selection, checkpoint.state, self.run.device, self.strain_range
+        )
         here, there = self.trainer.tracking, checkpoint.tracking
         if (None if here is None else here.tracked.shape) != (None if there is None else there.change.shape):
             raise StgaError(f"{self.out}: its checkpoint's refined tracking does not fit the capture or the settings")
@@ -316,6 +326,7 @@ class _Loop:
         share = min(1.0, self._share())
         self.evaluations = max(self.evaluations, int(share * EVALUATIONS))
         begin = perf_counter()
+        self._measure_refined_strain()
         line: dict[str, Any] = {
             "iteration": self.trainer.iteration,
             "seconds": round(self.elapsed, 3),
@@ -324,12 +335,14 @@ class _Loop:
         if self.losses:
             line["loss"] = float(np.mean(self.losses))
         if self.evaluation_views:
-            quality = evaluate(
-                lambda view: self.trainer.render(view, share),
-                self.evaluation_views,
-                perceptual,
-                matched=bool(self.settings.exposure),
-            )
+            limits = None if self.trainer.tracking is None else self.strain_range
+            with self.trainer.frames.strain_within(limits):
+                quality = evaluate(
+                    lambda view: self.trainer.render(view, share),
+                    self.evaluation_views,
+                    perceptual,
+                    matched=bool(self.settings.exposure),
+                )
             self.psnr = quality.psnr
             line.update(quality.as_json())
         self._keep_best(line.get(DETAIL))
@@ -385,6 +398,8 @@ class _Loop:
             self.forecast_text = "; ".join(filter(None, (self.forecast_text, far)))
 
     def _avatar(self) -> Avatar:
+        if self.strain_range is None:
+            self._measure_refined_strain()
         state = self.trainer.state
         return Avatar(
             state.averaged(),
@@ -396,18 +411,31 @@ class _Loop:
             self.settings.background,
             self.settings.antialiased,
             self.run.principal_point,
-            self._strain_range(),
+            self.strain_range,
             None if state.strain_position is None else state.strain_position.average.copy(),
         )
 
-    def _strain_range(self) -> np.ndarray | None:
-        """Measured once, or whenever refined tracking may have moved the meshes."""
-        if not (self.settings.strain_color or self.settings.strain_position):
-            return None
-        if self.measured_strain is None or self.trainer.tracking is not None:
-            mesh = self.trainer.frames.mesh if self.trainer.tracking is not None else self.capture.mesh
-            self.measured_strain = trained_strain_range(self.capture, mesh, self.run.continuation)
-        return self.measured_strain
+    def _measure_strain(self) -> None:
+        """Measure and write the strain of all training timesteps; refined tracking moves meshes, so not with it."""
+        if self._follows_strain() and not self.settings.tracking:
+            self.report(Progress(message="Measuring strain"))
+            self.strain_range = trained_strain_range(self.capture, self.capture.mesh, self.run.continuation)
+            write_strain_range(self.out, self.strain_range, self.digest)
+
+    def _read_or_measure_strain(self) -> None:
+        """The file is missing where an earlier version began the run."""
+        if (self.out / STRAIN_RANGE).exists() and self._follows_strain():
+            self.strain_range = read_strain_range(self.out, len(self.capture.faces), self.digest)
+        else:
+            self._measure_strain()
+
+    def _follows_strain(self) -> bool:
+        return self.settings.strain_color or self.settings.strain_position
+
+    def _measure_refined_strain(self) -> None:
+        """With refined tracking, measure all training timesteps where their meshes are now."""
+        if self._follows_strain() and self.trainer.tracking is not None:
+            self.strain_range = trained_strain_range(self.capture, self.trainer.frames.mesh, None)
 
     def _save(self) -> None:
         trainer = self.trainer
