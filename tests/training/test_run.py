@@ -13,9 +13,11 @@ import pytest
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import loop as run_module
+from stga_addon.training.run import session as session_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
@@ -203,13 +205,13 @@ def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pyte
         written.append(avatar)
         run_module_write(path, avatar)
 
-    run_module_write = run_module.write_avatar
+    run_module_write = session_module.write_avatar
     monkeypatch.setattr(
-        run_module,
+        evaluator,
         "evaluate",
         lambda *args, **kwargs: Quality(30.0, 0.5, detail_difference=next(scores)),
     )
-    monkeypatch.setattr(run_module, "write_avatar", write)
+    monkeypatch.setattr(session_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)
     assert len(written) == 2

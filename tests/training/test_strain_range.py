@@ -138,10 +138,13 @@ def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     train(toy, out, run, report=lambda progress: progress.iteration == 2)
-    limits = color_range(len(toy.faces))
+    limits, digest = color_range(len(toy.faces)), identity_of(toy, None, "vhap", settings).digest
     for arrays, says in (
         ((limits, "other"), "belongs to another run than run.json beside it"),
-        ((limits[1:], identity_of(toy, None, "vhap", settings).digest), r"expected 'strain_range', float32 \(320, 2, 3\)"),
+        (
+            (limits[1:], digest),
+            r"expected 'strain_range', float32 \(320, 2, 3\)",
+        ),
     ):
         write_strain_range(out, *arrays)
         with pytest.raises(StgaError, match=rf"strain_range\.npz: {says}"):

@@ -143,6 +143,29 @@ def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
     return f"{predicted}, detail difference {change:+.0f} % (±{error:.0f})"
 
 
+def next_forecast(lines: Sequence[Mapping[str, Any]], elapsed: float, left: float) -> Forecast | None:
+    """Forecast of PSNR over `forecast_horizon`; None where there is none."""
+    ahead = forecast_horizon(elapsed, left)
+    return None if ahead is None else forecast(curve_of(lines), ahead)
+
+
+def describe_forecast(lines: Sequence[Mapping[str, Any]], elapsed: float, left: float, target: float | None) -> str:
+    """What to expect of the remaining budget `left` (seconds) after `elapsed`, and whether a target PSNR is in reach.
+
+    Empty where nothing is known.
+    """
+    ahead = forecast_horizon(elapsed, left)
+    text = "" if ahead is None else forecast_text(lines, ahead)
+    plateau = flat_since(lines) if left else None
+    if plateau is not None:
+        text = f"no gain since {format_duration(plateau)}: more time no longer helps"
+    end = forecast(curve_of(lines), left) if left else None
+    if target is not None and end is not None and end.psnr + end.error < target:
+        far = f"{target:g} dB is out of reach ({end.psnr:.1f} ± {end.error:.1f} dB at the end)"
+        text = "; ".join(filter(None, (text, far)))
+    return text
+
+
 def explain_missed_target(curve: Curve, target: float) -> str:
     """Why a target PSNR was not reached and what would help, in one sentence."""
     best = max(psnr for _, psnr in curve)

@@ -13,7 +13,8 @@ from ...avatar.strain import COLOR_RANGE, color_range, seen_range, strain_basis
 from ...capture.model import Capture
 from ...errors import StgaError
 from ...files import read_npz, write_npz
-from .folder import Continuation
+from ..settings import TrainingSettings
+from .folder import Continuation, Run
 
 STRAIN_RANGE = "strain_range.npz"
 OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
@@ -40,6 +41,25 @@ def trained_strain_range(
         return limits
     lowest, highest = np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])
     return np.stack([np.maximum(lowest, limits[:, 0]), np.minimum(highest, limits[:, 1])], axis=1)
+
+
+def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | None:
+    """The range (F, 2, 3) of a run that has begun in the folder, measured and written where the folder has no file yet.
+
+    None where nothing follows strain, and with refined tracking, which moves the meshes while it trains.
+    """
+    if not follows_strain(run.settings) or run.settings.tracking:
+        return None
+    assert run.identity is not None
+    if (folder / STRAIN_RANGE).exists():
+        return read_strain_range(folder, len(capture.faces), run.identity.digest)
+    limits = trained_strain_range(capture, capture.mesh, run.continuation)
+    write_strain_range(folder, limits, run.identity.digest)
+    return limits
+
+
+def follows_strain(settings: TrainingSettings) -> bool:
+    return settings.strain_color or settings.strain_position
 
 
 def write_strain_range(folder: Path, limits: np.ndarray, identity: str) -> None:
