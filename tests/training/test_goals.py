@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.training.evaluate import evaluator
@@ -99,6 +100,20 @@ def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch
     train(toy, tmp_path, run, resume=True)
     assert read_checkpoint(tmp_path).iteration == 30
     assert next(values, None) is None
+
+
+def test_the_avatar_that_reached_the_target_is_kept(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches "30 dB was reached" beside a file that has less, because an earlier one was sharper."""
+    found = iter([Quality(25.0, 0.5, detail_difference=0.1), *[Quality(30.5, 0.5, detail_difference=0.2)] * 2])
+    monkeypatch.setattr(evaluator, "evaluate", lambda *arguments, **named: next(found))
+    run = run_of(toy, target_psnr=30.0)
+    path = train(toy, tmp_path, run)
+    end = read_checkpoint(tmp_path)
+    assert end.iteration == 20
+    np.testing.assert_array_equal(read_avatar(path).splats.xyz, end.state.average.xyz)
+    assert end.best_difference == 0.2
 
 
 def test_a_target_out_of_sight_is_said_while_training(toy: Capture, tmp_path: Path, clock: Clock) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from ...capture.model import View
 from ..settings import TrainingSettings
 from .evaluation_views import EvaluationView
-from .forecast import DETAIL, curve_of, describe_forecast, flat_since, next_forecast
+from .forecast import DETAIL, UNMATCHED, curve_of, describe_forecast, flat_since, next_forecast
 from .metrics import evaluate
 
 EVALUATIONS = 10
@@ -51,6 +51,7 @@ class Evaluator:
 
     keeps_latest     a continuation keeps the latest avatar: the one before is in the folder that it continues
     lines            of the run's metrics.jsonl
+    exposure         `known_exposure` of the training cameras; None where their images are not corrected
     count            evaluations of the schedule that have been made
     best_difference  `Quality.detail_difference` of the avatar that is kept; ∞ before there is one
     forecast_text    what more training is expected to bring
@@ -59,6 +60,7 @@ class Evaluator:
     settings: TrainingSettings
     views: Sequence[EvaluationView]
     keeps_latest: bool = False
+    exposure: Mapping[int, np.ndarray] | None = None
     lines: list[dict[str, Any]] = field(default_factory=list)
     count: int = 0
     best_difference: float = math.inf
@@ -68,6 +70,11 @@ class Evaluator:
     def psnr(self) -> float | None:
         """Of the last evaluation, in dB."""
         return self.lines[-1].get("psnr") if self.lines else None
+
+    @property
+    def psnr_unmatched(self) -> float | None:
+        """The same without fitted exposure; None where none was fitted."""
+        return self.lines[-1].get(UNMATCHED) if self.lines else None
 
     def is_due(self, spent: Spent) -> bool:
         """Whether to evaluate now; at the end of the budget there is an evaluation anyway."""
@@ -89,8 +96,7 @@ class Evaluator:
         """Measure `render(view)` on the evaluation views; perceptual: with LPIPS."""
         if not self.views:
             return Evaluation({}, True)
-        matched = bool(self.settings.exposure)
-        quality = evaluate(render, self.views, perceptual, matched=matched).as_json()
+        quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
         return Evaluation(quality, self._is_kept(quality))
 
     def record(self, evaluation: Evaluation, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
@@ -106,9 +112,11 @@ class Evaluator:
         return self.lines[-1]
 
     def _is_kept(self, quality: Mapping[str, float]) -> bool:
-        """Whether this avatar is the sharpest so far.
+        """Whether this avatar is the sharpest so far, or reaches the target, which ends the run (`saved_line`).
 
-        Not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
+        Otherwise not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
         """
-        difference = quality.get(DETAIL)
-        return self.keeps_latest or difference is None or difference <= self.best_difference
+        difference, target = quality.get(DETAIL), self.settings.target_psnr
+        if self.keeps_latest or difference is None or (target is not None and quality["psnr"] >= target):
+            return True
+        return difference <= self.best_difference

@@ -19,8 +19,9 @@ from .interrupts import interrupt_requests
 from .metrics_log import append_metrics
 from .open_run import check_identity
 from .progress import Progress, Report
-from .session import Session, begin_session, resume_session
+from .session import AVATAR, Session, begin_session, resume_session
 
+_log = logging.getLogger(__name__)
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 
@@ -48,7 +49,7 @@ def train(
     except DeviceError as error:
         if not falls_back:
             raise
-        logging.getLogger(__name__).warning("%s; continuing on the CPU from the last checkpoint", error.cause)
+        _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
     # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
     report(Progress(message="Continuing on the CPU"))
     return _train(capture, out, replace(run, device="cpu"), selection, True, report)
@@ -82,7 +83,7 @@ def _train(
             session, evaluator = begin_session(capture, out, run, selection, report)
         wall_s = evaluator.lines[-1]["wall_s"] if evaluator.lines else 0.0
         _Loop(session, evaluator, report, perf_counter() - wall_s).work()
-    return out / "avatar.npz"
+    return out / AVATAR
 
 
 @dataclass
@@ -101,8 +102,9 @@ class _Loop:
 
     def work(self) -> None:
         """Train until the budget is spent, a goal of the settings is reached or the report asks to stop."""
-        if self._is_finished():
-            return  # a finished run was resumed
+        if self._is_finished():  # a finished run was resumed
+            self._restore_avatar()
+            return
         with interrupt_requests() as interrupts:
             if self.session.run.continuation is not None and not self.evaluator.lines:
                 self._evaluate()  # the avatar before, which the others are compared with
@@ -115,6 +117,16 @@ class _Loop:
         self.report(self._progress("Interrupted" if interrupts else "Finished"))
         if interrupts:
             raise KeyboardInterrupt
+
+    def _restore_avatar(self) -> None:
+        """Write a finished run's avatar where it is missing."""
+        path = self.session.folder / AVATAR
+        if path.exists():
+            return
+        _log.warning("%s was missing; it is written anew from the checkpoint, the last state of training", path)
+        self.report(self._progress("Writing the missing avatar from the checkpoint"))
+        self.session.write_avatar()
+        self.session.write_residuals()
 
     def _train(self, interrupts: list[int]) -> None:
         session = self.session
@@ -137,6 +149,7 @@ class _Loop:
         """Evaluate, keep the avatar where that says so, and append a line of metrics."""
         begin, session = perf_counter(), self.session
         evaluation = session.evaluate(self.evaluator, perceptual)
+        session.require_folder()
         if evaluation.is_kept:
             session.write_avatar()
         now = perf_counter()
@@ -165,4 +178,5 @@ class _Loop:
             message,
             self.evaluator.forecast_text,
             session.avatar,
+            self.evaluator.psnr_unmatched,
         )

@@ -1,5 +1,6 @@
 """Session of a run in its folder: begun or resumed, trained step by step, and written."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from ...selection import select_capture
 from ..effects.decisions import TRACKING
 from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views, read_evaluation_view
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
+from ..evaluate.match_exposure import known_exposure
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.exposure import exposure_correction
 from ..optimize.flame_refinement import with_refined_tracking, write_tracking
@@ -27,7 +29,7 @@ from ..schedule import image_scale, view_order
 from ..settings import TrainingSettings, to_json
 from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
 from .continuation import continued_evaluation_views, starting_state
-from .folder import CHECKPOINT, Run, write_run
+from .folder import CHECKPOINT, Run, read_run, write_run
 from .metrics_log import METRICS, cut_metrics, read_metrics
 from .progress import Progress, Report
 from .replay import continued_order
@@ -38,7 +40,7 @@ RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
 RESIDUAL_VIEWS = 24
 """Views in which the residuals of a finished run are measured."""
-AVATAR = "avatar.npz"
+AVATAR, RUN = "avatar.npz", "run.json"
 
 
 @dataclass
@@ -132,6 +134,15 @@ class Session:
         }
         return figures if self.loss is None else {**figures, "loss": self.loss}
 
+    def require_folder(self) -> None:
+        """Raise StgaError where the run is no longer in its folder, which writing would make anew."""
+        if (self.folder / RUN).exists() and read_run(self.folder).identity == self.run.identity:
+            return
+        raise StgaError(
+            f"{self.folder}: was moved or deleted while its run trained; resume the run from its checkpoint, "
+            "in the folder where it is now"
+        )
+
     def write_avatar(self) -> None:
         write_avatar(self.folder / AVATAR, self.avatar())
         if self.trainer.tracking is not None:
@@ -140,6 +151,7 @@ class Session:
     def write_checkpoint(self, evaluator: Evaluator) -> None:
         trainer = self.trainer
         assert self.run.identity is not None
+        self.require_folder()
         checkpoint = Checkpoint(
             trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
             self.elapsed_s, evaluator.best_difference, evaluator.count, list(self.losses),
@@ -191,7 +203,8 @@ def begin_session(
         with replacing(folder / TRACKING) as partial:
             copyfile(continuation.parent / TRACKING, partial)
     session = Session(capture, folder, run, trainer, strain_range)
-    evaluator = Evaluator(settings, _evaluation_views(capture, run, trainer), continuation is not None)
+    views, exposure = _evaluation_views(capture, run, trainer), _exposure(capture, run)
+    evaluator = Evaluator(settings, views, continuation is not None, exposure)
     assert run.identity is not None
     write_selection(folder, selection, run.identity.digest)
     write_run(folder, run)
@@ -214,10 +227,12 @@ def resume_session(capture: Capture, folder: Path, run: Run, report: Report) -> 
     session.losses.extend(checkpoint.losses)
     cut_metrics(folder, checkpoint.iteration)
     evaluator = Evaluator(
-        run.settings, _evaluation_views(capture, run, trainer), run.continuation is not None,
+        run.settings, _evaluation_views(capture, run, trainer), run.continuation is not None, _exposure(capture, run),
         read_metrics(folder), checkpoint.evaluations, checkpoint.best_difference,
     )  # fmt: skip
-    if not evaluator.is_finished(session.spent()) and (folder / AVATAR).exists():
+    if not (folder / AVATAR).exists():
+        evaluator.best_difference = math.inf  # so that the next evaluation writes one
+    elif not evaluator.is_finished(session.spent()):
         require_color_range(folder / AVATAR, read_avatar(folder / AVATAR))
     write_run(folder, run)  # capture, model and device may be others now
     return session, evaluator
@@ -241,7 +256,14 @@ def _strain_range(folder: Path, capture: Capture, run: Run, report: Report) -> n
 def _evaluation_views(capture: Capture, run: Run, trainer: Trainer) -> list[EvaluationView]:
     if run.continuation is not None:
         return continued_evaluation_views(run, capture, _refined_region(run, trainer))
-    return [read_evaluation_view(capture, view) for view in choose_evaluation_views(capture)]
+    background = run.settings.background
+    return [read_evaluation_view(capture, view, background) for view in choose_evaluation_views(capture)]
+
+
+def _exposure(capture: Capture, run: Run) -> dict[int, np.ndarray] | None:
+    """`known_exposure` where images are corrected for it."""
+    rows = run.settings.exposure
+    return known_exposure(rows, capture.views["train"]) if rows else None
 
 
 def _refined_region(run: Run, trainer: Trainer) -> np.ndarray | None:
