@@ -23,13 +23,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stga_addon.training.run.request import Extension, Refinement
 
-from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
 from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
+from stga_addon.training.evaluate.match_exposure import known_exposure
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.optimize.precompile import precompile_kernels
@@ -46,7 +47,6 @@ from stga_addon.training.run.continuation import (
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.replay import continued_order
-from stga_addon.training.run.request import Extension, Refinement
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings, make_settings
 
@@ -160,7 +160,9 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
-    original = replace(read_run(continuation.parent).settings, strain_color=settings.strain_color)
+    parent = read_run(continuation.parent).settings
+    before = {"strain_color": parent.strain_color, "strain_position": parent.strain_position}
+    now = {"strain_color": settings.strain_color, "strain_position": settings.strain_position}
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
@@ -170,10 +172,10 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
         "all-in-turn": Arm(settings, alternating(old, new, seed), every),
         "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), every),
         "all-new-only": Arm(settings, view_order(new, 1, seed), every),
-        "anew": Arm(original, view_order(views, 1, seed), every, anew=True),
+        "anew": Arm(replace(parent, **now), view_order(views, 1, seed), every, anew=True),
     }
-    if settings.strain_color and not read_avatar(continuation.parent / "avatar.npz").splats.strain_color.shape[1]:
-        arms["all-in-turn-plain"] = Arm(replace(settings, strain_color=False), alternating(old, new, seed), every)
+    if now != before:
+        arms["all-in-turn-plain"] = Arm(replace(settings, **before), alternating(old, new, seed), every)
     return arms
 
 
@@ -211,6 +213,8 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     trainer.strategy = arm.strategy
     region = arm_region(prepared)
     evaluation_views = continued_evaluation_views(prepared.run, capture, region)
+    rows = arm.settings.exposure
+    exposure = known_exposure(rows, capture.views["train"]) if rows else None
     spent, due, budget = 0.0, 0.0, options.seconds * (ANEW_BUDGET if arm.anew else 1)
     lines: list[Line] = []
     background = tuple(round(255 * level) for level in arm.settings.background)
@@ -220,7 +224,7 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
         while True:
             if spent >= due:
                 share = min(1.0, spent / budget) if arm.anew else 1.0
-                quality = evaluate(partial(trainer.render, progress=share), evaluation_views)
+                quality = evaluate(partial(trainer.render, progress=share), evaluation_views, exposure=exposure)
                 lines.append({"arm": name, "seconds": spent, "iterations": trainer.iteration, **quality.as_json()})
                 print(describe(lines[-1]), flush=True)
                 if spent >= budget:
@@ -274,36 +278,41 @@ def table(runs: dict[str, list[list[Line]]]) -> list[str]:
 
 
 def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
-    """One line each, over seeds: what the continuation gains over all splats, forgets, and needs of the time anew."""
-
-    def gain(name: str, figure: str, over: str | None) -> str:
-        ends = [lines[-1][f"psnr_{figure}"] for lines in runs[name]]
-        others = [lines[0] for lines in runs[name]] if over is None else [lines[-1] for lines in runs[over]]
-        return spread([end - other[f"psnr_{figure}"] for end, other in zip(ends, others, strict=True)])
-
-    found = []
-    if {"extend", "all-in-turn"} <= set(runs):
-        found += [
-            f"{figure}: extend over all-in-turn {gain('extend', figure, 'all-in-turn')} dB, "
-            f"over before {gain('extend', figure, None)}, all-in-turn over before {gain('all-in-turn', figure, None)}"
-            for figure in FIGURES[:4]
-        ]
+    """What each arm gains in the new take beside what it pays in the old one, and how long the continuation takes."""
+    found = gains_and_costs(runs) if "extend" in runs else []
     if {"extend", "anew"} <= set(runs):
         pairs = list(zip(runs["extend"], runs["anew"], strict=True))
         shares = [time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"] for lines, anew in pairs]
-        found.append(f"98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time")
-    found += [f"region: {name} over before {gain(name, 'region', None)} dB" for name in runs if "refine" in name]
-    return [f"- {line}" for line in found]
+        found.append(f"- 98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time")
+    for name, of_seeds in runs.items():
+        if "refine" in name:
+            gains = [lines[-1]["psnr_region"] - lines[0]["psnr_region"] for lines in of_seeds]
+            found.append(f"- region: {name} over before {spread(gains)} dB")
+    return found
 
 
-def spread(values: list[float], digits: int = 2) -> str:
+def gains_and_costs(runs: dict[str, list[list[Line]]]) -> list[str]:
+    """Markdown: change of PSNR in dB from the avatar before to the end of each arm, the new take beside the old one."""
+    columns = {"new take": "take_2", "where it moves": "moving_take_2", "old take": "take_1"}
+    figures = [*columns.values(), "moving_take_1"]
+    rows = [["over before", *columns, "where it moves"], ["---"] * (1 + len(figures))]
+    for arm, of_seeds in runs.items():
+        pairs = list(zip(of_seeds, runs["extend"], strict=True))  # its first line is of the avatar before
+        changes = [
+            [lines[-1][f"psnr_{figure}"] - before[0][f"psnr_{figure}"] for lines, before in pairs] for figure in figures
+        ]
+        rows.append([arm, *(spread(values, signed=True) for values in changes)])
+    return [*("| " + " | ".join(row) + " |" for row in rows), ""]
+
+
+def spread(values: list[float], digits: int = 2, signed: bool = False) -> str:
     """Mean ± standard deviation; empty without values, a dash where one of them is infinite."""
     if not values:
         return ""
     if not np.isfinite(values).all():
         return "–"
     deviation = f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.{digits}f}{deviation}"
+    return f"{np.mean(values):{'+' if signed else ''}.{digits}f}{deviation}"
 
 
 def time_to(lines: list[Line], quality: str, level: float) -> float:

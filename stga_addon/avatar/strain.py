@@ -19,8 +19,8 @@ COLOR_RANGE = np.array(
 compression and shear; what is fitted to compression is not to be continued into stretch. Within this range, a mesh at
 rest has −MIN_COMPRESSION, not 0: a constant share of the colors, which the splats' `sh` are trained beside."""
 RANGE_MARGIN = 1.2
-"""How far from rest splats follow a triangle's strain, as a multiple of what was seen: training may have seen a few
-timesteps more than were measured, and refined tracking moves them."""
+"""How far from rest splats follow a triangle's strain, as a multiple of what was seen in training: other expressions
+are a little stronger now and then."""
 AVERAGING_ROUNDS = 3
 """How often `smoothed_strain` averages over triangles that share an edge: a bulge moves more than one triangle."""
 MIN_SQUARED_NORMAL = 1e-24

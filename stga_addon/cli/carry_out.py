@@ -2,6 +2,7 @@
 
 import math
 import sys
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from ..progress import Progress
@@ -26,27 +27,33 @@ def carry_out(request: Request) -> Result:
 
 
 class ProgressBar:
-    """A bar over the share of the work on stderr, with its stage and figures."""
+    """A bar over the share of the work on stderr, with its stage and figures; what is said or logged goes above it."""
 
     def __enter__(self) -> "ProgressBar":
         self._bar: tqdm[Any] | None = None
         self._stage = ""
+        self._opened = ExitStack()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        self._opened.close()
 
     def report(self, progress: Progress) -> bool:
         if self._bar is None:
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
+            self._bar = self._open()
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
         self._bar.set_postfix_str("; ".join(filter(None, [_figures(progress), progress.detail])), refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False
+
+    def _open(self) -> "tqdm[Any]":
+        from tqdm import tqdm
+        from tqdm.contrib.logging import logging_redirect_tqdm
+
+        bar = self._opened.enter_context(tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True))
+        self._opened.enter_context(logging_redirect_tqdm())
+        return bar
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
@@ -65,4 +72,7 @@ def _figures(progress: Progress) -> str:
     if not figures.get("iteration"):
         return ""
     known = {name: figures[name] for name in texts if not math.isnan(figures.get(name, math.nan))}
-    return ", ".join(texts[name].format(value) for name, value in known.items())
+    parts = {name: texts[name].format(value) for name, value in known.items()}
+    if "psnr_unmatched" in figures and "psnr" in parts:
+        parts["psnr"] += f" (exposure fitted; {figures['psnr_unmatched']:.2f} without)"
+    return ", ".join(parts.values())

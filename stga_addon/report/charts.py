@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..training.evaluate.forecast import DETAIL, curve_of
+from ..training.evaluate.forecast import DETAIL, UNMATCHED, curve_of, is_exposure_fitted
 
 if TYPE_CHECKING:  # imported when a chart is drawn: it takes half a second, and the command line starts without it
     from matplotlib.axes import Axes
@@ -18,8 +18,10 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
     """PSNR of one run in the whole image, the head mask and the moving region, with the latest forecast; and the detail
     difference, by which the avatar is kept, on an axis of its own with the best at the top."""
-    figure, axes = psnr_axes("PSNR and detail difference on held-out views")
-    for name, key in (("whole image", "psnr"), ("head mask", "psnr_mask"), ("moving region", "psnr_moving")):
+    fitted = " (exposure fitted)" if is_exposure_fitted(metrics) else ""
+    figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
+    keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}
+    for name, key in {**keys, "whole image, exposure not fitted": UNMATCHED}.items():
         curve = curve_of(metrics, key)
         if curve:
             axes.plot(*np.array(curve).T, marker=".", label=name)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..format import format_duration
-from ..training.evaluate.forecast import DETAIL, curve_of, detail_curve
+from ..training.evaluate.forecast import DETAIL, UNMATCHED, curve_of, detail_curve
 
 SIZE = 256
 """Width and height in pixels: Blender's icons are square."""
@@ -51,7 +51,9 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
         plot.line(x, y, FORECAST_COLOR)
     detail_range = _draw_detail(plot, lines, (low, high))
     plot.line(seconds, psnr, CURVE_COLOR)
-    return plot.pixels, f"{low:g} to {high:g} dB, 0 to {format_duration(end)}", detail_range
+    unmatched = lines[-1].get(UNMATCHED)
+    fitted = "" if unmatched is None else f" (exposure fitted; {unmatched:.1f} without)"
+    return plot.pixels, f"{low:g} to {high:g} dB{fitted}, 0 to {format_duration(end)}", detail_range
 
 
 def _draw_detail(plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]) -> str:

@@ -11,7 +11,16 @@ from typing import Any
 from ..errors import StgaError
 from ..files import replacing
 from ..format import format_duration
-from ..training.evaluate.forecast import DETAIL, checked_forecasts, curve_of, explain_missed_target, flat_since
+from ..training.evaluate.forecast import (
+    DETAIL,
+    UNMATCHED,
+    checked_forecasts,
+    curve_of,
+    explain_missed_target,
+    flat_since,
+    is_exposure_fitted,
+    saved_line,
+)
 from ..training.run.folder import read_run
 from ..training.run.metrics_log import METRICS, read_metrics
 from .charts import run_chart
@@ -55,7 +64,10 @@ def report_run(folder: Path) -> list[str]:
     run, metrics = read_run(folder), read_metrics(folder)
     continued = run.continuation is not None
     lines = summarize_continuation(metrics) if continued else summarize_run(metrics, run.settings.target_psnr)
-    return lines if (folder / CURVE).exists() else [*lines, f"{CURVE} was not drawn: matplotlib is not installed"]
+    if (folder / CURVE).exists():
+        return lines
+    reason = "matplotlib is not installed" if curve_of(metrics) else "no held-out views (split 'val') were evaluated"
+    return [*lines, f"{CURVE} was not drawn: {reason}"]
 
 
 def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
@@ -65,8 +77,9 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
-        best = min(evaluations, key=lambda line: line.get(DETAIL, math.inf))
-        parts = [f"{best['psnr']:.2f} dB", f"SSIM {best['ssim']:.4f}"]
+        best = saved_line(evaluations, target)
+        fitted = f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)" if UNMATCHED in best else ""
+        parts = [f"{best['psnr']:.2f} dB{fitted}", f"SSIM {best['ssim']:.4f}"]
         named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
         parts += [f"detail difference {best[DETAIL]:.4f}"] if DETAIL in best else []
@@ -74,7 +87,8 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
     if target is not None and curve:
         reached = any(psnr >= target for _, psnr in curve)
-        lines.append(f"{target:g} dB was reached" if reached else explain_missed_target(curve, target))
+        text = f"{target:g} dB was reached" if reached else explain_missed_target(curve, target)
+        lines.append(f"{text} (exposure fitted)" if is_exposure_fitted(metrics) else text)
     plateau = flat_since(metrics)
     if plateau is not None:
         since = format_duration(plateau)
@@ -93,12 +107,20 @@ def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
         return []
     first, last = metrics[0], metrics[-1]
     lines = [f"splats: {first['splats']} before, {last['splats']} after"]
-    for name in first:
-        if name == "psnr" or (name.startswith("psnr_") and name != "psnr_unmatched"):  # which is no region
-            label = name.removeprefix("psnr").strip("_").replace("_", " ") or "held-out views"
-            before, after = first[name], last.get(name, math.nan)
-            lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")
+    for name, label in _labels(first).items():
+        before, after = first[name], last.get(name, math.nan)
+        lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")
     return lines
+
+
+def _labels(line: Mapping[str, Any]) -> dict[str, str]:
+    """Each PSNR of a metrics line -> what it is called: of all held-out views, then by region and group."""
+    fitted = " (exposure fitted)" if UNMATCHED in line else ""
+    labels = {name: f"held-out views{fitted}" for name in ("psnr",) if name in line}
+    if UNMATCHED in line:
+        labels[UNMATCHED] = "held-out views (exposure not fitted)"
+    parts = [name.removeprefix("psnr_") for name in line if name.startswith("psnr_") and name != UNMATCHED]
+    return {**labels, **{f"psnr_{part}": part.replace("_", " ") + fitted for part in parts}}
 
 
 def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:

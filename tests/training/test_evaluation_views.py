@@ -4,9 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from capture import factory
 from PIL import Image
 
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.training.evaluate.evaluation_views import (
     MAX_EVALUATION_VIEWS,
@@ -14,6 +16,12 @@ from stga_addon.training.evaluate.evaluation_views import (
     read_evaluation_view,
     visible_pixels,
 )
+from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
+
+from .toys import quick_settings
 
 
 def test_evaluation_views_are_evenly_spread(toy: Capture) -> None:
@@ -78,3 +86,23 @@ def test_a_view_without_mask_has_no_head(toy: Capture, tmp_path: Path) -> None:
     view = replace(toy.views["val"][0], image=path, mask=None)
     assert "mask" not in read_evaluation_view(toy, view).regions
     assert read_evaluation_view(toy, view).interior is None
+
+
+def test_transparent_images_lie_over_the_settings_background(toy: Capture, tmp_path: Path) -> None:
+    """Catches evaluations that compare a head over gray with one over white."""
+    pixels = np.dstack([factory.picture(0, 0), factory.silhouette().astype(np.uint8) * 255])
+    Image.fromarray(pixels).save(tmp_path / "cut.png")
+    views = tuple(replace(view, image=tmp_path / "cut.png", mask=None) for view in toy.views["val"])
+    capture = replace(toy, views={**toy.views, "val": views, "test": views})
+    gray = (0.2, 0.4, 0.6)
+    target = read_evaluation_view(capture, views[0], gray).target
+    np.testing.assert_array_equal(target[0, 0], [51, 102, 153])
+    settings = replace(quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False)
+    path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
+    outside = np.ones(capture.neutral.shape) * 10  # behind the cameras: nothing but the background is rendered
+    avatar = read_avatar(path)
+    empty = evaluate_avatar(avatar, replace(capture, mesh=lambda timestep: outside), "test")
+    over_gray = np.where(factory.silhouette()[..., None], factory.picture(0, 0), np.round(255 * np.array(gray)))
+    error = np.square(over_gray / 255 - np.array(gray)).mean()
+    assert empty.psnr == pytest.approx(-10 * np.log10(error), abs=0.1)
+    assert read_metrics(tmp_path / "run")[-1]["psnr"] > empty.psnr

@@ -1,7 +1,9 @@
 """Extending a finished run by further takes: what is selected, what is remembered, and resumption to the same bits."""
 
+import importlib.util
 import json
 import shutil
+import sys
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -149,6 +151,18 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
+def test_a_resumed_extension_needs_no_parent(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches a run that fails at its next evaluation because the run that it began with was moved, or that takes over
+    another avatar that lies there now."""
+    beside = Path(shutil.copytree(parent, tmp_path / "parent"))
+    out = extend(beside, takes[1], tmp_path / "extended", stop=7)
+    before = read_avatar(out / "avatar.npz").strain_range
+    shutil.rmtree(beside)
+    opened = open_run(out)
+    train(opened.capture, out, opened.run, resume=True)
+    np.testing.assert_array_equal(read_avatar(out / "avatar.npz").strain_range, before)
+
+
 def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Path], tmp_path: Path) -> None:
     """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they change at once."""
     capture = open_capture(takes[0])
@@ -218,3 +232,40 @@ def test_takes_that_do_not_fit(
     with pytest.raises(StgaError, match=sentences[change]):
         prepare_extension(parent, (take,), iterations=1)
     assert read_run(parent).takes == ()
+
+
+def benchmark() -> Any:
+    """benchmarks/extend.py, which is no part of the package."""
+    path = Path(__file__).resolve().parents[2] / "benchmarks" / "extend.py"
+    spec = importlib.util.spec_from_file_location("extend_benchmark", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_benchmark_compares_equal_effects(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches an extension that wins because training anew goes without an effect that began with the take."""
+    prepared = prepare_extension(parent, (takes[1],), iterations=1)
+    settings = replace(prepared.run.settings, strain_color=True, strain_position=True)
+    arms = benchmark().extend_arms(replace(prepared, run=replace(prepared.run, settings=settings)), 0)
+    assert (arms["anew"].settings.strain_color, arms["anew"].settings.strain_position) == (True, True)
+    plain = arms["all-in-turn-plain"].settings
+    assert (plain.strain_color, plain.strain_position) == (True, False)  # as the parent
+
+
+def test_the_benchmark_shows_what_the_old_take_pays() -> None:
+    """Catches a summary that praises what the new take gains and is silent about the old one."""
+    first = {"psnr_take_1": 40.0, "psnr_moving_take_1": 39.0, "psnr_take_2": 35.0, "psnr_moving_take_2": 30.0}
+    last = {"psnr_take_1": 39.5, "psnr_moving_take_1": 37.0, "psnr_take_2": 39.0, "psnr_moving_take_2": 36.0}
+    lines = [{**values, "psnr": 37.0, "seconds": 10.0 * n} for n, values in enumerate((first, last))]
+    rows = [
+        [cell.strip() for cell in row.strip("|").split("|")]
+        for row in benchmark().differences({"extend": [lines], "anew": [[lines[1]]]})
+        if row.startswith("|")
+    ]
+    assert rows[0] == ["over before", "new take", "where it moves", "old take", "where it moves"]
+    assert rows[2] == ["extend", "+4.00", "+6.00", "-0.50", "-2.00"]
+    assert rows[3] == ["anew", "+4.00", "+6.00", "-0.50", "-2.00"]

@@ -10,14 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.training.evaluate import evaluator
+from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
 from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import loop as run_module
+from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import EVALUATION_SHARE, train
+from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 
@@ -48,7 +52,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Steps take a second, evaluations three."""
     clock = Clock()
-    step = run_module.Trainer.step
+    step = session.Trainer.step
 
     def slow_step(*arguments: Any) -> float | None:
         clock.now += 1
@@ -59,8 +63,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
         return Quality(20 + np.log(clock.now), 0.5)
 
     monkeypatch.setattr(run_module, "perf_counter", clock)
-    monkeypatch.setattr(run_module.Trainer, "step", slow_step)
-    monkeypatch.setattr(run_module, "evaluate", slow_evaluate)
+    monkeypatch.setattr(session.Trainer, "step", slow_step)
+    monkeypatch.setattr(evaluator, "evaluate", slow_evaluate)
     return clock
 
 
@@ -89,13 +93,27 @@ def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock
 def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a target that is passed by, and one that a resumed run forgets it has reached."""
     values = iter([25.0, 29.0, 30.5, 30.5])
-    monkeypatch.setattr(run_module, "evaluate", scores(values))
+    monkeypatch.setattr(evaluator, "evaluate", scores(values))
     run = run_of(toy, target_psnr=30.0)
     train(toy, tmp_path, run)
     assert read_checkpoint(tmp_path).iteration == 30
     train(toy, tmp_path, run, resume=True)
     assert read_checkpoint(tmp_path).iteration == 30
     assert next(values, None) is None
+
+
+def test_the_avatar_that_reached_the_target_is_kept(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches "30 dB was reached" beside a file that has less, because an earlier one was sharper."""
+    found = iter([Quality(25.0, 0.5, detail_difference=0.1), *[Quality(30.5, 0.5, detail_difference=0.2)] * 2])
+    monkeypatch.setattr(evaluator, "evaluate", lambda *arguments, **named: next(found))
+    run = run_of(toy, target_psnr=30.0)
+    path = train(toy, tmp_path, run)
+    end = read_checkpoint(tmp_path)
+    assert end.iteration == 20
+    np.testing.assert_array_equal(read_avatar(path).splats.xyz, end.state.average.xyz)
+    assert end.best_difference == 0.2
 
 
 def test_a_target_out_of_sight_is_said_while_training(toy: Capture, tmp_path: Path, clock: Clock) -> None:
@@ -121,7 +139,7 @@ def test_a_run_that_no_longer_improves(
 ) -> None:
     """Catches overfitting that nobody is told about, and a run that stops without having been asked to."""
     falling = (30 - n / 10 for n in count())
-    monkeypatch.setattr(run_module, "evaluate", scores(falling))
+    monkeypatch.setattr(evaluator, "evaluate", scores(falling))
     told: list[str] = []
     run = run_of(toy, iterations=None, seconds=200.0, stop_when_flat=stop)
     train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.forecast_text)))
@@ -135,13 +153,13 @@ def test_a_run_that_no_longer_improves(
 def test_images_grow_where_settings_say_so(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches coarse training that never ends, or whose camera does not fit its image."""
     seen: list[tuple[int, int]] = []
-    step = run_module.Trainer.step
+    step = session.Trainer.step
 
     def note(trainer: Any, view: Any, target: np.ndarray, *rest: Any) -> float | None:
         assert target.shape == (view.camera.height, view.camera.width, 3)
         seen.append(target.shape[:2])
         return step(trainer, view, target, *rest)
 
-    monkeypatch.setattr(run_module.Trainer, "step", note)
+    monkeypatch.setattr(session.Trainer, "step", note)
     train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_share=0.25))
     assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

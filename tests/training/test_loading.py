@@ -15,7 +15,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.residuals import Residuals
 from stga_addon.training.optimize.frames import CACHED_TIMESTEPS
 from stga_addon.training.optimize.initial_colors import MAX_LATER_TIMESTEPS
-from stga_addon.training.run import loop
+from stga_addon.training.run import session
 from stga_addon.training.run.loop import train
 
 from .test_run import assert_same_state, make_run
@@ -37,7 +37,7 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
 
     capture = replace(opened, mesh=mesh, views={"train": opened.views["train"]})
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
-    monkeypatch.setattr(loop, "triangle_residuals", no_residuals)  # which read meshes after training
+    monkeypatch.setattr(session, "triangle_residuals", no_residuals)  # which read meshes after training
     train(capture, tmp_path / "loaded", run)
     assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view
     # Before training, splats are placed on the first mesh, and given colors there and on a few later ones.
@@ -48,7 +48,7 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
         return ViewLoader(*arguments, **{**options, "mesh": None})
 
     read.clear()
-    monkeypatch.setattr(loop, "ViewLoader", without_meshes)
+    monkeypatch.setattr(session, "ViewLoader", without_meshes)
     train(capture, tmp_path / "unloaded", run)
     assert len(read) == len(timesteps) - 1 + len(before)
     assert all(on_training_thread for _, on_training_thread in read)

@@ -9,7 +9,7 @@ from PIL import Image
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import View
 from stga_addon.training.evaluate.evaluation_views import EvaluationView
-from stga_addon.training.evaluate.match_exposure import match_exposure
+from stga_addon.training.evaluate.match_exposure import known_exposure, match_exposure
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.optimize.exposure import exposure_correction
 from stga_addon.training.settings import TrainingSettings
@@ -58,9 +58,30 @@ def test_evaluation_reports_both(tmp_path: Path) -> None:
     view = View(0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", tmp_path / "0.png")
     views = [EvaluationView(view, (255 * target).round().astype(np.uint8), {"mask": head}, head)]
     plain = evaluate(lambda view: image, views)
-    matched = evaluate(lambda view: image, views, matched=True)
+    matched = evaluate(lambda view: image, views, exposure={})
     assert plain.psnr_unmatched is None
     assert matched.psnr_unmatched == pytest.approx(plain.psnr)
     assert matched.psnr > plain.psnr + 20
     assert matched.regions["mask"].psnr > plain.regions["mask"].psnr + 20
     assert matched.as_json()["psnr_unmatched"] == matched.psnr_unmatched
+
+
+def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
+    """Catches six numbers fitted to views of cameras whose exposure training has estimated, which hides its errors."""
+    head, image = head_and_image()
+    gain, offset = np.array([0.8, 1.1, 0.9]), np.array([4.0, -6.0, 3.0])
+    levels = 255 * image.transpose(1, 2, 0)
+    target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
+    camera = Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4))
+    views = [View(0, number, camera, "0.png", tmp_path / "0.png") for number in range(3)]
+    known = known_exposure([[0, *gain, *offset]], views[:2])
+    trained, plain, other = (
+        evaluate(lambda view: image, [EvaluationView(view, target, {"mask": head}, head)], exposure=known)
+        for view in views
+    )
+    assert trained.psnr > 45
+    assert trained.psnr_unmatched is None
+    assert plain.psnr == pytest.approx(evaluate(lambda view: image, [EvaluationView(views[1], target)]).psnr)
+    assert plain.psnr_unmatched is None  # trained, and not corrected
+    assert other.psnr > 45
+    assert other.psnr_unmatched == pytest.approx(plain.psnr)

@@ -13,9 +13,11 @@ import pytest
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import loop as run_module
+from stga_addon.training.run import session as session_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
@@ -194,6 +196,45 @@ def test_resuming_a_finished_run_changes_nothing(toy: Capture, unbroken: Path, t
     assert [line["iteration"] for line in ours] == [line["iteration"] for line in theirs]
 
 
+def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+    """Catches "--resume" of a finished run that ends without an avatar and says nothing."""
+    out = tmp_path / "run"
+    shutil.copytree(unbroken, out)
+    for name in ("avatar.npz", "residuals.npz"):
+        (out / name).unlink()
+    told: list[str] = []
+    train(toy, out, make_run(toy), resume=True, report=lambda progress: bool(told.append(progress.message)))
+    assert "Writing the missing avatar from the checkpoint" in told
+    written = read_avatar(out / "avatar.npz").splats
+    np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
+    assert read_residuals(out, len(toy.faces)).shape == (len(toy.faces),)
+    stopped = tmp_path / "stopped"
+    train(toy, stopped, make_run(toy), report=stop_at(11))
+    (stopped / "avatar.npz").unlink()
+    train(toy, stopped, make_run(toy), resume=True)
+    assert (stopped / "avatar.npz").exists()
+
+
+@pytest.mark.parametrize("change", ["renamed", "emptied"])
+def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, change: str) -> None:
+    """Catches a renamed run that is begun a second time under its old name, without what it needs to be resumed."""
+    out, moved = tmp_path / "run", tmp_path / "moved"
+
+    def move(progress: Progress) -> bool:
+        if progress.iteration == 7:
+            out.rename(moved)
+            if change == "emptied":
+                out.mkdir()
+        return False
+
+    with pytest.raises(StgaError, match=rf"^{out}: was moved or deleted while its run trained; "):
+        train(toy, out, make_run(toy), report=move)
+    assert not out.exists() or not list(out.iterdir())
+    assert (moved / "run.json").exists()
+    train(toy, moved, make_run(toy), resume=True)
+    assert read_checkpoint(moved).iteration == ITERATIONS
+
+
 def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a run that gets worse with time taking its best avatar with it, also over an interruption."""
     scores = iter([0.3, 0.1, 0.2, 0.11, *[0.15] * 20])
@@ -203,13 +244,13 @@ def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pyte
         written.append(avatar)
         run_module_write(path, avatar)
 
-    run_module_write = run_module.write_avatar
+    run_module_write = session_module.write_avatar
     monkeypatch.setattr(
-        run_module,
+        evaluator,
         "evaluate",
         lambda *args, **kwargs: Quality(30.0, 0.5, detail_difference=next(scores)),
     )
-    monkeypatch.setattr(run_module, "write_avatar", write)
+    monkeypatch.setattr(session_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)
     assert len(written) == 2

@@ -10,11 +10,14 @@ from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.strain import COLOR_RANGE, MIN_COMPRESSION, color_range, face_strain, strain_basis
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.run import strain_range as module
 from stga_addon.training.run.folder import Continuation, Run
+from stga_addon.training.run.identity import identity_of
 from stga_addon.training.run.loop import train
-from stga_addon.training.run.strain_range import trained_strain_range
+from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.strain_range import trained_strain_range, write_strain_range
+from stga_addon.training.settings import Rates
 
 from .toys import quick_settings, random_splats
 
@@ -100,10 +103,49 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
     train(toy, out, run, resume=True)
 
 
-def test_long_captures_are_sampled(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a sequence of thousands of timesteps that is read as a whole for every avatar."""
-    monkeypatch.setattr(module, "MAX_TIMESTEPS", 2)
-    read: list[int] = []
-    trained_strain_range(toy, lambda t: (read.append(t), deformed(toy, t))[1], None)
-    timesteps = sorted({view.timestep for view in toy.views["train"]})
-    assert read == [timesteps[0], timesteps[-1]]
+def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
+    """Catches a blink of six frames in twelve hundred that is trained, but clipped out of the avatar."""
+    view, blink = toy.views["train"][0], range(1003, 1009)
+    views = {"train": tuple(replace(view, timestep=timestep) for timestep in range(1200))}
+
+    def mesh(timestep: int) -> np.ndarray:
+        return np.asarray(toy.neutral) * (0.85 if timestep in blink else 1.0)
+
+    basis = strain_basis(toy.neutral, toy.faces, color_range(len(toy.faces)))
+    limits = trained_strain_range(replace(toy, views=views), mesh, None)
+    assert (limits[:, 0] <= face_strain(basis, mesh(blink[0]))).all()
+
+
+def test_evaluation_while_training_measures_the_avatar_that_is_written(toy: Capture, tmp_path: Path) -> None:
+    """Catches metrics of an avatar that follows held-out expressions further than the file does."""
+    strong = {view.timestep for view in toy.views["val"]} - {0}
+
+    def mesh(timestep: int) -> np.ndarray:
+        return np.asarray(toy.neutral) * (0.8 if timestep in strong else 1.0)
+
+    views = {**toy.views, "train": tuple(view for view in toy.views["train"] if view.timestep not in strong)}
+    rates = Rates(strain_color=0.5)
+    settings = quick_settings("global", iterations=20, lattice=0, strain_color=True, sh_degree=0, sh_steps=())
+    run = Run(toy.root, None, "vhap", replace(settings, rates=rates, ema_share=1.0))
+    capture = replace(toy, mesh=mesh, views=views)
+    path = train(capture, tmp_path / "run", run)
+    best = min(read_metrics(tmp_path / "run"), key=lambda line: line["detail_difference"])
+    assert evaluate_avatar(read_avatar(path), capture, "val").psnr == pytest.approx(best["psnr"], abs=1e-3)
+
+
+def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
+    """Catches a resumed run that clips its colors to what another run has seen."""
+    settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
+    run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
+    train(toy, out, run, report=lambda progress: progress.iteration == 2)
+    limits, digest = color_range(len(toy.faces)), identity_of(toy, None, "vhap", settings).digest
+    for arrays, says in (
+        ((limits, "other"), "belongs to another run than run.json beside it"),
+        (
+            (limits[1:], digest),
+            r"expected 'strain_range', float32 \(320, 2, 3\)",
+        ),
+    ):
+        write_strain_range(out, *arrays)
+        with pytest.raises(StgaError, match=rf"strain_range\.npz: {says}"):
+            train(toy, out, run, resume=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from ...errors import StgaError
 from ...training.run.folder import Run, has_run, read_run, write_run
 from ...worker.launch import same_interpreter_environment
-from .worker import QUALITY
+from .worker import FIT_EXPOSURE, QUALITY
 
 TURN_S = 2.0
 """Seconds of training in one turn."""
@@ -26,10 +26,11 @@ PrintProgress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class BenchmarkRun:
-    """A run and its folder."""
+    """A run and its folder; fits_exposure: whether its avatar is measured with fitted exposure (`worker`)."""
 
     run: Run
     out: Path
+    fits_exposure: bool = False
 
     @property
     def finished(self) -> bool:
@@ -83,9 +84,10 @@ class _Worker:
         if not has_run(self._run.out):
             write_run(self._run.out, self._run.run)
         # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
+        options = [FIT_EXPOSURE] if self._run.fits_exposure else []
         with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", f"{__package__}.worker", str(self._run.out)],
+                [sys.executable, "-m", f"{__package__}.worker", str(self._run.out), *options],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,

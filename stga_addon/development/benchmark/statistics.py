@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...files import read_json
-from ...training.evaluate.forecast import checked_forecasts, curve_of
+from ...training.evaluate.forecast import UNMATCHED, checked_forecasts, curve_of
 from ...training.run.metrics_log import read_metrics
 from .scheduler import BenchmarkRun
 from .worker import QUALITY
@@ -55,7 +55,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class MeanCurve:
-    """Held-out PSNR over seconds of training: mean over seeds, and the lowest and highest of them, (M,) each."""
+    """Held-out PSNR without fitted exposure, so that variants compare, over seconds of training.
+
+    Mean over seeds, and the lowest and highest of them, (M,) each."""
 
     seconds: np.ndarray
     mean: np.ndarray
@@ -95,7 +97,7 @@ def mean_curves(outcomes: Sequence[Outcome]) -> dict[str, MeanCurve]:
     """variant -> its curve over the time that all of its runs cover."""
     curves = {}
     for variant in dict.fromkeys(outcome.variant for outcome in outcomes):
-        runs = [curve_of(outcome.lines) for outcome in outcomes if outcome.variant == variant]
+        runs = [_unfitted_curve(outcome.lines) for outcome in outcomes if outcome.variant == variant]
         runs = [run for run in runs if len(run) > 1]
         if not runs:
             continue
@@ -103,6 +105,11 @@ def mean_curves(outcomes: Sequence[Outcome]) -> dict[str, MeanCurve]:
         values = np.array([np.interp(seconds, *np.array(run).T) for run in runs])
         curves[variant] = MeanCurve(seconds, values.mean(0), values.min(0), values.max(0))
     return curves
+
+
+def _unfitted_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """`curve_of` PSNR without fitted exposure."""
+    return curve_of([{**line, "psnr": line.get(UNMATCHED, line["psnr"])} if "psnr" in line else line for line in lines])
 
 
 def pareto_front(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, float]]:

@@ -1,6 +1,6 @@
 """Benchmark worker: a process that trains one run in turns.
 
-    python -m stga_addon.development.benchmark.worker FOLDER
+    python -m stga_addon.development.benchmark.worker FOLDER [--fit-exposure]
 
 Trains or resumes the run of FOLDER/run.json. Each line on stdin is a share of the budget to train up to; the end of
 stdin means save and end. Each line, and the start, is answered by a line of JSON on stdout: {"share": …,
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
+FIT_EXPOSURE = "--fit-exposure"
 QUALITY = "quality.json"
 """Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the file exists."""
 
@@ -52,8 +53,8 @@ class Turns:
         self._replies.flush()
 
 
-def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
-    """Train the folder's run in turns and measure its avatar."""
+def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool = False) -> None:
+    """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that were not trained."""
     from ...avatar.file import read_avatar
     from ...report.preset_timing import seconds_per_iteration
     from ...training.evaluate.metrics import evaluate_avatar
@@ -70,7 +71,8 @@ def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
         if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
             trained = with_refined_tracking(capture, folder)
-            quality = {split: evaluate_avatar(avatar, trained, split, perceptual=True).as_json() for split in splits}
+            found = {split: evaluate_avatar(avatar, trained, split, True, fits_exposure) for split in splits}
+            quality = {split: figures.as_json() for split, figures in found.items()}
             write_json(folder / QUALITY, quality)
         turns.reply({"done": not turns.stopped})
     except StgaError as error:
@@ -78,4 +80,4 @@ def work(folder: Path, requests: IO[str], replies: IO[str]) -> None:
 
 
 if __name__ == "__main__":
-    work(Path(sys.argv[1]), sys.stdin, TextIOWrapper(claim_stdout(), encoding="utf-8"))
+    work(Path(sys.argv[1]), sys.stdin, TextIOWrapper(claim_stdout(), encoding="utf-8"), FIT_EXPOSURE in sys.argv)

@@ -61,7 +61,8 @@ def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | Non
     metrics = _measure(capture, avatar)
     write_json(out / "metrics.json", {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error})
     for split, values in metrics.items():
-        print(f"{split}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
+        fitted = f" (exposure fitted; {values['psnr_unmatched']:.2f} without)" if "psnr_unmatched" in values else ""
+        print(f"{split}: PSNR {values['psnr']:.2f} dB{fitted}, SSIM {values['ssim']:.4f}")
     print(f"Blender places the splats within {error:.1e} m of numpy")
     print(f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
 

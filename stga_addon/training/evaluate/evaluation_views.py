@@ -44,13 +44,16 @@ def choose_evaluation_views(capture: Capture) -> Sequence[View]:
     return evenly_spread(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
 
 
-def read_evaluation_view(capture: Capture, view: View) -> EvaluationView:
-    """Read a view's image and mask and find its regions.
+def read_evaluation_view(
+    capture: Capture, view: View, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> EvaluationView:
+    """Read a view's image and mask and find its regions; background (0…1): behind transparent pixels, as in training.
 
     "moving" is by the default selection whatever a run's settings are, so that runs are comparable.
     Raises StgaError if a file cannot be read.
     """
-    target, mask = read_image(view), read_mask(view)
+    red, green, blue = (round(255 * level) for level in background)
+    target, mask = read_image(view, (red, green, blue)), read_mask(view)
     target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
     selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
     regions = {"moving": visible_pixels(capture, view, selection[view.timestep])}

@@ -13,6 +13,8 @@ Curve = Sequence[tuple[float, float]]
 
 DETAIL = "detail_difference"
 """Key, in a metrics.jsonl, of what the avatar that a run keeps is chosen by; lower is better."""
+UNMATCHED = "psnr_unmatched"
+"""Key of PSNR without fitted exposure, in the lines whose "psnr" is with it."""
 MIN_EVALUATIONS = 4
 """Evaluations that a forecast needs."""
 FITTED_SINCE_SHARE = 2 / 3
@@ -108,6 +110,17 @@ def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
     return int(sum(held)), len(checked)
 
 
+def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the PSNR of a metrics.jsonl is with the exposure of views fitted, of cameras that were not trained."""
+    return any(UNMATCHED in line for line in lines)
+
+
+def saved_line(lines: Sequence[Mapping[str, Any]], target: float | None) -> Mapping[str, Any]:
+    """The evaluation of the saved avatar, of those with a PSNR: the last that reached the target, or the sharpest."""
+    reached = [line for line in lines if target is not None and line["psnr"] >= target]
+    return reached[-1] if reached else min(lines, key=lambda line: line.get(DETAIL, np.inf))
+
+
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
     """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times or values not finite."""
     curve: list[tuple[float, float]] = []
@@ -137,10 +150,35 @@ def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
     predicted, detail = forecast(curve_of(lines), ahead), forecast(detail_curve(lines), ahead)
     if predicted is None:
         return ""
+    text = f"{predicted} PSNR with exposure fitted" if is_exposure_fitted(lines) else str(predicted)
     if detail is None:
-        return str(predicted)
+        return text
     change, error = (100 * (10 ** (-gain / 20) - 1) for gain in (detail.gain, -detail.error))
-    return f"{predicted}, detail difference {change:+.0f} % (±{error:.0f})"
+    return f"{text}, detail difference {change:+.0f} % (±{error:.0f})"
+
+
+def next_forecast(lines: Sequence[Mapping[str, Any]], elapsed: float, left: float) -> Forecast | None:
+    """Forecast of PSNR over `forecast_horizon`; None where there is none."""
+    ahead = forecast_horizon(elapsed, left)
+    return None if ahead is None else forecast(curve_of(lines), ahead)
+
+
+def describe_forecast(lines: Sequence[Mapping[str, Any]], elapsed: float, left: float, target: float | None) -> str:
+    """What to expect of the remaining budget `left` (seconds) after `elapsed`, and whether a target PSNR is in reach.
+
+    Empty where nothing is known.
+    """
+    ahead = forecast_horizon(elapsed, left)
+    text = "" if ahead is None else forecast_text(lines, ahead)
+    plateau = flat_since(lines) if left else None
+    if plateau is not None:
+        text = f"no gain since {format_duration(plateau)}: more time no longer helps"
+    end = forecast(curve_of(lines), left) if left else None
+    if target is not None and end is not None and end.psnr + end.error < target:
+        fitted = ", exposure fitted" if is_exposure_fitted(lines) else ""
+        far = f"{target:g} dB is out of reach ({end.psnr:.1f} ± {end.error:.1f} dB at the end{fitted})"
+        text = "; ".join(filter(None, (text, far)))
+    return text
 
 
 def explain_missed_target(curve: Curve, target: float) -> str:

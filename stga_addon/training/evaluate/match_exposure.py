@@ -1,9 +1,49 @@
-"""Exposure of a held-out view: gain and offset per channel that match a rendering to it before it is measured."""
+"""Exposure of a view that is measured: gain and offset per channel, known from training or fitted to the view."""
+
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from ...capture.model import View
+
 PRIOR_SHARE = 1e-3
 """Weight of the prior (gain 1, offset 0), as a share of the fitted pixels; decides where a rendering is one color."""
+
+
+NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+
+
+def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> dict[int, np.ndarray]:
+    """Training camera's index -> gain and offset (2, 3), in levels, of red, green and blue in its images.
+
+    rows: `TrainingSettings.exposure`. A camera that they do not list was trained as it is.
+    """
+    known = {view.camera_index: NO_CORRECTION for view in training_views}
+    return {**known, **{int(row[0]): np.array(row[1:], np.float64).reshape(2, 3) for row in rows}}
+
+
+def with_exposure(image: np.ndarray, exposure: np.ndarray, head: np.ndarray | None = None) -> np.ndarray:
+    """The rendering (3, H, W) as a camera of this exposure (2, 3) shows it, clipped to 0…1; head as below."""
+    head = np.ones(image.shape[1:], bool) if head is None else head
+    gain, offset = exposure.astype(np.float32)[..., None]
+    exposed = image.copy()
+    exposed[:, head] = gain * image[:, head] + offset / 255
+    return np.clip(exposed, 0, 1)
+
+
+def exposed_rendering(
+    image: np.ndarray,
+    target: np.ndarray,
+    exposure: np.ndarray | None,
+    head: np.ndarray | None = None,
+    fitted: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rendering with a view's exposure (2, 3), or with a fitted one (`match_exposure`) where that is None; and the
+    rendering as it is without a fit."""
+    if exposure is None:
+        return match_exposure(image, target, head, fitted), image
+    exposed = with_exposure(image, exposure, head)
+    return exposed, exposed
 
 
 def match_exposure(

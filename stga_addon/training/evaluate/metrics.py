@@ -16,7 +16,7 @@ from ..optimize.losses import similarity
 from . import lpips
 from .detail_difference import detail_difference
 from .evaluation_views import EvaluationView, read_evaluation_view
-from .match_exposure import match_exposure
+from .match_exposure import exposed_rendering, known_exposure
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Quality:
              ("take_1"), and per region of a group ("moving_take_1")
     detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
                        None for a region
-    psnr_unmatched     PSNR without matching the exposure of each view; None where it was not matched
+    psnr_unmatched     PSNR without fitting the exposure of views; None where none was fitted
     """
 
     psnr: float
@@ -49,20 +49,23 @@ def evaluate(
     render: Callable[[View], np.ndarray],
     evaluation_views: Iterable[EvaluationView],
     perceptual: bool = False,
-    matched: bool = False,
+    exposure: Mapping[int, np.ndarray] | None = None,
 ) -> Quality:
     """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1.
 
-    perceptual: whether to measure LPIPS; matched: whether to match the exposure of each view first (`match_exposure`).
+    perceptual: whether to measure LPIPS; exposure: `known_exposure`, which renderings are given before; that of other
+    cameras is fitted (`match_exposure`). None: renderings are measured as they are.
     """
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
-    differences, unmatched = [], []
+    differences, unmatched, fitted = [], [], False
     for evaluation_view in evaluation_views:
-        target = evaluation_view.target
+        target, camera = evaluation_view.target, evaluation_view.view.camera_index
         image = np.clip(render(evaluation_view.view), 0, 1)
-        if matched:
-            unmatched.append(psnr(image, target))
-            image = match_exposure(image, target, evaluation_view.regions.get("mask"), evaluation_view.interior)
+        if exposure is not None:
+            head, interior = evaluation_view.regions.get("mask"), evaluation_view.interior
+            image, plain = exposed_rendering(image, target, exposure.get(camera), head, interior)
+            unmatched.append(psnr(plain, target))
+            fitted = fitted or camera not in exposure
         differences.append(detail_difference(image, target, evaluation_view.interior))
         parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
         for region, where in parts.items():
@@ -76,7 +79,7 @@ def evaluate(
         whole,
         regions=means,
         detail_difference=float(np.mean(differences)) if differences else None,
-        psnr_unmatched=float(np.mean(unmatched)) if unmatched else None,
+        psnr_unmatched=float(np.mean(unmatched)) if fitted else None,
     )
 
 
@@ -85,13 +88,16 @@ def evaluate_avatar(
 ) -> Quality:
     """Quality of an avatar on all views of a split; holds one view at a time in memory.
 
-    matched: as in `evaluate`; None: where the avatar was trained with `exposure`.
+    matched: whether to apply the exposure of each view, known or fitted; None: where the avatar was trained so.
     """
+    rows, exposure = avatar.settings.get("exposure") or (), None
+    if rows if matched is None else matched:
+        exposure = known_exposure(rows, capture.views.get("train", ()))
     return evaluate(
         lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
-        (read_evaluation_view(capture, view) for view in capture.views[split]),
+        (read_evaluation_view(capture, view, avatar.background) for view in capture.views[split]),
         perceptual,
-        bool(avatar.settings.get("exposure")) if matched is None else matched,
+        exposure,
     )
 
 

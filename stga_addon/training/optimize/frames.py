@@ -1,6 +1,8 @@
 """Cache of meshes and face frames by timestep."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,10 +30,16 @@ class FrameStore:
     """
 
     def __init__(
-        self, capture: Capture, convention: str, strain: bool = False, tracking: Tracking | None = None
+        self,
+        capture: Capture,
+        convention: str,
+        strain: bool = False,
+        tracking: Tracking | None = None,
+        limits: np.ndarray | None = None,
     ) -> None:
+        """limits (F, 2, 3): lowest and highest strain that is followed; None: COLOR_RANGE."""
         self.capture, self.convention, self.tracking = capture, convention, tracking
-        limits = color_range(len(capture.faces))
+        limits = color_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self._cached: dict[int, _Timestep] = {}
 
@@ -59,8 +67,23 @@ class FrameStore:
             self._latest(timestep, mesh)
 
     def clear(self) -> None:
-        """Forget all meshes, because the refined tracking has changed."""
+        """Forget all meshes and frames, because what they are computed from has changed."""
         self._cached.clear()
+
+    @contextmanager
+    def strain_within(self, limits: np.ndarray | None) -> Iterator[None]:
+        """Follow strain within other limits (F, 2, 3) for a while; None: within the same."""
+        before = self.strain
+        if limits is None or before is None:
+            yield
+            return
+        self.strain = replace(before, range=limits)
+        self.clear()
+        try:
+            yield
+        finally:
+            self.strain = before
+            self.clear()
 
     def _latest(self, timestep: int, mesh: np.ndarray | None = None) -> _Timestep:
         entry = self._cached.pop(timestep, None)

@@ -32,13 +32,17 @@ class Trainer:
         selection: Mapping[int, np.ndarray],
         state: TrainState | None = None,
         device: str = "cpu",
+        strain_range: np.ndarray | None = None,
     ) -> None:
-        """selection: timestep -> (F,) bool triangles, for the selective strategy; device: one of `choose_device`."""
+        """selection: timestep -> (F,) bool triangles, for the selective strategy; device: one of `choose_device`.
+
+        strain_range (F, 2, 3): within which colors and positions follow strain; None: COLOR_RANGE.
+        """
         self.capture, self.settings = capture, settings
         self.strategy = make_strategy(settings, selection)
         self.tracking = refinable_tracking(capture, settings.convention) if settings.tracking else None
         strained = settings.strain_color or settings.strain_position
-        self.frames = FrameStore(capture, settings.convention, strained, self.tracking)
+        self.frames = FrameStore(capture, settings.convention, strained, self.tracking, strain_range)
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)

@@ -163,7 +163,7 @@ def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | 
     for name, members in groups.items():
         group = name if len(groups) > 1 else ""
         for view in evenly_spread(members, limit):
-            found = replace(read_evaluation_view(capture, view), group=group)
+            found = replace(read_evaluation_view(capture, view, run.settings.background), group=group)
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= MIN_REGION_PIXELS:
                 found = replace(found, regions={**found.regions, "region": pixels})

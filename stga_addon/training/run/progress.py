@@ -22,6 +22,7 @@ class Progress:
     message     the current stage
     forecast_text  what more training is expected to bring
     avatar      makes the avatar in its present state; None before there is one
+    psnr_unmatched  `psnr` without fitting the exposure of views; None where none was fitted
     """
 
     share: float = 0.0
@@ -34,12 +35,13 @@ class Progress:
     message: str = ""
     forecast_text: str = ""
     avatar: Callable[[], Avatar] | None = None
+    psnr_unmatched: float | None = None
 
     def figures(self) -> dict[str, float]:
         """The figures that are known, by name; NaN where one has no value yet."""
         from ..evaluate.metrics import peak_memory_mb
 
-        names = ("iteration", "per_second", "left_s", "loss", "psnr", "splats")
+        names = ("iteration", "per_second", "left_s", "loss", "psnr", "psnr_unmatched", "splats")
         values = {name: getattr(self, name) for name in names} | {"memory_mb": peak_memory_mb()}
         return {name: float(value) for name, value in values.items() if value is not None}
 
@@ -50,9 +52,13 @@ Report = Callable[[Progress], bool]
 
 def describe_figures(figures: Mapping[str, float]) -> list[str]:
     """`Progress.figures` as short lines for a narrow panel, without those that are not known yet."""
+    loss = ("loss", "loss {:.4f}")
+    quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)
+    if "psnr_unmatched" in figures:
+        quality = (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")), (loss,)
     pairs = (
         (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
-        (("psnr", "PSNR {:.2f} dB"), ("loss", "loss {:.4f}")),
+        *quality,
         (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
     )
     lines = []

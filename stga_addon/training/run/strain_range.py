@@ -1,4 +1,7 @@
-"""Range of strain that a run has trained on, within which its avatar's colors and positions follow strain."""
+"""Range of strain that a run has trained on, within which its avatar's colors and positions follow strain.
+
+strain_range.npz   `strain_range` (F, 2, 3) float32 of a run, and `identity`: the digest of the run's
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,24 +10,26 @@ import numpy as np
 
 from ...avatar.file import Avatar, read_avatar
 from ...avatar.strain import COLOR_RANGE, color_range, seen_range, strain_basis
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture
 from ...errors import StgaError
-from .folder import Continuation
+from ...files import read_npz, write_npz
+from ..settings import TrainingSettings
+from .folder import Continuation, Run
 
-MAX_TIMESTEPS = 64
-"""Timesteps that are measured, evenly spread over those trained on."""
+STRAIN_RANGE = "strain_range.npz"
+OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
 
 
 def trained_strain_range(
     capture: Capture, mesh: Callable[[int], np.ndarray], continuation: Continuation | None
 ) -> np.ndarray:
-    """`Avatar.strain_range` (F, 2, 3) of a run: what its training timesteps show, and what its parent's did.
+    """`Avatar.strain_range` (F, 2, 3) of a run: what all its training timesteps show, and what its parent's did.
 
-    mesh: timestep -> (V, 3) that is trained on. Within COLOR_RANGE.
+    mesh: timestep -> (V, 3) that is trained on; one at a time is held. Within COLOR_RANGE.
     """
     limits = color_range(len(capture.faces))
     basis = strain_basis(capture.neutral, capture.faces, limits)
-    timesteps = evenly_spread(sorted({view.timestep for view in capture.views["train"]}), MAX_TIMESTEPS)
+    timesteps = sorted({view.timestep for view in capture.views["train"]})
     seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     if continuation is None:
         return seen
@@ -38,13 +43,55 @@ def trained_strain_range(
     return np.stack([np.maximum(lowest, limits[:, 0]), np.minimum(highest, limits[:, 1])], axis=1)
 
 
+def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | None:
+    """The range (F, 2, 3) of a run that has begun in the folder, measured and written where the folder has no file yet.
+
+    None where nothing follows strain, and with refined tracking, which moves the meshes while it trains.
+    """
+    if not follows_strain(run.settings) or run.settings.tracking:
+        return None
+    assert run.identity is not None
+    if (folder / STRAIN_RANGE).exists():
+        return read_strain_range(folder, len(capture.faces), run.identity.digest)
+    limits = trained_strain_range(capture, capture.mesh, run.continuation)
+    write_strain_range(folder, limits, run.identity.digest)
+    return limits
+
+
+def follows_strain(settings: TrainingSettings) -> bool:
+    return settings.strain_color or settings.strain_position
+
+
+def write_strain_range(folder: Path, limits: np.ndarray, identity: str) -> None:
+    """Write the range (F, 2, 3) of the run with this digest of its identity."""
+    arrays = {"strain_range": limits, "identity": np.frombuffer(identity.encode(), np.uint8)}
+    write_npz(folder / STRAIN_RANGE, arrays, compressed=True)
+
+
+def read_strain_range(folder: Path, faces: int, identity: str) -> np.ndarray:
+    """(F, 2, 3) float32 as written. Raises StgaError where the file is damaged, or of another run or mesh."""
+    path = folder / STRAIN_RANGE
+    arrays = read_npz(path)
+    limits, stored = arrays.get("strain_range"), arrays.get("identity")
+    if stored is None or stored.tobytes() != identity.encode():
+        raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it")
+    if limits is None or limits.dtype != np.float32 or limits.shape != (faces, *COLOR_RANGE.shape):
+        found = "no such array" if limits is None else f"{limits.dtype} {limits.shape}"
+        raise StgaError(f"{path}: expected 'strain_range', float32 ({faces}, 2, 3), found {found}")
+    if not _is_color_range(limits):
+        raise StgaError(f"{path}: 'strain_range' is not within the range that colors are trained to follow; remove it")
+    return limits
+
+
 def require_color_range(path: Path, avatar: Avatar) -> None:
     """Raise StgaError, naming the path, where an avatar follows strain beyond COLOR_RANGE.
 
     An earlier version trained it: more training would change it at once.
     """
-    limits = avatar.strain_range
-    if avatar.follows_strain and (
-        limits is None or ((limits[:, 0] < COLOR_RANGE[0]) | (limits[:, 1] > COLOR_RANGE[1])).any()
-    ):
-        raise StgaError(f"{path}: colors follow strain as in an earlier version; train it anew")
+    if avatar.follows_strain and (avatar.strain_range is None or not _is_color_range(avatar.strain_range)):
+        raise StgaError(f"{path}: {OLDER_COLORS}")
+
+
+def _is_color_range(limits: np.ndarray) -> bool:
+    """Whether limits (F, 2, 3) lie within COLOR_RANGE; not so where one is NaN."""
+    return bool(((limits[:, 0] >= COLOR_RANGE[0]) & (limits[:, 1] <= COLOR_RANGE[1])).all())

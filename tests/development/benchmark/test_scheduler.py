@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from stga_addon.capture.model import Capture
-from stga_addon.development.benchmark import scheduler
+from stga_addon.development.benchmark import benchmark, scheduler
 from stga_addon.development.benchmark.benchmark import run_benchmark
 from stga_addon.development.benchmark.scheduler import BenchmarkRun, train_in_turns
 from stga_addon.development.benchmark.variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
@@ -62,6 +62,9 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     quality = json.loads((run.out / QUALITY).read_text())
     assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality["val"]) & set(quality["test"])
     assert run.finished
+    assert "psnr_unmatched" not in quality["val"]
+    work(run.out, io.StringIO(), io.StringIO(), fits_exposure=True)
+    assert "psnr_unmatched" in json.loads((run.out / QUALITY).read_text())["val"]
     replies = io.StringIO()
     write_run(tmp_path / "lost", replace(run.run, capture=tmp_path / "nowhere"))
     work(tmp_path / "lost", io.StringIO(), replies)
@@ -110,6 +113,20 @@ def test_a_benchmark_is_interrupted_and_goes_on(toy: Capture, tmp_path: Path, mo
     assert printed == ["Deciding effects"]
     with pytest.raises(StgaError, match="holds a run with other settings"):
         run_benchmark(toy, run, VARIANTS, 3.0, 2, tmp_path, printed.append)
+
+
+def test_exposure_is_fitted_for_all_or_none(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches variants with the effect that are measured with fitted exposure beside others without it."""
+    started: list[bool] = []
+    monkeypatch.setattr(
+        benchmark, "train_in_turns", lambda runs, print_progress: started.extend(run.fits_exposure for run in runs)
+    )
+    run, rows = Run(toy.root, None, "vhap", make_settings(seconds=1.0)), ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
+    plain = {name: {**changes, "effects": {"exposure": "off"}} for name, changes in VARIANTS.items()}
+    run_benchmark(toy, run, plain, 2.0, 1, tmp_path / "none", lambda text: None)
+    with_rows = {"paper": {**TINY, "schedule": "paper"}, "corrected": {**TINY, "exposure": rows, "effects": None}}
+    run_benchmark(toy, run, with_rows, 2.0, 1, tmp_path / "all", lambda text: None)
+    assert started == [False, False, True, True]
 
 
 def test_ended_workers_are_reaped(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,6 +59,22 @@ def test_mean_curves() -> None:
     np.testing.assert_allclose(curve.mean, curve.seconds + 9)
 
 
+def test_curves_compare_psnr_without_fit() -> None:
+    """Catches a variant that leads because exposure is fitted for it alone, in the chart and on the front."""
+    fitted = Outcome("a", 0, [line(s, 35.0, psnr_unmatched=28.0) for s in (1.0, 5.0)], {})
+    curves = mean_curves([fitted, Outcome("b", 0, [line(s, 30.0) for s in (1.0, 5.0)], {})])
+    np.testing.assert_allclose(curves["a"].mean, 28.0)
+    assert [name for name, *_ in pareto_front(curves)] == ["b"]
+
+
+def test_both_psnrs_are_in_the_table() -> None:
+    """Catches a table of fitted figures that does not say so, or hides the others."""
+    runs = [Outcome("a", 0, [line(1.0, 35.0, 1)], {"val": {"psnr": 35.0, "psnr_unmatched": 28.0, "ssim": 0.9}})]
+    heading = table_lines(summarize(runs))[0]
+    assert [cell.strip() for cell in heading.strip("|").split("|")][4:6] == ["val", "val unfitted"]
+    assert "The exposure of held-out cameras is fitted for all variants" in report_text(runs, {}, 1.0, Path("head"))
+
+
 def curve(seconds: list[float], psnr: list[float]) -> MeanCurve:
     values = np.array(psnr)
     return MeanCurve(np.array(seconds), values, values, values)
