@@ -9,7 +9,15 @@ from flame.conftest import random_arrays, random_frame
 from stga_addon.capture.camera import look_at
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.tracking.fit import Similarity, TimestepLandmarks, fit_head, pose_from_one_camera, triangulated
+from stga_addon.tracking.fit import (
+    Similarity,
+    TimestepLandmarks,
+    fit_head,
+    observed_landmarks,
+    pose_from_one_camera,
+    rigid_start,
+    triangulated,
+)
 from stga_addon.tracking.head_model import HeadModel, linear_model
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
 from stga_addon.tracking.track import interpolated
@@ -199,6 +207,21 @@ def test_landmarks_of_no_weight_stay_unknown(head, count):
         pixels, _ = fit.to_capture.camera(own[0]).project(posed_mesh(fit, fit.parameters[timestep]))
         error = np.linalg.norm(pixels - rig[0].project(mesh)[0], axis=1)[head.model.masks["face"]]
         assert np.median(error) < 2  # of a face of 300 pixels
+
+
+def test_rays_that_all_miss_give_a_start(head):
+    """Catches weights that vanish, and the mean of no points, where no two cameras agree about any landmark."""
+    rig, rng = cameras(3), np.random.default_rng(0)
+    points = rng.normal(0, 0.05, (30, 3))
+    landmarks = seen(rig, points, noise=100.0)
+    found = triangulate(rig, landmarks.points, landmarks.confidence)
+    world = Similarity(100.0, np.eye(3), np.zeros(3))
+    with np.errstate(all="raise"):
+        observed = observed_landmarks(found, world, np.ones(30, bool))
+        start = rigid_start(points, observed)
+    assert (observed.weight > 0).all()
+    np.testing.assert_allclose(start[-3:], (observed.position - points).mean(0), atol=3)
+    assert np.linalg.norm(start[:3]) <= np.pi + 1e-9
 
 
 def test_a_linear_model_without_joints_moves_rigidly():
