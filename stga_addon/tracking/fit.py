@@ -77,8 +77,7 @@ class HeadFit:
 
 
 def is_face(pixels: np.ndarray) -> bool:
-    """Whether one camera's landmarks (N, 2) pixels have an extent; those of a face that was not found may be one point.
-    """
+    """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one point."""
     return len(pixels) > 0 and bool((np.ptp(pixels, axis=0) >= MIN_FACE_PIXELS).all())
 
 

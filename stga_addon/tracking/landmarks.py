@@ -86,30 +86,40 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
     for key in ("timesteps", "points"):
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}")
-    timesteps, points = arrays["timesteps"], arrays["points"]
+    timesteps = arrays["timesteps"]
     listed = timesteps.tolist() if timesteps.ndim == 1 and timesteps.dtype.kind in "iu" else [None]
     if not set(listed) <= set(camera.timesteps) or len(set(listed)) < len(listed):
-        raise StgaError(f"{path}: timesteps: expected timesteps of camera {camera.name}, each once, whole numbers (any,)")
-    if points.dtype.kind != "f":
-        raise StgaError(f"{path}: points holds {points.dtype}, expected floating-point numbers")
-    if points.ndim != 3 or points.shape[::2] != (len(timesteps), 2):
-        raise StgaError(f"{path}: points has shape {points.shape}, expected ({len(timesteps)}, any, 2)")
-    with np.errstate(over="ignore"):
-        points = points.astype(np.float64)
-    confidence = arrays.get("confidence", np.isfinite(points).all(2).astype(np.float32))
-    if confidence.shape != points.shape[:2]:
-        raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {points.shape[:2]}")
-    if confidence.dtype.kind not in "biuf":
-        raise StgaError(f"{path}: confidence holds {confidence.dtype}, expected numbers")
-    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():  # also where it is not a number
-        raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
+        expected = f"timesteps of camera {camera.name}, each once, whole numbers (any,)"
+        raise StgaError(f"{path}: timesteps: expected {expected}")
+    points = _pixels(path, arrays["points"], len(timesteps))
+    confidence = _confidence(path, arrays.get("confidence", np.isfinite(points).all(2)), points.shape[:2])
     seen = points[confidence > 0]
     if not np.isfinite(seen).all():
         raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
     if not (np.abs(seen) <= MAX_PIXELS).all():
         raise StgaError(f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image reaches")
-    known = np.where(confidence[..., None] > 0, points, 0.0)
-    return CameraLandmarks(timesteps.astype(np.int64), known, confidence.astype(np.float64))
+    return CameraLandmarks(timesteps.astype(np.int64), np.where(confidence[..., None] > 0, points, 0.0), confidence)
+
+
+def _pixels(path: Path, points: np.ndarray, count: int) -> np.ndarray:
+    """(T, N, 2) float64 of `count` timesteps, finite or not."""
+    if points.dtype.kind != "f":
+        raise StgaError(f"{path}: points holds {points.dtype}, expected floating-point numbers")
+    if points.ndim != 3 or points.shape[::2] != (count, 2):
+        raise StgaError(f"{path}: points has shape {points.shape}, expected ({count}, any, 2)")
+    with np.errstate(over="ignore"):
+        return points.astype(np.float64)
+
+
+def _confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """(T, N) float64."""
+    if confidence.shape != shape:
+        raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {shape}")
+    if confidence.dtype.kind not in "biuf":
+        raise StgaError(f"{path}: confidence holds {confidence.dtype}, expected numbers")
+    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():  # also where it is not a number
+        raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
+    return confidence.astype(np.float64)
 
 
 def write_camera(path: Path, landmarks: CameraLandmarks) -> None:
@@ -133,23 +143,28 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
     face, barycentric = arrays["face"], arrays["barycentric"]
     if face.ndim != 1 or face.dtype.kind not in "iu" or not ((face >= -1) & (face < triangles)).all():
         raise StgaError(f"{path}: face: expected triangles from 0 to {triangles - 1}, or -1, of shape (any,)")
-    if barycentric.shape != (len(face), 3):
-        raise StgaError(f"{path}: barycentric has shape {barycentric.shape}, expected ({len(face)}, 3)")
-    if barycentric.dtype.kind not in "biuf":
-        raise StgaError(f"{path}: barycentric holds {barycentric.dtype}, expected numbers")
     used = face >= 0
     if used.sum() < MIN_LANDMARKS:
         raise StgaError(f"{path}: face: uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}")
+    return SurfacePoints(np.maximum(face, 0).astype(np.int64), _barycentric(path, barycentric, used)), used
+
+
+def _barycentric(path: Path, barycentric: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(N, 3) float64; thirds where a landmark is not used."""
+    if barycentric.shape != (len(used), 3):
+        raise StgaError(f"{path}: barycentric has shape {barycentric.shape}, expected ({len(used)}, 3)")
+    if barycentric.dtype.kind not in "biuf":
+        raise StgaError(f"{path}: barycentric holds {barycentric.dtype}, expected numbers")
     if not np.isfinite(barycentric).all():
         raise StgaError(f"{path}: barycentric: expected finite numbers")
-    if not (barycentric[used] >= MIN_BARYCENTRIC).all():
-        raise StgaError(f"{path}: barycentric: expected numbers from 0 up")
     with np.errstate(over="ignore"):
-        sums = barycentric[used].astype(np.float64).sum(1)
+        shares = np.where(used[:, None], barycentric, 1 / 3).astype(np.float64)
+        sums = shares.sum(1)
+    if not (shares >= MIN_BARYCENTRIC).all():
+        raise StgaError(f"{path}: barycentric: expected numbers from 0 up")
     if not (np.abs(sums - 1) <= MAX_SUM_ERROR).all():
         raise StgaError(f"{path}: barycentric: expected rows that add up to 1")
-    shares = np.where(used[:, None], barycentric, 1 / 3).astype(np.float64)
-    return SurfacePoints(np.maximum(face, 0).astype(np.int64), shares), used
+    return shares
 
 
 def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
