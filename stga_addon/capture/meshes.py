@@ -1,9 +1,7 @@
 """Reading of tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles."""
 
 import io
-import json
 import re
-import struct
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -15,13 +13,13 @@ from ..errors import StgaError
 from ..files import file_size, read_json
 from ..flame.masks import faces_within
 from .camera import MAX_COORDINATE_M
+from .glb_chunks import glb_chunks
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
 """A mesh smaller than this is a point: it has no shape to train on, and no scale to compare motion with."""
-GLB_JSON_CHUNK = b"JSON"
 MAX_GLB_NODES, MAX_GLB_CORNERS = 1000, 1 << 22
 """A GLB's nodes may repeat a mesh; a tracked head has a skeleton's nodes and 10^4 to 10^5 vertices."""
 
@@ -169,10 +167,7 @@ def _check_ply(data: bytes) -> None:
 def _check_glb(data: bytes) -> None:
     """trimesh allocates what accessors promise and copies a mesh for each node. Raises ValueError where that is more
     than the file can hold, and where nodes are no trees."""
-    length, kind = struct.unpack("<L4s", data[12:20])
-    if kind != GLB_JSON_CHUNK or length > len(data):
-        raise ValueError("no JSON chunk at its beginning")
-    document = json.loads(data[20 : 20 + length])
+    document, _ = glb_chunks(data)
     nodes, meshes, accessors = (document.get(key, []) for key in ("nodes", "meshes", "accessors"))
     counts = [accessor["count"] for accessor in accessors]
     if any(type(count) is not int or not 0 <= count <= len(data) for count in counts):

@@ -8,6 +8,7 @@ from ..capture.camera import Camera, look_at
 from ..errors import StgaError
 from ..flame.model import JOINTS, FlameModel
 from .detectors import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
+from .fit import MIN_LANDMARKS
 from .mesh_image import shaded_image
 from .posed_points import SurfacePoints
 from .triangulation import triangulate
@@ -51,6 +52,11 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
         reliable[FIRST_IRIS_POINT:] = False
         places, pupils = _with_pupils(model, places, located.position)
         reliable[pupils] = True
+    if reliable.sum() < MIN_LANDMARKS:
+        raise StgaError(
+            f"{name}: {reliable.sum()} of {len(reliable)} landmarks that are found in its pictures lie on its surface, "
+            f"expected at least {MIN_LANDMARKS}"
+        )
     return places, reliable
 
 

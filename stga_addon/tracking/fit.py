@@ -7,6 +7,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.model import evenly_spread
+from ..capture.rigid import weighted_procrustes
 from .head_model import HeadModel
 from .mesh_image import vertex_normals
 from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
@@ -20,6 +21,12 @@ MIN_VISIBILITY = 1e-3
 """Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than left open."""
 RESIDUAL_SCALE_M = 0.004
 """Landmarks whose rays miss each other by much more are not used."""
+MAX_RESIDUALS = 25.0
+"""In RESIDUAL_SCALE_M, beyond which a landmark's weight no longer falls: it would vanish below the smallest number."""
+MIN_LANDMARKS = 4
+"""Of a timestep that the head is fitted to: fewer do not determine a pose."""
+MIN_FACE_PIXELS, MIN_FACE_M = 1.0, 0.01
+"""Extents of the landmarks in an image and on the head, below which they are no face but a point."""
 POSIT_ITERATIONS = 20
 
 
@@ -69,6 +76,23 @@ class HeadFit:
     static_offset: np.ndarray | None = None
 
 
+def is_face(pixels: np.ndarray) -> bool:
+    """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one point."""
+    return len(pixels) > 0 and bool((np.ptp(pixels, axis=0) >= MIN_FACE_PIXELS).all())
+
+
+def determines_pose(landmarks: TimestepLandmarks, reliable: np.ndarray, neutral: np.ndarray) -> bool:
+    """Whether `fit_head` can use the timestep: enough reliable landmarks are seen by two cameras, or by the only one.
+
+    neutral (N, 3) meters: the landmarks' places on the neutral head.
+    """
+    if not landmarks.cameras:
+        return False
+    seen = (landmarks.confidence > 0).sum(0) >= min(2, len(landmarks.cameras))
+    use = seen & reliable
+    return use.sum() >= MIN_LANDMARKS and bool(np.ptp(neutral[use], axis=0).max() >= MIN_FACE_M)
+
+
 def fit_head(
     head: HeadModel,
     places: SurfacePoints,
@@ -76,7 +100,7 @@ def fit_head(
     take: Mapping[int, TimestepLandmarks],
     report: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> HeadFit:
-    """Fit the model to the landmarks of every timestep that has any (`take`).
+    """Fit the model to the landmarks of the timesteps of `take`, each of which `determines_pose`.
 
     Rounds of triangulation, identity and scale from timesteps spread over the take, then all timesteps; from the second
     round on, a camera's landmarks count by the angle at which it sees the surface.
@@ -113,12 +137,10 @@ def fit_head(
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) (Umeyama)."""
+    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama)."""
+    rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
     a, b = source - source.mean(0), target - target.mean(0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(signs) @ vt
-    scale = float((values * signs).sum() / (a**2).sum())
+    scale = float((b * (a @ rotation.T)).sum() / (a**2).sum())
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
@@ -161,7 +183,7 @@ def observed_landmarks(found: Triangulation, world: Similarity, reliable: np.nda
     """The triangulation in the capture's world."""
     values, vectors = np.linalg.eigh(world.rotation @ found.information @ world.rotation.T)
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
-    certain = np.exp(-((found.residual * world.scale / RESIDUAL_SCALE_M) ** 2))
+    certain = np.exp(-(np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS) ** 2))
     return Observation(world.apply(found.position), root, np.where(found.seen & reliable, certain, 0.0))
 
 
@@ -183,11 +205,13 @@ def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     """(18,) pose that brings a neutral head's landmarks (N, 3) onto the observed ones."""
     from scipy.spatial.transform import Rotation
 
-    use = observed.weight > 0
-    rotation = similarity(neutral[use], observed.position[use]).rotation
+    use = observed.weight > np.exp(-(MAX_RESIDUALS**2))
+    if use.sum() < MIN_LANDMARKS:  # no cameras agree: all of them, and the fit will show by how much they do not
+        use = observed.weight > 0
+    rotation, translation = weighted_procrustes(neutral[use], observed.position[use], np.ones(use.sum()))
     rigid = np.zeros(RIGID_SIZE)
     rigid[:3] = Rotation.from_matrix(rotation).as_rotvec()
-    rigid[POSE_SIZE:] = observed.position[use].mean(0) - rotation @ neutral[use].mean(0)
+    rigid[POSE_SIZE:] = translation
     return rigid
 
 

@@ -1,6 +1,5 @@
 """Reading of meshes with morph targets from binary glTF."""
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError
-from ..files import file_size, parse_json
+from ..capture.glb_chunks import glb_chunks
+from ..errors import StgaError, shorten
 from ..flame.quaternions import to_matrices
+from .footage.reading import read_bytes
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES = 4
-MAX_ELEMENTS = 20_000_000
-"""Largest accessor: one without data promises as many zeros as it likes."""
+MIN_NUMBERS_ALLOWANCE, MAX_NUMBERS_PER_BYTE = 1 << 20, 8
+"""Numbers that the joined mesh may hold: any file's, and more for each byte. Accessors without data promise as many
+zeros as they like, and nodes repeat meshes; sparse morph targets of a real head reach 4 a byte."""
+PRIMITIVE_NUMBERS = 100
+"""That each primitive counts for besides its own: it takes time even where it is small."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 
 
@@ -36,32 +39,19 @@ def read_glb(path: Path) -> MorphMesh:
     Vertices that are split at seams of normals and texture coordinates are merged. Skins are left in their bind pose.
     Raises StgaError naming the file and what is missing or not supported. Source: Khronos, glTF 2.0.
     """
-    file_size(path)
+    content = read_bytes(path)
     try:
-        document, data = _chunks(path.read_bytes())
-        _require_readable(path, document)
-        nodes = _mesh_nodes(document)
-        parts = [part for node, matrix in nodes for part in _placed(document, data, node, matrix)]
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except StgaError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, struct.error, RecursionError) as error:
+        with np.errstate(all="ignore"):  # a head's vertices are checked by `read_head_model`
+            document, data = glb_chunks(content)
+            _require_readable(path, document)
+            nodes = list(_mesh_nodes(document))
+            _require_bounded(path, document, nodes, MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * len(content))
+            parts = [part for node, matrix in nodes for part in _placed(document, data, node, matrix)]
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise StgaError(f"{path}: is not a readable GLB ({type(error).__name__}: {error!s:.100})") from error
     if not parts:
         raise StgaError(f"{path}: its scene has no triangle mesh")
     return _merged(_joined(parts))
-
-
-def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON document and the binary chunk."""
-    magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
-    if (magic, version, kind) != (b"glTF", 2, b"JSON"):
-        raise ValueError("expected binary glTF 2.0")
-    document = parse_json(data[20 : 20 + length])
-    rest = data[20 + length :]
-    size = struct.unpack_from("<I", rest)[0] if len(rest) >= 8 else 0
-    return document, rest[8 : 8 + size]
 
 
 def _require_readable(path: Path, document: dict[str, Any]) -> None:
@@ -70,6 +60,39 @@ def _require_readable(path: Path, document: dict[str, Any]) -> None:
         raise StgaError(f"{path}: needs {', '.join(sorted(map(str, unknown)))}; export it without compression")
     if any("uri" in buffer for buffer in document.get("buffers", ())):
         raise StgaError(f"{path}: refers to other files; export a GLB that holds its buffers")
+
+
+def _require_bounded(
+    path: Path, document: dict[str, Any], nodes: list[tuple[dict[str, Any], np.ndarray]], allowed: int
+) -> None:
+    """Raise StgaError where the joined mesh of all nodes would hold more numbers than allowed."""
+    vertices = corners = 0
+    names: set[str] = set()
+    for node, _ in nodes:
+        for primitive, targets in _primitives(document, node):
+            vertices += _count(document["accessors"][primitive["attributes"]["POSITION"]])
+            corners += PRIMITIVE_NUMBERS
+            corners += _count(document["accessors"][primitive["indices"]]) if "indices" in primitive else 0
+            names.update(name for name, _ in targets)
+            numbers = 3 * vertices * (1 + len(names)) + corners
+            if numbers > allowed:
+                raise StgaError(
+                    f"{path}: its meshes hold {numbers} numbers, more than the {allowed} allowed to a file of this size"
+                )
+
+
+def _primitives(
+    document: dict[str, Any], node: dict[str, Any]
+) -> Iterator[tuple[dict[str, Any], list[tuple[str, dict[str, int]]]]]:
+    """Triangle primitives of a node's mesh, with the names of their morph targets and these."""
+    mesh = document["meshes"][node["mesh"]]
+    extras = mesh.get("extras")
+    names = extras.get("targetNames", ()) if isinstance(extras, dict) else ()
+    for primitive in mesh["primitives"]:
+        if primitive.get("mode", TRIANGLES) == TRIANGLES:
+            targets = primitive.get("targets", ())
+            named = len(names) == len(targets)
+            yield primitive, [(str(names[k]) if named else f"target {k}", target) for k, target in enumerate(targets)]
 
 
 def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
@@ -99,51 +122,52 @@ def _transform(node: dict[str, Any]) -> np.ndarray:
 
 def _placed(document: dict[str, Any], data: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[MorphMesh]:
     """The triangle primitives of a node's mesh, in the scene's axes."""
-    mesh = document["meshes"][node["mesh"]]
-    names = mesh.get("extras", {}).get("targetNames", ()) if isinstance(mesh.get("extras"), dict) else ()
     parts = []
-    for primitive in mesh["primitives"]:
-        if primitive.get("mode", TRIANGLES) != TRIANGLES:
-            continue
+    for primitive, morphs in _primitives(document, node):
         positions = _accessor(document, data, primitive["attributes"]["POSITION"])
-        morphs = primitive.get("targets", ())
-        given = (
-            [str(name) for name in names] if len(names) == len(morphs) else [f"target {k}" for k in range(len(morphs))]
-        )
-        shape = positions.shape
-        moved = [_accessor(document, data, m["POSITION"]) if "POSITION" in m else np.zeros(shape) for m in morphs]
-        targets = np.stack(moved, axis=2) if moved else np.zeros((*shape, 0))
-        faces = (
-            _accessor(document, data, primitive["indices"])[:, 0]
-            if "indices" in primitive
-            else np.arange(len(positions))
-        ).astype(np.int64)
-        if faces.max(initial=0) >= len(positions) or targets.shape[:2] != shape or shape[1:] != (3,):
-            raise ValueError("a primitive's indices or morph targets do not fit its vertices")
+        count = len(positions)
+        targets = np.zeros((count, 3, len(morphs)))
+        for column, (_, morph) in enumerate(morphs):
+            if "POSITION" in morph:
+                targets[:, :, column] = _accessor(document, data, morph["POSITION"], count)
+        corners = np.arange(count, dtype=np.int64)
+        if "indices" in primitive:
+            corners = _accessor(document, data, primitive["indices"], width=1)[:, 0].astype(np.int64)
+        if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
+            raise ValueError("a primitive's indices do not fit its vertices")
         parts.append(
             MorphMesh(
                 positions @ matrix[:3, :3].T + matrix[:3, 3],
-                faces[: len(faces) // 3 * 3].reshape(-1, 3),
-                tuple(given),
+                corners[: len(corners) // 3 * 3].reshape(-1, 3),
+                tuple(name for name, _ in morphs),
                 np.einsum("ab,vbk->vak", matrix[:3, :3], targets),
             )
         )
     return parts
 
 
-def _accessor(document: dict[str, Any], data: bytes, number: int) -> np.ndarray:
-    """Values (N, width) of an accessor, sparse ones applied."""
+def _count(accessor: dict[str, Any]) -> int:
+    count = accessor["count"]
+    if type(count) is not int or count < 1:
+        raise ValueError(f"an accessor of {shorten(count)} elements")
+    return count
+
+
+def _accessor(
+    document: dict[str, Any], data: bytes, number: int, expected: int | None = None, width: int = 3
+) -> np.ndarray:
+    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where that is given."""
     accessor = document["accessors"][number]
-    count, width = int(accessor["count"]), WIDTHS[accessor["type"]]
-    if not 0 < count <= MAX_ELEMENTS:
-        raise ValueError(f"an accessor of {count} elements")
+    count = _count(accessor)
+    if WIDTHS[accessor["type"]] != width or count != (expected or count):
+        raise ValueError("an accessor is of another type or length than its use")
     if "bufferView" in accessor:
         values = _view(document, data, accessor, accessor["componentType"], count, width)
     else:
         values = np.zeros((count, width))
     sparse = accessor.get("sparse")
     if sparse:
-        changed = int(sparse["count"])
+        changed = _count(sparse)
         rows = _view(document, data, sparse["indices"], sparse["indices"]["componentType"], changed, 1)[:, 0]
         values[rows.astype(np.int64)] = _view(
             document, data, sparse["values"], accessor["componentType"], changed, width
@@ -163,7 +187,8 @@ def _view(
         raise ValueError("expected one buffer")
     start = int(view.get("byteOffset", 0)) + int(source.get("byteOffset", 0))
     stride = int(view.get("byteStride", dtype.itemsize * width))
-    if min(start, stride, count) < 0 or start + stride * max(count - 1, 0) + dtype.itemsize * width > len(data):
+    size = dtype.itemsize * width
+    if start < 0 or stride < size or start + stride * (count - 1) + size > len(data):
         raise ValueError("an accessor reaches beyond the file")
     strides = (stride, dtype.itemsize)
     return np.ndarray((count, width), dtype, data, start, strides).astype(np.float64)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..capture.camera import MAX_COORDINATE_M
 from ..capture.flame_capture import flame_model
 from ..errors import StgaError
 from ..files import read_npz, write_npz
@@ -17,6 +18,10 @@ IDENTITY_PREFIX = "identity"
 LINEAR_KEYS = ("mean", "faces")
 MIN_EXTENT_M, MAX_EXTENT_M = 0.1, 2.0
 """Extent of a head model along its longest axis; outside of it, the file is in other units."""
+MAX_COMPONENT_M = 100.0
+"""Displacement of a vertex by a component at coefficient 1; scales of components differ from model to model."""
+MAX_JOINT_SHARE = 100.0
+"""Of a vertex in a joint's position, and of a joint in a vertex's motion."""
 MIN_JOINT_WEIGHT = 0.5
 """Skinning weight that some vertex must have for a joint to count as present."""
 
@@ -110,11 +115,33 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
 
 
 def checked(path: Path, head: HeadModel) -> HeadModel:
-    """The head model. Raises StgaError where it is not of a head's size in meters."""
+    """The head model. Raises StgaError where it is not of a head's size in meters, or holds numbers that none has."""
+    for name, (array, limit) in _bounds(head).items():
+        largest = float(np.abs(array).max(initial=0))
+        if largest > limit:
+            raise StgaError(f"{path}: {name} reaches {largest:.3g}, expected at most {limit:.0f}")
     extent = float(np.ptp(head.model.v_template, axis=0).max())
     if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
         raise StgaError(f"{path}: the head measures {extent:.3g}, expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters")
     return head
+
+
+def _bounds(head: HeadModel) -> dict[str, tuple[np.ndarray, float]]:
+    """Name in the file -> array, and what its numbers may reach."""
+    model = head.model
+    if head.layout == "flame":
+        shapes = {"shapedirs": model.shapedirs, "posedirs": model.posedirs}
+    else:
+        shapes = {
+            "identity": model.shapedirs[..., : model.n_identity],
+            "expression": model.shapedirs[..., model.n_identity :],
+        }
+    return {
+        "v_template" if head.layout == "flame" else "mean": (model.v_template, MAX_COORDINATE_M),
+        **{name: (array, MAX_COMPONENT_M) for name, array in shapes.items()},
+        "J_regressor": (model.j_regressor, MAX_JOINT_SHARE),
+        "weights": (model.weights, MAX_JOINT_SHARE),
+    }
 
 
 def _skeleton(path: Path, arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -137,6 +164,10 @@ def _floats(path: Path, arrays: dict[str, np.ndarray], key: str, expected: tuple
     if not fits or not array.shape[0]:
         wanted = ", ".join("any" if size is None else str(size) for size in expected)
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
-    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise StgaError(f"{path}: {key} holds {array.dtype} that are not all finite numbers")
-    return np.ascontiguousarray(array, np.float64)
+    if array.dtype.kind not in "iuf":
+        raise StgaError(f"{path}: {key} holds {array.dtype}, expected numbers")
+    with np.errstate(over="ignore"):
+        values = np.ascontiguousarray(array, np.float64)
+    if not np.isfinite(values).all():
+        raise StgaError(f"{path}: {key} holds values that are not finite")
+    return values

@@ -11,11 +11,15 @@ import numpy as np
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .detectors import Detector
+from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .posed_points import SurfacePoints
 
-MIN_BARYCENTRIC = -1e-3
+MIN_BARYCENTRIC, MAX_SUM_ERROR = -1e-3, 1e-3
+MAX_PIXELS, MAX_CONFIDENCE = 1e5, 1e6
+"""Bounds of landmarks, three times as far as the largest image reaches, and of their confidence: some detectors write
+scores in place of shares."""
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""
 MIN_OVERLAP = 0.3
@@ -50,11 +54,9 @@ def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report:
     done = 0
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
-        if path.exists():
-            found[camera.name] = read_camera(path, camera)
-        else:
-            found[camera.name] = _detect(camera, detector, partial(_count, report, done, total))
-            write_camera(path, found[camera.name])
+        if not path.exists():
+            write_camera(path, _detect(camera, detector, partial(_count, report, done, total)))
+        found[camera.name] = read_camera(path, camera)  # in the file's precision, whether it was detected now or before
         done += len(camera.timesteps)
         report("Landmarks", done, total)
     return found
@@ -84,17 +86,40 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
     for key in ("timesteps", "points"):
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}")
-    timesteps, points = arrays["timesteps"], arrays["points"]
-    if timesteps.ndim != 1 or timesteps.dtype.kind not in "iu" or not set(timesteps.tolist()) <= set(camera.timesteps):
-        raise StgaError(f"{path}: timesteps: expected timesteps of camera {camera.name}, whole numbers (any,)")
-    if points.ndim != 3 or points.dtype.kind != "f" or points.shape[::2] != (len(timesteps), 2):
-        raise StgaError(f"{path}: points has shape {points.shape}, expected ({len(timesteps)}, any, 2) numbers")
-    confidence = arrays.get("confidence", np.isfinite(points).all(2).astype(np.float32))
-    if confidence.shape != points.shape[:2] or not (np.isfinite(confidence) & (confidence >= 0)).all():
-        raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {points.shape[:2]} from 0 up")
-    if not np.isfinite(points[confidence > 0]).all():
-        raise StgaError(f"{path}: points holds values that are not finite; expected confidence 0 there")
-    return CameraLandmarks(timesteps, np.nan_to_num(points.astype(np.float64)), confidence.astype(np.float64))
+    timesteps = arrays["timesteps"]
+    listed = timesteps.tolist() if timesteps.ndim == 1 and timesteps.dtype.kind in "iu" else [None]
+    if not set(listed) <= set(camera.timesteps) or len(set(listed)) < len(listed):
+        expected = f"timesteps of camera {camera.name}, each once, whole numbers (any,)"
+        raise StgaError(f"{path}: timesteps: expected {expected}")
+    points = _pixels(path, arrays["points"], len(timesteps))
+    confidence = _confidence(path, arrays.get("confidence", np.isfinite(points).all(2)), points.shape[:2])
+    seen = points[confidence > 0]
+    if not np.isfinite(seen).all():
+        raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
+    if not (np.abs(seen) <= MAX_PIXELS).all():
+        raise StgaError(f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image reaches")
+    return CameraLandmarks(timesteps.astype(np.int64), np.where(confidence[..., None] > 0, points, 0.0), confidence)
+
+
+def _pixels(path: Path, points: np.ndarray, count: int) -> np.ndarray:
+    """(T, N, 2) float64 of `count` timesteps, finite or not."""
+    if points.dtype.kind != "f":
+        raise StgaError(f"{path}: points holds {points.dtype}, expected floating-point numbers")
+    if points.ndim != 3 or points.shape[::2] != (count, 2):
+        raise StgaError(f"{path}: points has shape {points.shape}, expected ({count}, any, 2)")
+    with np.errstate(over="ignore"):
+        return points.astype(np.float64)
+
+
+def _confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """(T, N) float64."""
+    if confidence.shape != shape:
+        raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {shape}")
+    if confidence.dtype.kind not in "biuf":
+        raise StgaError(f"{path}: confidence holds {confidence.dtype}, expected numbers")
+    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():  # also where it is not a number
+        raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
+    return confidence.astype(np.float64)
 
 
 def write_camera(path: Path, landmarks: CameraLandmarks) -> None:
@@ -118,11 +143,28 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
     face, barycentric = arrays["face"], arrays["barycentric"]
     if face.ndim != 1 or face.dtype.kind not in "iu" or not ((face >= -1) & (face < triangles)).all():
         raise StgaError(f"{path}: face: expected triangles from 0 to {triangles - 1}, or -1, of shape (any,)")
-    if barycentric.shape != (len(face), 3) or not (barycentric >= MIN_BARYCENTRIC).all():
-        raise StgaError(f"{path}: barycentric has shape {barycentric.shape}, expected ({len(face)}, 3) from 0 up")
-    if not np.allclose(barycentric[face >= 0].sum(1), 1, atol=1e-3):
+    used = face >= 0
+    if used.sum() < MIN_LANDMARKS:
+        raise StgaError(f"{path}: face: uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}")
+    return SurfacePoints(np.maximum(face, 0).astype(np.int64), _barycentric(path, barycentric, used)), used
+
+
+def _barycentric(path: Path, barycentric: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(N, 3) float64; thirds where a landmark is not used."""
+    if barycentric.shape != (len(used), 3):
+        raise StgaError(f"{path}: barycentric has shape {barycentric.shape}, expected ({len(used)}, 3)")
+    if barycentric.dtype.kind not in "biuf":
+        raise StgaError(f"{path}: barycentric holds {barycentric.dtype}, expected numbers")
+    if not np.isfinite(barycentric).all():
+        raise StgaError(f"{path}: barycentric: expected finite numbers")
+    with np.errstate(over="ignore"):
+        shares = np.where(used[:, None], barycentric, 1 / 3).astype(np.float64)
+        sums = shares.sum(1)
+    if not (shares >= MIN_BARYCENTRIC).all():
+        raise StgaError(f"{path}: barycentric: expected numbers from 0 up")
+    if not (np.abs(sums - 1) <= MAX_SUM_ERROR).all():
         raise StgaError(f"{path}: barycentric: expected rows that add up to 1")
-    return SurfacePoints(np.maximum(face, 0), barycentric.astype(np.float64)), face >= 0
+    return shares
 
 
 def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
@@ -136,16 +178,6 @@ def write_landmarks(
     for name, camera in found.items():
         write_camera(landmark_file(folder, name), camera)
     write_places(folder / PLACES_FILE, places, used)
-
-
-def timesteps_with_landmarks(found: Mapping[str, CameraLandmarks]) -> set[int]:
-    """Timesteps at which some camera sees something."""
-    return {
-        int(timestep)
-        for camera in found.values()
-        for timestep, seen in zip(camera.timesteps, camera.confidence.any(1), strict=True)
-        if seen
-    }
 
 
 def _count(report: Report, done: int, total: int, number: int) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from os.path import realpath
 from pathlib import Path
@@ -17,7 +17,7 @@ from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
-from .fit import HeadFit, TimestepLandmarks, fit_head
+from .fit import MIN_FACE_M, HeadFit, TimestepLandmarks, determines_pose, fit_head, is_face
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
 from .footage.model import Footage, FootageCamera
 from .head_model import read_head_model
@@ -27,7 +27,6 @@ from .landmarks import (
     detect_landmarks,
     read_landmarks,
     read_places,
-    timesteps_with_landmarks,
     write_landmarks,
     write_places,
 )
@@ -85,19 +84,27 @@ def track(
     head = read_head_model(head_file)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
-        places, reliable = read_places(landmarks / PLACES_FILE, len(head.model.faces))
+        places_file = landmarks / PLACES_FILE
+        places, reliable = read_places(places_file, len(head.model.faces))
     else:
         detector = make_detector(task)
         report("Head model", 0, 1)
         places, reliable = calibrate(head.model, detector, str(head_file))
         _begin(out, footage, head_file, task)
-        write_places(out / LANDMARKS_FOLDER / PLACES_FILE, places, reliable)
+        places_file = out / LANDMARKS_FOLDER / PLACES_FILE
+        write_places(places_file, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
-    seen = sorted(timesteps_with_landmarks(found) & set(footage.timesteps))
-    if not seen:
+    if not any(camera.confidence.any() for camera in found.values()):
         raise StgaError(f"{footage.root}: shows no face in any of {len(list(footage.views()))} frames")
     _check_count(found, places)
-    take = {timestep: _at(footage, found, timestep, len(places)) for timestep in seen}
+    neutral = places.on(head.model.v_template, head.model.faces)
+    if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
+        raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
+    detected, found = found, _reliable(found, reliable)
+    everything = {timestep: _at(footage, found, timestep, len(places)) for timestep in footage.timesteps}
+    take = {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
+    if not take:
+        raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
     fit = fit_head(head, places, reliable, take, report)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
     fit = fit_surface(
@@ -123,7 +130,7 @@ def track(
         result.reprojection_px,
     )
     if landmarks is not None:  # what a correction of the capture starts from
-        write_landmarks(out / LANDMARKS_FOLDER, found, places, reliable)
+        write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
     write_capture(out, footage, fit, parameters, meshes, report)
     return result
 
@@ -191,9 +198,20 @@ def _check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) ->
             raise StgaError(f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}")
 
 
+def _reliable(found: Mapping[str, CameraLandmarks], reliable: np.ndarray) -> dict[str, CameraLandmarks]:
+    """The landmarks with confidence 0 for those that are not reliable; cameras without a face have none at all."""
+    return {
+        name: replace(own, confidence=own.confidence * reliable) if own.confidence.any() else own
+        for name, own in found.items()
+    }
+
+
 def _row(camera: CameraLandmarks, timestep: int) -> int | None:
+    """The row of a timestep at which the camera sees a face."""
     rows = np.flatnonzero(camera.timesteps == timestep)
-    return int(rows[0]) if len(rows) and camera.confidence[rows[0]].any() else None
+    if not len(rows) or not is_face(camera.points[rows[0]][camera.confidence[rows[0]] > 0]):
+        return None
+    return int(rows[0])
 
 
 def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int) -> TimestepLandmarks:
@@ -201,8 +219,8 @@ def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, c
     rows = {name: row for name, own in found.items() if (row := _row(own, timestep)) is not None}
     return TimestepLandmarks(
         tuple(cameras[name] for name in rows),
-        np.stack([found[name].points[row] for name, row in rows.items()]),
-        np.stack([found[name].confidence[row] for name, row in rows.items()]),
+        np.array([found[name].points[row] for name, row in rows.items()]).reshape(-1, count, 2),
+        np.array([found[name].confidence[row] for name, row in rows.items()]).reshape(-1, count),
     )
 
 

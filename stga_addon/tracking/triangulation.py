@@ -19,7 +19,7 @@ RANK_GUARD = 1e-9
 class Triangulation:
     """What one timestep's cameras say of N landmarks, in the units of the cameras' world.
 
-    position     (N, 3) the best point; for a single ray, one on that ray
+    position     (N, 3) the best point; for a single ray, one on that ray; without a ray, the center of the cameras
     information  (N, 3, 3) weighted mean over the rays of I − d dᵀ: (x − position)ᵀ information (x − position) is the
                  mean squared distance of x from the rays, up to a constant
     residual     (N,) median distance of the rays from `position`, 0 where there is none
@@ -52,7 +52,8 @@ def triangulate(cameras: Sequence[Camera], points: np.ndarray, confidence: np.nd
     weights = confidence.astype(np.float64)
     position, distance = guess, np.zeros(confidence.shape)
     for _ in range(ITERATIONS):
-        share = weights / np.maximum(weights.sum(0), RANK_GUARD)
+        total = weights.sum(0)
+        share = weights / np.where(total > 0, total, 1.0)
         information = np.einsum("cn,cnij->nij", share, across)
         right = np.einsum("cn,cni->ni", share, offsets)
         guard = RANK_GUARD * np.eye(3)  # a single ray leaves the position along it open
@@ -61,7 +62,8 @@ def triangulate(cameras: Sequence[Camera], points: np.ndarray, confidence: np.nd
         distance = np.linalg.norm(np.cross(to_point, directions), axis=2)
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
         floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
-        weights = confidence / (1 + (distance / np.maximum(scale, floor)) ** 2) ** 2
+        smallest = np.finfo(np.float64).tiny  # a point without a ray may lie in a camera, at distance 0 from its ray
+        weights = confidence / (1 + (distance / np.maximum(np.maximum(scale, floor), smallest)) ** 2) ** 2
     seen = (confidence > 0).sum(0) >= min(2, len(cameras))
     return Triangulation(position, information, _median(distance, confidence > 0), seen)
 

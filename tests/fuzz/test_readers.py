@@ -6,8 +6,12 @@ Catches any other exception, crashes, hangs and excessive memory. Quick in the n
 
 import json
 import pickle
+import shutil
+import struct
+import tempfile
 import time
 import tracemalloc
+import warnings
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,6 +28,7 @@ from flame.conftest import model_of, random_arrays
 from hypothesis import given, seed, settings
 from hypothesis import strategies as st
 from PIL import Image
+from tracking import scenes, test_head_model, test_metashape, test_nerfstudio, test_realitycapture
 from training.test_folder import make_checkpoint, make_run
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -38,6 +43,17 @@ from stga_addon.export.ply import PROPERTIES, read_ply, splat_columns, write_ply
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.tracking.footage.colmap import read_colmap
+from stga_addon.tracking.footage.image_frames import ImageFrames
+from stga_addon.tracking.footage.metashape import read_metashape
+from stga_addon.tracking.footage.model import FootageCamera
+from stga_addon.tracking.footage.nerfstudio import read_nerfstudio
+from stga_addon.tracking.footage.realitycapture import read_realitycapture_csv, read_realitycapture_xmp
+from stga_addon.tracking.footage.shots import Shot
+from stga_addon.tracking.footage.sources import Sources, sequence_names
+from stga_addon.tracking.footage.undistort import undistortion
+from stga_addon.tracking.head_model import read_head_model
+from stga_addon.tracking.landmarks import read_camera, read_places
 from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
 from stga_addon.training.run import metrics_log
@@ -122,7 +138,108 @@ def metrics(path: Path) -> None:
         metrics_log.append_metrics(path.parent, {"iteration": n, **times, "psnr": 20.5, "ssim": 0.9})
 
 
+RIG = scenes.rig(2)
+NAMES = ["cam0.png", "cam1.png"]
+LANDMARK_CAMERA = FootageCamera("cam0", RIG[0], ImageFrames(dict.fromkeys(range(4))))  # type: ignore[arg-type]
+ROW = "{},1,2,3,10,20,30,24.3,0.01,-0.01,0.1,0.02,0,0,0.001,0\n"
+
+
+def colmap_target(file: str) -> Target:
+    """A door of COLMAP's model; the other of its two files is whole."""
+    suffix = Path(file).suffix
+
+    def write(path: Path) -> None:
+        scenes.write_colmap_text(path.parent, RIG, NAMES)
+        if suffix == ".bin":
+            write_colmap_binary(path.parent)
+
+    def read(path: Path) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder) / file)
+            if suffix == ".bin":
+                for text in Path(folder).glob("*.txt"):
+                    text.unlink()
+            shutil.copyfile(path, Path(folder) / file)
+            undistorted(read_colmap(Path(folder)))
+
+    return Target(file, lambda path: (write(path), keep_only(path)), read)
+
+
+def keep_only(path: Path) -> None:
+    """The folder with this file alone."""
+    for other in path.parent.iterdir():
+        if other != path:
+            other.unlink()
+
+
+def write_colmap_binary(folder: Path) -> None:
+    cameras, images = [struct.pack("<Q", 2)], [struct.pack("<Q", 2)]
+    for number, (camera, name) in enumerate(zip(RIG, NAMES, strict=True), start=1):
+        values = camera.fl_x, camera.fl_y, camera.cx, camera.cy, 0.1, 0.0, 0.0, 0.0
+        cameras.append(struct.pack("<IiQQ8d", number, 4, camera.width, camera.height, *values))
+        pose = *scenes.quaternion(camera.world_to_camera[:3, :3]), *camera.world_to_camera[:3, 3]
+        images.append(struct.pack("<I7dI", number, *pose, number) + name.encode() + b"\0" + struct.pack("<Q", 0))
+    (folder / "cameras.bin").write_bytes(b"".join(cameras))
+    (folder / "images.bin").write_bytes(b"".join(images))
+
+
+def undistorted(shots: list[Shot]) -> None:
+    """Look for the images of the shots, and prepare their undistortion, as opening footage does."""
+    sources = Sources(Path("/nowhere"))
+    sequence_names(sources, (shot.label for shot in shots))
+    for shot in shots:
+        undistortion(shot.camera, shot.lens, shot.where)
+
+
+def metashape(path: Path) -> None:
+    test_metashape.write_export(path, RIG, NAMES, intrinsics=test_metashape.INTRINSICS)
+
+
+def nerfstudio(path: Path) -> None:
+    frames = [
+        test_nerfstudio.entry(camera, f"images/{name}", k1=0.1, p2=0.001, mask_path=f"masks/{name}")
+        for camera, name in zip(RIG, NAMES, strict=True)
+    ]
+    path.write_text(json.dumps({"frames": frames, "camera_model": "OPENCV"}))
+
+
+def landmarks(path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0, 40, (4, 6, 2)).astype(np.float32)
+    np.savez(path, timesteps=np.arange(4), points=points, confidence=np.ones((4, 6), np.float32))
+
+
+def places(path: Path) -> None:
+    np.savez(path, face=np.array([0, 3, -1, 2, 1, 3]), barycentric=np.full((6, 3), 1 / 3))
+
+
+def linear_head(path: Path) -> None:
+    skeleton = {"J_regressor": np.full((5, 4), 0.25), "weights": np.eye(4, 5)}
+    bases = {"identity": np.ones((4, 3, 2)), "expression": np.ones((4, 3, 1))}
+    np.savez(path, mean=np.eye(4, 3), faces=np.array([[0, 1, 2]]), **bases, **skeleton)
+
+
+CALIBRATIONS = {
+    **{f"colmap {file}": colmap_target(file) for file in ("cameras.txt", "images.txt", "cameras.bin", "images.bin")},
+    "metashape": Target("cameras.xml", metashape, lambda path: undistorted(read_metashape(path)[0])),
+    "realitycapture csv": Target(
+        "cameras.csv",
+        lambda path: path.write_text(f"{test_realitycapture.HEADER}\n" + "".join(map(ROW.format, NAMES))),
+        lambda path: undistorted(read_realitycapture_csv(path, lambda label: (40, 30))),
+    ),
+    "realitycapture xmp": Target(
+        "a.xmp",
+        lambda path: test_realitycapture.write_xmp(path, RIG[0]),
+        lambda path: undistorted(read_realitycapture_xmp([path], lambda label: (40, 30))[0]),
+    ),
+    "nerfstudio": Target("transforms.json", nerfstudio, lambda path: undistorted(read_nerfstudio(path))),
+}
+
 TARGETS = {
+    **CALIBRATIONS,
+    "landmarks": Target("cam0.npz", landmarks, lambda path: read_camera(path, LANDMARK_CAMERA)),
+    "places": Target("head_model.npz", places, lambda path: read_places(path, 4)),
+    "head model npz": Target("head.npz", linear_head, read_head_model),
+    "head model glb": Target("head.glb", lambda path: path.write_bytes(test_head_model.simple()), read_head_model),
     "avatar": Target("a.npz", lambda path: write_avatar(path, small_avatar()), read_avatar),
     "splats": Target("a.ply", lambda path: write_ply(path, random_splats(1, 4, 1)), read_ply),
     "splats as text": Target("a.ply", ascii_splats, read_ply),
@@ -218,7 +335,8 @@ def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) ->
         begin = time.monotonic()
         tracemalloc.start()
         try:
-            with suppress(StgaError):
+            with suppress(StgaError), warnings.catch_warnings():
+                warnings.simplefilter("error", RuntimeWarning)  # NumPy's, for numbers that are not checked
                 target.read(broken)
             peak = tracemalloc.get_traced_memory()[1]
         finally:

@@ -65,6 +65,10 @@ def test_model_beside_the_images(tmp_path):
         np.testing.assert_allclose(camera.camera.world_to_camera, expected.world_to_camera, atol=1e-9)
 
 
+DIGITS = "9" * 5000
+DEPTH = repr(float(rig(1)[0].world_to_camera[2, 3]))
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
@@ -77,8 +81,15 @@ def test_model_beside_the_images(tmp_path):
         ("images", " 2 right.png", " 2 left.png", r"image 'left.png': two cameras are named left"),
         ("images", " 1 left.png", " 1 gone.png", r"has no image, folder or video of the name 'gone.png'"),
         ("images", " 1 left.png", "", r"images.txt: line 2: expected number, quaternion, translation, camera and name"),
+        ("images", " 1 left.png", f" 1 {DIGITS}.png", r"has no image, folder or video of the name '999"),
+        ("images", " 1 left.png", f" 1 {'a/' * 30000}.png", r"has no image, folder or video of the name 'a/a/"),
+        ("images", " 1 left.png", f" {DIGITS} left.png", r"images.txt: line 2: expected a whole number, not '999"),
+        ("cameras", "1 PINHOLE", f"{DIGITS} PINHOLE", r"cameras.txt: line 2: expected a whole number, not '999"),
+        ("images", DEPTH, "1e308", r"image 'left.png': expected a camera within 1e\+12 units of the origin"),
+        ("cameras", " 20.0", " 1e308", r"image 'left.png': expected a principal point within 1e\+07 pixels"),
     ],
 )
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_damaged_models_are_named(tmp_path, file, old, new, message):
     """Catches a traceback, or a message without file and field."""
     write_colmap_text(tmp_path / "sparse/0", rig(2), ["left.png", "right.png"])

@@ -9,7 +9,15 @@ from flame.conftest import random_arrays, random_frame
 from stga_addon.capture.camera import look_at
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.tracking.fit import Similarity, TimestepLandmarks, fit_head, pose_from_one_camera
+from stga_addon.tracking.fit import (
+    Similarity,
+    TimestepLandmarks,
+    fit_head,
+    observed_landmarks,
+    pose_from_one_camera,
+    rigid_start,
+    triangulated,
+)
 from stga_addon.tracking.head_model import HeadModel, linear_model
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
 from stga_addon.tracking.track import interpolated
@@ -170,6 +178,50 @@ def test_one_camera_follows_a_head(head):
         pixels, _ = fit.to_capture.camera(rig[0]).project(posed_mesh(fit, fit.parameters[timestep]))
         error = np.linalg.norm(pixels - rig[0].project(mesh)[0], axis=1)[head.model.masks["face"]]
         assert np.median(error) < 2  # of a face of 300 pixels
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_landmarks_of_no_weight_stay_unknown(head, count):
+    """Catches 0 / 0 and NaN from landmarks that no camera sees, in a world whose origin is a camera.
+
+    Whether NumPy raises an error for eigenvalues of NaN depends on the processor.
+    """
+    places, rig = places_on(head, 100), cameras(count)
+    meshes = [flame_forward(head.model, np.zeros(head.model.n_identity), frame_at(head, t)) for t in range(3)]
+    take = {t: seen(rig, places.on(mesh, head.model.faces)) for t, mesh in enumerate(meshes)}
+    first = np.linalg.inv(rig[0].world_to_camera)
+    own = tuple(replace(camera, world_to_camera=camera.world_to_camera @ first) for camera in rig)
+    own = (replace(own[0], world_to_camera=np.eye(4)), *own[1:])
+    take = {t: replace(landmarks, cameras=own) for t, landmarks in take.items()}
+    for timestep, landmarks in take.items():
+        landmarks.confidence[:, timestep::7] = 0
+        landmarks.points[:, timestep::7] = 0
+    reliable = np.arange(100) % 9 != 4
+    with np.errstate(all="raise"):
+        found = triangulated(take[0], reliable, places.on(head.model.v_template, head.model.faces), 1.0)
+        fit = fit_head(head, places, reliable, take)
+    for values in (found.position, found.information, found.residual, *fit.parameters.values()):
+        assert np.isfinite(values).all()
+    assert not found.seen[::7].any()
+    for timestep, mesh in enumerate(meshes):
+        pixels, _ = fit.to_capture.camera(own[0]).project(posed_mesh(fit, fit.parameters[timestep]))
+        error = np.linalg.norm(pixels - rig[0].project(mesh)[0], axis=1)[head.model.masks["face"]]
+        assert np.median(error) < 2  # of a face of 300 pixels
+
+
+def test_rays_that_all_miss_give_a_start(head):
+    """Catches weights that vanish, and the mean of no points, where no two cameras agree about any landmark."""
+    rig, rng = cameras(3), np.random.default_rng(0)
+    points = rng.normal(0, 0.05, (30, 3))
+    landmarks = seen(rig, points, noise=100.0)
+    found = triangulate(rig, landmarks.points, landmarks.confidence)
+    world = Similarity(100.0, np.eye(3), np.zeros(3))
+    with np.errstate(all="raise"):
+        observed = observed_landmarks(found, world, np.ones(30, bool))
+        start = rigid_start(points, observed)
+    assert (observed.weight > 0).all()
+    np.testing.assert_allclose(start[-3:], (observed.position - points).mean(0), atol=3)
+    assert np.linalg.norm(start[:3]) <= np.pi + 1e-9
 
 
 def test_a_linear_model_without_joints_moves_rigidly():

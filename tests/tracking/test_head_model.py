@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -40,6 +41,17 @@ def simple(**changes):
         "buffers": [{"byteLength": 72}],
     }
     return glb(document | changes, data)
+
+
+def primitives(count, targets):
+    """A mesh of equal primitives with targets of names of their own."""
+    part = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}] * targets}
+    return {"primitives": [part] * count}
+
+
+def zeros(count, **more):
+    """Accessors of zeros, which need no data."""
+    return [{"componentType": 5126, "count": count, "type": "VEC3", **more}] * 2
 
 
 def blender_head(mesh, faces, names, shapes):
@@ -144,15 +156,29 @@ def test_seams_are_merged_and_kept_where_a_target_parts_them(tmp_path):
         (simple(nodes=[{"children": [0]}]), "no triangle mesh"),
         (simple(nodes=[{"mesh": 9}]), "is not a readable GLB"),
         (simple(nodes=[{"mesh": 0, "scale": [99, 99, 99]}]), "measures"),
-        (simple(accessors=[{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}] * 2), "not a readable GLB"),
+        (simple(accessors=[{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}] * 2), "more than the"),
         (simple(bufferViews=[{"buffer": 0, "byteOffset": 60, "byteLength": 36}] * 2), "beyond the file"),
+        (simple(accessors=[{"componentType": 5126, "count": np.inf, "type": "VEC3"}] * 2), "not a readable GLB"),
+        (simple(nodes=[{"mesh": 0, "scale": [1e308, 1e308, 1e308], "rotation": [1e308] * 4}]), ""),
+        (simple(nodes=[{"mesh": 0, "matrix": [1e308] * 16}]), ""),
+        (simple(nodes=[{"mesh": 0, "translation": [1e308, 0, np.nan]}]), "holds values that are not finite"),
+        (simple(meshes=[primitives(400, 2)], accessors=zeros(100_000)), "its meshes hold .* numbers, more than"),
+        (simple(meshes=[primitives(2, 400)], accessors=zeros(100_000)), "its meshes hold .* numbers, more than"),
+        (simple(nodes=[{"mesh": 0}] * 999, scenes=[{"nodes": [*range(999)]}], accessors=zeros(9_000)), "more than"),
+        (simple(accessors=zeros(3_000_000)), "its meshes hold .* numbers, more than"),
+        (simple(accessors=zeros(100_000, bufferView=0), bufferViews=[{"byteStride": 0}]), "not a readable GLB"),
     ],
 )
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_wrong_glbs_are_named(tmp_path, data, expected):
     """Catches a traceback, a hang or gigabytes of memory for a file that is damaged or hostile."""
     (tmp_path / "a.glb").write_bytes(data)
+    tracemalloc.start()
     with pytest.raises(StgaError, match=f"a.glb: .*{expected}"):
         read_head_model(tmp_path / "a.glb")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6
 
 
 def test_a_small_glb_is_read(tmp_path):

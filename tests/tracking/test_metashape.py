@@ -117,9 +117,13 @@ def test_labels_are_image_names_or_paths(tmp_path):
         ('component_id="0" label="b"', 'component_id="1" label="b"', r"its cameras are in 2 components"),
         ('label="b"', 'label="a"', r"camera 'a': two cameras are named a"),
         ("<transform>", "<transform>-", r"camera 'a': expected a rotation without scale|its axes are mirrored"),
+        ("<f>50.0</f>", "<f>0</f>", r"sensor '0': f: expected a focal length of 1 to 1e7 pixels, not 0"),
+        ("<p1>", "<k1>1e308</k1><p1>", r"camera 'a': the distortion of its lens folds the image"),
+        ("<p1>", "<b1>1e308</b1><p1>", r"camera 'a': the distortion of its lens folds the image"),
         ("<transform>", "<transform>1 ", r"camera 'a': transform: expected 16 finite numbers, not"),
     ],
 )
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_damaged_exports_are_named(tmp_path, old, new, message):
     """Catches a traceback, or a message without file and field."""
     write_export(tmp_path / "cameras.xml", rig(2), ["a", "b"], intrinsics={"f": 50.0, "p1": 0.0})

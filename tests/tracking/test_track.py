@@ -230,23 +230,104 @@ def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
     )
 
 
+def full(value, dtype=None):
+    return lambda array: np.full(array.shape, value, dtype)
+
+
+def with_first(value, dtype=float):
+    """The array with another first element."""
+    return lambda array: np.concatenate([[value], array.ravel()[1:].astype(dtype)]).reshape(array.shape)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("file", "field", "change", "expected"),
     [
-        ({"points": np.zeros((5, 3))}, "points has shape"),
-        ({"timesteps": np.array([0, 1, 2, 3, 99])}, "timesteps: expected timesteps of camera cam0"),
-        ({"confidence": np.full((5, LANDMARKS), -1.0)}, "confidence"),
-        ({"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))}, "different numbers of landmarks"),
+        ("cam0", "points", lambda _: np.zeros((5, 3)), "points has shape (5, 3), expected (5, any, 2)"),
+        ("cam0", "points", full("x"), "points holds <U1, expected floating-point numbers"),
+        ("cam0", "points", full(1e300), "points: expected pixels of at most 100000"),
+        ("cam0", "points", full(np.longdouble("1e4000")), "points: expected finite pixels where confidence is not 0"),
+        ("cam0", "points", with_first(np.nan), "points: expected finite pixels where confidence is not 0"),
+        ("cam0", "points", lambda _: np.zeros((5, 7, 2)), "confidence has shape (5, 120), expected (5, 7)"),
+        ("cam0", "timesteps", lambda _: np.array([0, 1, 2, 3, 99]), "timesteps: expected timesteps of camera cam0"),
+        ("cam0", "timesteps", lambda _: np.array([0, 1, 2, 3, 3]), "timesteps: expected timesteps of camera cam0"),
+        ("cam0", "confidence", full(-1.0), "confidence: expected numbers from 0 to 1e+06"),
+        ("cam0", "confidence", full(1e308), "confidence: expected numbers from 0 to 1e+06"),
+        ("cam0", "confidence", full(np.nan), "confidence: expected numbers from 0 to 1e+06"),
+        ("cam0", "confidence", full("high"), "confidence holds <U4, expected numbers"),
+        ("head_model", "face", full(-1), "face: uses 0 landmarks, expected at least 4"),
+        ("head_model", "face", full("x"), "face: expected triangles from 0 to"),
+        ("head_model", "face", full(10**6), "face: expected triangles from 0 to"),
+        ("head_model", "barycentric", full("x"), "barycentric holds <U1, expected numbers"),
+        ("head_model", "barycentric", lambda _: np.ones((7, 3)), "barycentric has shape (7, 3), expected (120, 3)"),
+        ("head_model", "barycentric", full(np.nan), "barycentric: expected finite numbers"),
+        ("head_model", "barycentric", with_first(np.inf), "barycentric: expected finite numbers"),
+        ("head_model", "barycentric", full(-1.0), "barycentric: expected numbers from 0 up"),
+        ("head_model", "barycentric", full(0.5), "barycentric: expected rows that add up to 1"),
     ],
 )
-def test_wrong_landmark_files_are_named(recorded, capsys, change, expected):
-    """Catches landmark files that are read as something else."""
-    folder, _ = recorded
-    write_npz(folder / "points/cam0.npz", dict(np.load(folder / "points/cam0.npz")) | change)
-    assert command(folder) == 2
+def test_wrong_landmark_files_are_named(recorded, capsys, file, field, change, expected):
+    """Catches landmark files that are read as something else, end in a traceback, or are refused for a wrong reason."""
+    path = recorded[0] / f"points/{file}.npz"
+    arrays = dict(np.load(path))
+    if file == "head_model":
+        arrays["face"][0] = -1  # an infinite number is refused in a row that is not used, too
+    write_npz(path, arrays | {field: change(arrays[field])})
+    assert command(recorded[0]) == 2
     message = capsys.readouterr().err
-    assert expected in message
-    assert "points" in message
+    assert f"{path}: {expected}" in message
+    assert message.count("\n") == 1
+
+
+def test_landmark_files_of_different_detectors(recorded, capsys):
+    """Catches landmarks of one camera taken for those of another number."""
+    path = recorded[0] / "points/cam0.npz"
+    write_npz(path, dict(np.load(path)) | {"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))})
+    assert command(recorded[0]) == 2
+    assert "points: the files have different numbers of landmarks" in capsys.readouterr().err
+
+
+def unreliable_alone(points, confidence, camera):
+    confidence[3, 7:] = 0
+
+
+def in_one_point(points, confidence, camera):
+    points[3] = 5.0
+
+
+def in_one_camera_each(points, confidence, camera):
+    confidence[3] = np.arange(LANDMARKS) % 5 == camera
+
+
+def only_two(points, confidence, camera):
+    confidence[3, 20:] = np.arange(LANDMARKS - 20) < 2
+    confidence[3, :20] = 0
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("spoil", [unreliable_alone, in_one_point, in_one_camera_each, only_two])
+def test_timesteps_that_determine_no_pose_are_interpolated(recorded, capsys, spoil):
+    """Catches NaN, or a head at the camera, from landmarks of one timestep that are too few to tell where it is."""
+    folder, _ = recorded
+    places = dict(np.load(folder / "points/head_model.npz"))
+    places["face"][:7] = -1
+    write_npz(folder / "points/head_model.npz", places)
+    for number in range(5):
+        arrays = dict(np.load(folder / f"points/cam{number}.npz"))
+        spoil(arrays["points"], arrays["confidence"], number)
+        write_npz(folder / f"points/cam{number}.npz", arrays)
+    assert command(folder) == 0
+    assert read_json(folder / "out/tracking.json")["interpolated"] == [2, 3]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_places_in_one_point_are_no_face(recorded, capsys):
+    """Catches a division by the extent of landmarks that all lie on one triangle."""
+    path = recorded[0] / "points/head_model.npz"
+    arrays = {"face": np.zeros(LANDMARKS, int), "barycentric": np.full((LANDMARKS, 3), 1 / 3)}
+    write_npz(path, arrays)
+    assert command(recorded[0]) == 2
+    assert f"{path}: face: its landmarks lie in one point of the head model" in capsys.readouterr().err
 
 
 def test_a_resolution_that_changes_is_named(recorded, capsys):
@@ -269,6 +350,11 @@ def test_footage_without_a_face(recorded, capsys):
     assert "shows no face in any of 25 frames" in capsys.readouterr().err
 
 
+def linear(**changes):
+    """The arrays of a linear head model of four vertices, and what is changed of them."""
+    return {"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))} | changes
+
+
 @pytest.mark.parametrize(
     ("arrays", "expected"),
     [
@@ -276,13 +362,31 @@ def test_footage_without_a_face(recorded, capsys):
         ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 9]]), "identity": np.ones((4, 3, 1))}, "names vertices"),
         ({"mean": np.eye(4, 3) * 30, "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))}, "meters"),
         ({"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((5, 3, 1))}, "identity has shape"),
+        (linear(mean=np.full((4, 3), "x")), "mean holds <U1, expected numbers"),
+        (linear(mean=np.eye(4, 3) + 1e200), "mean reaches 1e[+]200, expected at most 100000"),
+        (linear(mean=np.eye(4, 3) * 1e308 * [1, -1, 1]), "mean reaches 1e[+]308"),
+        (linear(faces=np.full((1, 3), "x")), "faces is <U1"),
+        (linear(identity=np.full((4, 3, 1), 1e300)), "identity reaches 1e[+]300, expected at most 100"),
+        (linear(identity=np.full((4, 3, 1), np.longdouble("1e4000"))), "identity holds values that are not finite"),
+        (linear(expression=np.full((4, 3, 1), np.nan)), "expression holds values that are not finite"),
+        (linear(J_regressor=np.full((5, 4), 1e300), weights=np.eye(4, 5)), "J_regressor reaches 1e[+]300"),
+        (linear(J_regressor=np.ones((5, 4)) / 4, weights=np.full((4, 5), -1e300)), "weights reaches 1e[+]300"),
     ],
 )
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_wrong_head_models_are_named(tmp_path, arrays, expected):
     """Catches head models whose mistake shows up as a strange fit minutes later."""
     write_npz(tmp_path / "model.npz", arrays)
     with pytest.raises(StgaError, match=f"model.npz: .*{expected}"):
         read_head_model(tmp_path / "model.npz")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_flame_model_of_huge_numbers(tmp_path, head):
+    """Catches an overflow in the fit for numbers that no head has."""
+    write_flame(replace(head.model, shapedirs=1e300 * head.model.shapedirs), tmp_path / "head.npz")
+    with pytest.raises(StgaError, match=r"head.npz: shapedirs reaches .*, expected at most 100"):
+        read_head_model(tmp_path / "head.npz")
 
 
 class Counting:
@@ -314,6 +418,46 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
     camera = footage.cameras[0]
     np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+
+
+class Remembering:
+    """A detector that knows each image by its brightness."""
+
+    def __init__(self, landmarks):
+        self.landmarks = landmarks
+
+    def detect(self, image):
+        return [self.landmarks[int(image[0, 0, 0])]]
+
+
+def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
+    """Catches landmarks in another precision on disk than in memory: the same track, with other numbers."""
+    number = iter(range(25))
+    meshes = record(tmp_path, head, lambda mesh, camera: np.full((SIZE, SIZE, 3), next(number), np.uint8))
+    places, rng = places_on(head, LANDMARKS), np.random.default_rng(0)
+    exact = [camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes]
+    detector = Remembering([points + rng.normal(0, 0.1, points.shape) for points in exact])
+    monkeypatch.setattr("stga_addon.tracking.track.make_detector", lambda task: detector)
+    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
+
+    def cancel(stage, done, total):
+        if done == 13:
+            raise KeyboardInterrupt
+
+    footage = open_footage(tmp_path / "footage")
+    track(footage, tmp_path / "head.npz", tmp_path / "unbroken")
+    with pytest.raises(KeyboardInterrupt):
+        track(footage, tmp_path / "head.npz", tmp_path / "resumed", report=cancel)
+    track(footage, tmp_path / "head.npz", tmp_path / "resumed")
+    written = [path for path in sorted((tmp_path / "unbroken").rglob("*")) if path.is_file()]
+    assert len(written) > 30
+    for path in written:
+        other = tmp_path / "resumed" / path.relative_to(tmp_path / "unbroken")
+        if path.suffix == ".npz":  # an archive holds the time at which it was written
+            for name, array in np.load(path).items():
+                np.testing.assert_array_equal(np.load(other)[name], array, f"{path}: {name}")
+        else:
+            assert path.read_bytes() == other.read_bytes(), path
 
 
 def test_cameras_have_landmark_files_of_their_own(tmp_path):

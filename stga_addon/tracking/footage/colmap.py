@@ -1,5 +1,6 @@
 """Cameras of a COLMAP model: `cameras` and `images`, as .bin or .txt."""
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -120,7 +121,8 @@ def _shot(image: _Image, cameras: dict[int, _Intrinsics], cameras_file: Path, im
     intrinsics = cameras[image.camera]
     focal, center, lens = _split(intrinsics, f"{cameras_file}: camera {image.camera}")
     rotation = _rotation(np.array(image.quaternion), where)
-    position = -rotation.T @ np.array(image.translation)
+    with np.errstate(over="ignore", invalid="ignore"):  # `pinhole` refuses what is not finite
+        position = -rotation.T @ np.array(image.translation)
     return Shot(image.name, pinhole(intrinsics.size, focal, center, rotation, position, where), lens, where)
 
 
@@ -139,7 +141,7 @@ def _split(intrinsics: _Intrinsics, where: str) -> tuple[tuple[float, float], tu
 
 def _rotation(quaternion: np.ndarray, where: str) -> np.ndarray:
     """World to camera, from a quaternion wxyz."""
-    length = np.linalg.norm(quaternion)
+    length = math.hypot(*quaternion)
     if not 0.5 < length < 2:
         raise StgaError(f"{where}: expected a rotation quaternion of length 1, not {length:g}")
     return to_matrices(quaternion)

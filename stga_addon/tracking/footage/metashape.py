@@ -5,6 +5,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ...capture.camera import MAX_FOCAL_PIXELS
 from ...errors import StgaError, shorten
 from .lens import Lens
 from .reading import numbers, pinhole, read_xml
@@ -62,6 +63,8 @@ def _calibration(sensor: Element, where: str) -> tuple[tuple[float, float], floa
     if value("p3") or value("p4"):
         raise StgaError(f"{where}: p3 and p4 are not supported; optimize the cameras without them and export again")
     focal = value("f")
+    if not 1 <= focal <= MAX_FOCAL_PIXELS:
+        raise StgaError(f"{where}: f: expected a focal length of 1 to 1e7 pixels, not {focal:g}")
     lens = Lens(
         PROJECTIONS[kind],
         radial=(value("k1"), value("k2"), value("k3"), value("k4")),

@@ -1,11 +1,10 @@
 """Cameras of nerfstudio, instant-ngp and VHAP: `transforms.json`, with lens distortion."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...capture.transforms import Frame, frame_rate, inside, read_transforms
+from ...capture.transforms import MAX_NUMBER, Frame, frame_rate, inside, read_transforms
 from ...errors import StgaError, shorten
 from ...files import read_json
 from .lens import Lens
@@ -75,6 +74,6 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
 
 def _coefficient(values: dict[str, Any], key: str, where: str) -> float:
     value = values.get(key) or 0.0
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_NUMBER:
         raise StgaError(f"{where}.{key}: expected a finite number, not {shorten(value)}")
     return float(value)

@@ -13,6 +13,8 @@ from ...files import file_size
 
 MAX_FILE_BYTES = 1 << 30
 ROTATION_TOLERANCE = 1e-3  # some exports round rotations to a few decimals
+MAX_POSITION = 1e12
+"""Of a camera, in the calibration's unit: millimeters from the center of the earth are 1e10."""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -70,15 +72,19 @@ def pinhole(
 
     size, focal, center: (x, y) in pixels, the center from the top-left corner. rotation (3, 3) from world to OpenCV's
     camera axes; position (3,) of the camera in the calibration's world, whose unit is free.
-    Raises StgaError, beginning with `where`, for a size, focal length or rotation that no camera has.
+    Raises StgaError, beginning with `where`, for a size, focal length, principal point or pose that no camera has.
     """
     if not is_image_size(*size):
         raise StgaError(f"{where}: expected an image size in pixels, not {size[0]:g} x {size[1]:g}")
     if not all(1 <= value <= MAX_FOCAL_PIXELS for value in focal):
         raise StgaError(f"{where}: expected a focal length of 1 to 1e7 pixels, not {focal[0]:g}, {focal[1]:g}")
-    if not np.isfinite([*center, *rotation.ravel(), *position]).all():
-        raise StgaError(f"{where}: expected a pose and principal point of finite numbers")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+    if not all(abs(value) <= MAX_FOCAL_PIXELS for value in center):  # also where it is not a number
+        found = f"{center[0]:g}, {center[1]:g}"
+        raise StgaError(f"{where}: expected a principal point within {MAX_FOCAL_PIXELS:g} pixels, not {found}")
+    if not (np.abs(position) <= MAX_POSITION).all():
+        raise StgaError(f"{where}: expected a camera within {MAX_POSITION:g} units of the origin")
+    bounded = np.abs(rotation).max() <= 1 + ROTATION_TOLERANCE
+    if not bounded or np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise StgaError(f"{where}: expected a rotation without scale or shear")
     if np.linalg.det(rotation) < 0:
         raise StgaError(f"{where}: its axes are mirrored; expected a right-handed rotation")

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +36,14 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
     Columns: name, x, y, alt, heading, pitch, roll (degrees), f (35 mm film), and, where they are there, px, py (shares
     of the longer side), k1 to k4, t1, t2. Raises StgaError that names file and line.
     """
-    lines = csv.reader(io.StringIO(read_text(path)))
-    columns = _columns(next(lines, []))
+    rows = _csv_rows(path)
+    columns = _columns(next(rows, (1, []))[1])
     missing = [name for name in REQUIRED_COLUMNS if name not in columns]
     if missing:
         raise StgaError(f"{path}: has no column {', '.join(missing)}; expected internal and external camera parameters")
     shots = []
-    for line in filter(None, lines):
-        where = f"{path}: line {lines.line_num}"
+    for number, line in rows:
+        where = f"{path}: line {number}"
         if len(line) < len(columns):
             raise StgaError(f"{where}: expected {len(columns)} columns, not {len(line)}")
         row = dict(zip(columns, line, strict=False))
@@ -67,6 +67,17 @@ def read_realitycapture_xmp(paths: Iterable[Path], image_size: ImageSize) -> tup
         else:
             without_pose.append(path.stem)
     return shots, without_pose
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number from 1 and values of each line that is not empty."""
+    lines = csv.reader(io.StringIO(read_text(path)))
+    try:
+        for line in lines:
+            if line:
+                yield lines.line_num, line
+    except csv.Error as error:
+        raise StgaError(f"{path}: line {lines.line_num}: is not readable CSV ({error})") from error
 
 
 def _columns(names: Iterable[str]) -> list[str]:

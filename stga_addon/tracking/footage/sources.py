@@ -112,7 +112,9 @@ def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
 
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Sort key by which 2 comes before 10."""
-    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
+    parts = re.split(r"([0-9]+)", name)  # every second one a number, of any length
+    digits = [part.lstrip("0") for part in parts]
+    return [(len(digits[n]), digits[n]) if n % 2 else (0, parts[n]) for n in range(len(parts))]
 
 
 def frame_number(path: Path) -> int | None:
@@ -142,6 +144,6 @@ def _parent(label: str) -> str:
 
 
 def _tails(label: str) -> list[str]:
-    """The label without suffix, then without its first folder, its second, …"""
-    parts = [part for part in _stem(label).split("/") if part not in ("", ".")]
+    """The label without suffix, then without its first folder, its second, …; none deeper than footage is searched."""
+    parts = [part for part in _stem(label).split("/") if part not in ("", ".")][-MAX_DEPTH - 1 :]
     return ["/".join(parts[start:]) for start in range(len(parts))]

@@ -70,8 +70,9 @@ def _is_inside(recorded: Camera, lens: Lens, zoom: float) -> bool:
     pixels = np.concatenate([edge, edge[:, ::-1]]) * [width, height]
     focal, center = [recorded.fl_x, recorded.fl_y], [recorded.cx, recorded.cy]
     rays = along[:, None, None] * ((pixels - center) / focal / zoom)
-    distorted = lens.distort(rays)
-    found = distorted[-1] * focal + center
+    with np.errstate(all="ignore"):  # coefficients of no lens overflow, which is checked below
+        distorted = lens.distort(rays)
+        found = distorted[-1] * focal + center
     if not np.isfinite(distorted).all() or (found < 0).any() or (found > [width, height]).any():
         return False
     return bool((np.diff(np.linalg.norm(distorted, axis=-1), axis=0) > 0).all())
