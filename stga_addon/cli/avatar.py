@@ -19,7 +19,7 @@ from ..requests.open_head import OpenHead
 from .arguments import usable_path
 from .carry_out import carry_out
 from .track import add_footage, tracking_request
-from .train import add_training, training_request
+from .train import add_training, training_request, training_settings
 
 NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a report and a .blend file"
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
@@ -37,6 +37,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    training_settings(options)  # refuses now what would be refused after the tracking
     begin = perf_counter()
     capture, run_folder = options.out / CAPTURE, options.out / RUN
     _track(options, capture)
