@@ -20,7 +20,7 @@ from ..training.run.folder import AVATAR, has_run
 from .arguments import usable_path
 from .carry_out import carry_out
 from .track import add_footage, tracking_request
-from .train import add_training, training_request
+from .train import add_training, training_request, training_settings
 
 NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a report and a .blend file"
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
@@ -36,6 +36,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
+    training_settings(options)  # refuses now what would be refused after the tracking
     begin = perf_counter()
     capture, run_folder = options.out / CAPTURE, options.out / RUN
     _track(options, capture)

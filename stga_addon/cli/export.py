@@ -75,7 +75,17 @@ def _check_options(options: Namespace) -> None:
         if getattr(options, option) not in (None, False) and options.format not in formats:
             flag = f"--{option.replace('_', '-')}"
             raise StgaError(f"{flag} cannot be combined with --format {options.format}, only with {', '.join(formats)}")
+    if options.head is None:
+        _check_capture_options(options)
     check_suffix(options.out, options.format)
+
+
+def _check_capture_options(options: Namespace) -> None:
+    """Refuse a capture that would not be used, and a FLAME model without a capture that it could be of."""
+    if options.capture is not None and FORMATS[options.format].source == "frame" and options.timestep is None:
+        raise StgaError(f"--capture: has no effect with --format {options.format} without --timestep")
+    if options.flame is not None and options.capture is None and not options.avatar.is_dir():
+        raise StgaError("--flame: has no effect without --capture")
 
 
 def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> Meshes:

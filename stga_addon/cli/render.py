@@ -83,6 +83,8 @@ def run(options: Namespace) -> None:
     if options.video is not None and options.video.suffix.lower() != ".mp4":
         raise StgaError(f"{options.video}: a video's name ends in .mp4")
     _check_film_options(options)
+    if options.head is None:
+        _check_mesh_options(options)
     if options.cameras is None and options.video is None and options.turntable is None:
         raise StgaError("--out needs --cameras, which says what to render, or --turntable")
     principal_point = options.principal_point or _principal_point(options.source)
@@ -112,6 +114,21 @@ def _check_film_options(options: Namespace) -> None:
             setattr(options, name, default)
         elif not has_effect:
             raise StgaError(f"--{name}: has no effect without {needed}")
+
+
+def _check_mesh_options(options: Namespace) -> None:
+    """Raise StgaError for an option on meshes or cameras that would have no effect."""
+    if options.motion is not None and options.capture is not None:
+        raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
+    if options.principal_point is not None and options.cameras is None:
+        raise StgaError("--principal-point: has no effect without --cameras")
+    for name in ("capture", "flame"):
+        if _is_ply(options.source) and options.motion is None and getattr(options, name) is not None:
+            raise StgaError(f"--{name}: has no effect on {options.source}, whose splats follow no mesh")
+
+
+def _is_ply(source: Path) -> bool:
+    return source.suffix.lower() == ".ply"
 
 
 @dataclass(frozen=True)
@@ -194,16 +211,14 @@ def _chosen_camera(options: Namespace, views: Sequence[View]) -> View:
 
 def _principal_point(source: Path) -> str:
     """The convention that the avatar was trained with; a PLY has none."""
-    return (
-        DEFAULT_PRINCIPAL_POINT if source.suffix.lower() == ".ply" else read_avatar(avatar_path(source)).principal_point
-    )
+    return DEFAULT_PRINCIPAL_POINT if _is_ply(source) else read_avatar(avatar_path(source)).principal_point
 
 
 def _subject(options: Namespace) -> _Subject:
     """An avatar with its capture, or a plain world-space PLY."""
     from ..render.render import render, render_avatar
 
-    if options.source.suffix.lower() == ".ply":
+    if _is_ply(options.source):
         splats = read_ply(options.source)
         return _Subject(
             lambda view: render(splats, view.camera, options.background, composer=options.composer),
@@ -234,7 +249,7 @@ def _reenacted(options: Namespace) -> _Subject:
     from ..render.render import render_avatar
     from ..training.run.folder import read_run
 
-    if options.source.suffix.lower() == ".ply":
+    if _is_ply(options.source):
         raise StgaError(f"{options.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
     flame = options.flame or (read_run(options.source).flame if options.source.is_dir() else None)
     avatar = read_avatar(avatar_path(options.source))

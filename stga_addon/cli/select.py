@@ -2,6 +2,7 @@
 
 from argparse import ArgumentParser, Namespace
 
+from ..errors import StgaError
 from ..files import write_npz
 from ..requests.open_head import OpenHead
 from ..selection import SelectionOptions, select_capture
@@ -23,7 +24,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--zero-pose",
         choices=("head", "all"),
-        default="head",
         help="FLAME motion that does not count: the head's (default), or the jaw's and the eyes' as well",
     )
     parser.add_argument("--out", type=usable_path, metavar="NPZ", help="also write timestep -> triangles")
@@ -31,7 +31,10 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 def run(options: Namespace) -> None:
     capture = open_named_capture(options)
-    selection = select_capture(capture, SelectionOptions(threshold=options.threshold, zero_pose=options.zero_pose))
+    if options.zero_pose is not None and capture.flame is None:
+        raise StgaError(f"--zero-pose: has no effect on {options.capture}, which was not tracked with FLAME")
+    chosen = SelectionOptions(threshold=options.threshold, zero_pose=options.zero_pose or SelectionOptions.zero_pose)
+    selection = select_capture(capture, chosen)
     print(f"threshold {1000 * options.threshold:g} mm, {len(capture.faces)} triangles")
     for timestep, faces in selection.items():
         regions = [name for name, members in capture.regions.items() if members.any() and faces[members].all()]

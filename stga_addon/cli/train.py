@@ -70,7 +70,7 @@ def training_request(options: Namespace) -> Train | Resume:
         )  # fmt: skip
     if has_run(options.out):
         raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
-    settings = _settings(options)
+    settings = training_settings(options)
     untimed = options.preset is not None and options.budget is None and options.iterations is None
     return Train(
         options.out,
@@ -84,7 +84,9 @@ def training_request(options: Namespace) -> Train | Resume:
     )
 
 
-def _settings(options: Namespace) -> TrainingSettings:
+def training_settings(options: Namespace) -> TrainingSettings:
+    """The settings of a new run. Raises StgaError for options that do not go together, or would have no effect."""
+    _refuse_overwritten(options)
     changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": bool(options.stop_when_flat)}
     if options.iterations is not None:
         changes["iterations"] = options.iterations
@@ -102,6 +104,18 @@ def _settings(options: Namespace) -> TrainingSettings:
     if settings.strategy != "selective":
         raise StgaError("--threshold: has no effect without --strategy selective, or --schedule paper")
     return replace(settings, selection=replace(settings.selection, threshold=options.threshold))
+
+
+def _refuse_overwritten(options: Namespace) -> None:
+    """Raise StgaError for a choice of settings that another choice replaces."""
+    paper, other_method = options.schedule == "paper", options.strategy == "gaussian-avatars"
+    for option, is_replaced, by in (
+        ("--schedule paper", paper and other_method, "--strategy gaussian-avatars"),
+        ("--preset", options.preset and paper, "--schedule paper"),
+        ("--preset", options.preset and other_method, "--strategy gaussian-avatars"),
+    ):
+        if is_replaced:
+            raise StgaError(f"{option}: cannot be combined with {by}, which has settings of its own")
 
 
 def _refuse_changes(options: Namespace, run: Run) -> None:

@@ -19,7 +19,7 @@ def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
     if not folder.is_dir():
         raise StgaError(f"{folder}: is not a folder; expected that of a run")
     report(Progress(stage="Evaluating"))
-    capture = with_refined_tracking(open_run(folder, flame=request.flame).capture, folder)
+    capture = with_refined_tracking(open_run(folder, request.capture, request.flame).capture, folder)
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")

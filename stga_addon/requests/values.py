@@ -214,11 +214,15 @@ class Analyze:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a run's avatar on all views of a split; the figures are also written into the run's folder."""
+    """Measure a run's avatar on all views of a split; the figures are also written into the run's folder.
+
+    flame, capture  the FLAME model file and the folder of the run's capture, if they have moved
+    """
 
     run: Path
     split: str = setting("val", choices=("train", "val", "test"))
     flame: Path | None = None
+    capture: Path | None = None
 
 
 Request = Train | Resume | Refine | Extend | SelectForTake | Track | SolveAgain | RenderRecording | Analyze | Evaluate

@@ -339,6 +339,20 @@ def test_eval_with_a_model_that_has_moved(tmp_path: Path, capsys: pytest.Capture
     assert main(["eval", str(out), "--flame", str(elsewhere)]) == 0
 
 
+def test_eval_with_a_capture_that_has_moved(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on another capture."""
+    run, moved = Path(shutil.copytree(trained, tmp_path / "run")), Path(shutil.copytree(root, tmp_path / "moved"))
+    factory.edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
+    assert "gone" in refused(capsys, "eval", run)
+    assert main(["eval", str(run), "--capture", str(moved)]) == 0
+    assert main(["eval", str(trained)]) == 0
+    assert json.loads((run / "quality_val.json").read_text()) == json.loads((trained / "quality_val.json").read_text())
+    factory.edit(moved / "transforms_val.json", lambda document: document["frames"][0].update(fl_x=300.0))
+    assert "other camera poses or intrinsics" in refused(capsys, "eval", run, "--capture", moved)
+
+
 def test_export_gaussian_avatars(tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a pair without motion, and one that is made up for a mesh capture, which has none."""
     root, model = factory.write_flame_capture(tmp_path / "flame")
@@ -458,7 +472,8 @@ def test_unreadable_avatars(trained: Path, root: Path, tmp_path: Path, capsys: p
     (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     cameras = root / "transforms_val.json"
     for name in ("half.npz", "foreign.npz", "none.npz", "mesh.ply", "none.ply"):
-        arguments = ["--capture", root, "--cameras", cameras, "--out", tmp_path / "o"]
+        driver = [] if name.endswith(".ply") else ["--capture", root]
+        arguments = [*driver, "--cameras", cameras, "--out", tmp_path / "o"]
         assert f"{name}: " in refused(capsys, "render", tmp_path / name, *arguments)
     assert not (tmp_path / "o").exists()
 

@@ -81,7 +81,7 @@ REQUESTS: tuple[Request, ...] = (
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
-    Evaluate(Path("r"), "test"),
+    Evaluate(Path("r"), "test", capture=HEAD),
 )
 RESULTS: tuple[Result, ...] = (
     Written(Path("a.npz"), ("PSNR 30 dB", "avatar: a.npz")),

@@ -25,6 +25,8 @@ INVERSE_STEPS = 15
 CHUNK = 1 << 16
 """Pixels converted at a time, which bounds the memory."""
 MAIN_THREAD_TIMEOUT_S = 10.0
+MAX_MEASURED = 8
+"""Inverses that are kept, of a megabyte each."""
 
 _measured: dict[tuple[Any, ...], "InverseView"] = {}
 
@@ -113,7 +115,10 @@ def measure(scene: Any) -> None:
     the render engine has the GPU, it must not be: the main thread then waits for the GPU to draw.
     """
     key = _settings(scene)
-    if key in _measured or not needs_inverse(scene):
+    if key in _measured:
+        _keep(key, _measured[key])
+        return
+    if not needs_inverse(scene):
         return
     measured = threading.Event()
 
@@ -121,8 +126,7 @@ def measure(scene: Any) -> None:
         try:
             axis = np.append(0, 2 ** (np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure))
             shown = _shown(scene, axis)
-            _measured.clear()  # an animated exposure would pile them up
-            _measured[key] = InverseView(axis, shown)
+            _keep(key, InverseView(axis, shown))
         finally:
             measured.set()
 
@@ -131,6 +135,14 @@ def measure(scene: Any) -> None:
     else:
         bpy.app.timers.register(work)
         measured.wait(MAIN_THREAD_TIMEOUT_S)
+
+
+def _keep(key: tuple[Any, ...], view: InverseView) -> None:
+    """Keep the newest few: an animated exposure would pile them up."""
+    global _measured
+    kept = {other: value for other, value in _measured.items() if other != key}
+    # Another thread may be reading the dictionary, which is therefore replaced as a whole.
+    _measured = dict([*kept.items(), (key, view)][-MAX_MEASURED:])
 
 
 def _settings(scene: Any) -> tuple[Any, ...]:
