@@ -23,11 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stga_addon.training.run.request import Extension, Refinement
 
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
+from stga_addon.perform.training import Prepared, prepare
+from stga_addon.progress import ignore
+from stga_addon.requests.values import Extend, Refine
 from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
 from stga_addon.training.evaluate.match_exposure import known_exposure
@@ -38,10 +40,7 @@ from stga_addon.training.optimize.strategies import ExtendStrategy, GlobalStrate
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.continuation import (
     DENSITY_INTERVAL,
-    Prepared,
     continued_evaluation_views,
-    prepare_extension,
-    prepare_refinement,
     starting_state,
 )
 from stga_addon.training.run.folder import Run, read_run
@@ -102,17 +101,19 @@ def main() -> None:
 
 def comparisons(options: argparse.Namespace, seed: int) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
     """What is compared with one seed: "extend" and, where a region is given, "refine"; the arms of each."""
-    parent = options.parent
+    parent, unused = options.parent, options.folder / "unused"
     if parent is None:
         old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
         parent = trained(old, options, seed)
-        wanted = Extension(parent, (new,), seconds=options.seconds, seed=seed)
-        prepared = prepare_extension(wanted, "cpu")
+        extend = Extend(unused, parent, (new,), seconds=options.seconds, seed=seed, device="cpu")
+        prepared = prepare(extend, ignore, print)
         prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
         yield "extend", prepared, extend_arms(prepared, seed)
     if options.refine:
-        refinement = Refinement(parent, options.refine, seconds=options.seconds, seed=seed)
-        prepared = prepare_refinement(refinement, "cpu", options.flame)
+        refine = Refine(
+            options.folder / "unused", parent, options.refine, seconds=options.seconds, seed=seed, device="cpu"
+        )
+        prepared = prepare(refine, ignore, print)
         yield "refine", prepared, refine_arms(prepared, seed)
 
 
