@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .splats import SH_C0, Splats, no_strain_color, unit_quaternions
+from ..flame.quaternions import from_matrices, multiply, normalized
+from .splats import SH_C0, Splats, no_strain_color
 from .strain import StrainBasis, gram_strain
 
 CONVENTIONS = ("stga", "gaussian_avatars")
@@ -33,7 +34,7 @@ class FaceFrames:
     @cached_property
     def quaternion(self) -> np.ndarray:
         """(F, 4) wxyz of the same rotation; needed for baking, not for rendering."""
-        return quaternion_from_matrix(self.rotation)
+        return from_matrices(self.rotation)
 
 
 NO_STRAIN = np.zeros((1, 0), np.float32)
@@ -143,7 +144,7 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
     """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
-    rotation = quaternion_multiply(frames.quaternion[face], unit_quaternions(splats.rotation))
+    rotation = multiply(frames.quaternion[face], normalized(splats.rotation))
     log_scale = splats.log_scale + np.log(np.maximum(scale, MIN_DIVISOR))[:, None]
     return replace(
         splats,
@@ -170,7 +171,7 @@ def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
     scale = np.maximum(frames.scale[face], MIN_DIVISOR)
     xyz = np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face]) / scale[:, None]
     inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
-    rotation = quaternion_multiply(inverse, unit_quaternions(world.rotation))
+    rotation = multiply(inverse, normalized(world.rotation))
     return replace(
         world,
         xyz=xyz.astype(np.float32),
@@ -178,47 +179,6 @@ def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
         log_scale=(world.log_scale - np.log(scale)[:, None]).astype(np.float32),
         face=np.asarray(face, np.int32),
     )
-
-
-def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product of wxyz quaternions (..., 4): rotate by b, then by a."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    product = np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
-    return np.asarray(product)
-
-
-def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
-    """Unit quaternion wxyz (..., 4), w ≥ 0, of proper rotation matrices (..., 3, 3).
-
-    Builds the outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations by 180°
-    (trace −1) lose no precision.
-    """
-    m = np.asarray(matrix, np.float64)
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    outer = np.empty((*m.shape[:-2], 4, 4))
-    outer[..., 0, 0] = 1 + xx + yy + zz
-    outer[..., 1, 1] = 1 + xx - yy - zz
-    outer[..., 2, 2] = 1 - xx + yy - zz
-    outer[..., 3, 3] = 1 - xx - yy + zz
-    outer[..., 0, 1] = outer[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
-    outer[..., 0, 2] = outer[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
-    outer[..., 0, 3] = outer[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]
-    outer[..., 1, 2] = outer[..., 2, 1] = m[..., 0, 1] + m[..., 1, 0]
-    outer[..., 1, 3] = outer[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
-    outer[..., 2, 3] = outer[..., 3, 2] = m[..., 1, 2] + m[..., 2, 1]
-    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    row = np.where(row[..., :1] < 0, -row, row)
-    return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
 
 
 # Vectors of triangles are (3, F) here: arithmetic on whole rows takes a fraction of the time of that on columns.

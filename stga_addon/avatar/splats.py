@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from ..flame.quaternions import normalized
+
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0 coefficient."""
@@ -48,7 +50,7 @@ class Splats:
 
     def unit_rotations(self) -> np.ndarray:
         """(N, 4) float32 wxyz, normalized."""
-        return np.asarray(unit_quaternions(self.rotation), np.float32)
+        return np.asarray(normalized(self.rotation), np.float32)
 
     def scales(self) -> np.ndarray:
         """(N, 3) float32: standard deviations, linear."""
@@ -66,11 +68,3 @@ class Splats:
 def no_strain_color(count: int) -> np.ndarray:
     """An empty `strain_color` for `count` splats."""
     return np.zeros((count, 0, 3), np.float32)
-
-
-def unit_quaternions(q: np.ndarray) -> np.ndarray:
-    """(..., 4) normalized in float64; a zero quaternion counts as the identity."""
-    q = np.asarray(q, np.float64)
-    largest = np.max(np.abs(q), axis=-1, keepdims=True)
-    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions (w, x, y, z), and their interpolation."""
+"""Rotations as unit quaternions (w, x, y, z): conversions, products and interpolation."""
 
 import numpy as np
 
@@ -49,3 +49,52 @@ def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarra
     whole = np.sinc(angle / np.pi)
     near, far = ((s * np.sinc(s * angle / np.pi)) / whole for s in (1 - share, share))
     return np.asarray(near * first + far * second)
+
+
+def normalized(q: np.ndarray) -> np.ndarray:
+    """(..., 4) normalized in float64; a zero quaternion counts as the identity."""
+    q = np.asarray(q, np.float64)
+    largest = np.max(np.abs(q), axis=-1, keepdims=True)
+    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product of wxyz quaternions (..., 4): rotate by b, then by a."""
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
+    product = np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+    return np.asarray(product)
+
+
+def from_matrices(matrices: np.ndarray) -> np.ndarray:
+    """Unit quaternion wxyz (..., 4), w ≥ 0, of proper rotation matrices (..., 3, 3).
+
+    Builds the outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations by 180°
+    (trace −1) lose no precision.
+    """
+    m = np.asarray(matrices, np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    outer = np.empty((*m.shape[:-2], 4, 4))
+    outer[..., 0, 0] = 1 + xx + yy + zz
+    outer[..., 1, 1] = 1 + xx - yy - zz
+    outer[..., 2, 2] = 1 - xx + yy - zz
+    outer[..., 3, 3] = 1 - xx - yy + zz
+    outer[..., 0, 1] = outer[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
+    outer[..., 0, 2] = outer[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
+    outer[..., 0, 3] = outer[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]
+    outer[..., 1, 2] = outer[..., 2, 1] = m[..., 0, 1] + m[..., 1, 0]
+    outer[..., 1, 3] = outer[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
+    outer[..., 2, 3] = outer[..., 3, 2] = m[..., 1, 2] + m[..., 2, 1]
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    row = np.where(row[..., :1] < 0, -row, row)
+    return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))

@@ -7,12 +7,13 @@ from flame.conftest import model_of, random_arrays, random_frame
 from raster.test_kernels import embed
 from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.embedding import CONVENTIONS, face_frames, quaternion_from_matrix, to_local, to_world
+from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_local, to_world
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.camera import Camera
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
 from stga_addon.flame.forward_torch import flame_forward as torch_forward
+from stga_addon.flame.quaternions import from_matrices
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
@@ -135,7 +136,7 @@ def test_quaternions_near_half_turns_from_float32_matrices() -> None:
     angles = np.pi + rng.normal(size=500) * 10.0 ** rng.uniform(-9, -3, 500)
     matrices = Rotation.from_rotvec(axes * angles[:, None]).as_matrix().astype(np.float32)
     assert (np.trace(matrices, axis1=1, axis2=2) < -1).any()
-    quaternions = quaternion_from_matrix(matrices)
+    quaternions = from_matrices(matrices)
     expected = Rotation.from_matrix(matrices.astype(float))
     error = (Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]) * expected.inv()).magnitude()
     assert error.max() < 1e-6

@@ -7,8 +7,9 @@ import numpy as np
 
 from ...avatar.embedding import face_frames
 from ...avatar.file import Avatar
-from ...avatar.splats import Splats, unit_quaternions
+from ...avatar.splats import Splats
 from ...capture.camera import Camera
+from ...flame.quaternions import normalized
 from ..playback import Playback
 from .container import FixedPoint, pack
 from .rig import WebRig
@@ -116,7 +117,7 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
 def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in order, of the unit
     quaternion whose largest part is positive. A zero quaternion counts as the identity."""
-    q = unit_quaternions(rotation)
+    q = normalized(rotation)
     largest = np.abs(q).argmax(1)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
     others = np.array([[k for k in range(4) if k != left_out] for left_out in range(4)])[largest]

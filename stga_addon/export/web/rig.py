@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...avatar.embedding import quaternion_from_matrix
 from ...flame.forward import joint_positions
 from ...flame.model import JOINTS
-from ...flame.quaternions import to_axis_angle
+from ...flame.quaternions import from_matrices, to_axis_angle
 from ...flame.sequence import FlameSequence, with_identity
 
 BAKE_TOLERANCE_M = 5e-6
@@ -89,7 +88,7 @@ def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
         parents=(-1,),
         weights=np.ones((vertices, 1)),
         coefficients=coefficients,
-        pose=to_axis_angle(quaternion_from_matrix(rotations))[:, None],
+        pose=to_axis_angle(from_matrices(rotations))[:, None],
         translation=translations,
         expressions=0,
     )

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import FaceFrames
-from ...avatar.splats import Splats, unit_quaternions
+from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...errors import StgaError
+from ...flame.quaternions import normalized
 from ..layers import SceneLayer, random_percentage
 
 NEAR_M = 0.01
@@ -84,7 +85,7 @@ def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
 def _axes(splats: Splats, layer: int) -> np.ndarray:
     """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a random value in
     0…100 for the display's percentage, and the layer's index."""
-    w, x, y, z = unit_quaternions(splats.rotation).T
+    w, x, y, z = normalized(splats.rotation).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -40,7 +40,7 @@ def step(
         by_column = np.full(arrays[0].shape[1], rates[name], np.float32)
         if name == "sh":
             by_column[3:] = rates["sh_rest"]
-        parameters.append(AdamTables(*arrays, by_column))
+        parameters.append(AdamTables._make((*arrays, by_column)))
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
     adam_rows(rows, state.steps.numpy(), tuple(parameters), options)
 

@@ -31,6 +31,6 @@ def step(
     gradient = smoothed[:, :, None] * total[:, None, :]
     rates = np.full(gradient[0].size, RATE_SHARE * position_rate, np.float32)
     arrays = (state.value, gradient, state.first, state.second, state.average)
-    tables = AdamTables(*(array.reshape(count, -1) for array in arrays), rates)
+    tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rates])
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
     adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)
