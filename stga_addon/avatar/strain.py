@@ -39,6 +39,16 @@ class IndexLists(NamedTuple):
         return np.diff(self.indptr)
 
 
+class RankedLists(NamedTuple):
+    """The same lists by rank, so that numpy adds along them without a loop over lists.
+
+    order  lists by falling length; ranks: for each rank, the index at that place of every list that is long enough
+    """
+
+    order: np.ndarray
+    ranks: tuple[np.ndarray, ...]
+
+
 @dataclass(frozen=True)
 class StrainBasis:
     """Precomputed terms of a neutral mesh with V vertices and F triangles.
@@ -51,6 +61,7 @@ class StrainBasis:
     vertex_weight (V,): a third of one over how many these are.
     range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
     neighbors: `edge_neighbors`.
+    ranked_vertex_faces, ranked_neighbors: both by rank.
     neighbor_weight (F,): one over how many neighbors a triangle has and itself.
     """
 
@@ -64,6 +75,8 @@ class StrainBasis:
     range: np.ndarray
     neighbors: IndexLists
     neighbor_weight: np.ndarray
+    ranked_vertex_faces: RankedLists
+    ranked_neighbors: RankedLists
 
 
 def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None) -> StrainBasis:
@@ -103,6 +116,8 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
         range=_by_component(strain_range),
         neighbors=neighbors,
         neighbor_weight=(1 / (1 + neighbors.counts)).astype(np.float32),
+        ranked_vertex_faces=_ranked(vertex_faces),
+        ranked_neighbors=_ranked(neighbors),
     )
 
 
@@ -112,11 +127,23 @@ def _index_lists(owners: np.ndarray, indices: np.ndarray, count: int) -> IndexLi
     return IndexLists(indptr, indices[np.argsort(owners, kind="stable")])
 
 
-def _add_listed(lists: IndexLists, rows: np.ndarray, total: np.ndarray) -> None:
-    """Add to the columns of total (·, L) the columns of rows (·, N) that each of L lists names, in the list's order."""
-    owner = np.repeat(np.arange(len(lists.counts)), lists.counts)
+def _ranked(lists: IndexLists) -> RankedLists:
+    order = np.argsort(-lists.counts, kind="stable")
+    starts, counts = lists.indptr[:-1][order], lists.counts[order]
+    lengths = (int((counts > rank).sum()) for rank in range(int(counts.max(initial=0))))
+    return RankedLists(order, tuple(lists.indices[starts[:n] + rank] for rank, n in enumerate(lengths)))
+
+
+def _add_listed(lists: RankedLists, rows: np.ndarray, total: np.ndarray) -> None:
+    """Add to the columns of total (·, L) the columns of rows (·, N) that each of L lists names, in the list's order.
+
+    Not by `np.add.at`, which numpy before 1.25, as in Blender 4.2, carries out element by element.
+    """
     for row, sums in zip(rows, total, strict=True):
-        np.add.at(sums, owner, np.take(row, lists.indices))
+        ordered = np.take(sums, lists.order)
+        for indices in lists.ranks:
+            ordered[: len(indices)] += np.take(row, indices)
+        sums[lists.order] = ordered
 
 
 def edge_neighbors(faces: np.ndarray) -> IndexLists:
@@ -148,7 +175,7 @@ def smoothed_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
     smoothed = np.ascontiguousarray((strain - rest_strain(basis.range)).T, np.float32)
     for _ in range(AVERAGING_ROUNDS):
         total = smoothed.copy()
-        _add_listed(basis.neighbors, smoothed, total)
+        _add_listed(basis.ranked_neighbors, smoothed, total)
         smoothed = total * basis.neighbor_weight
     return np.ascontiguousarray(smoothed.T)
 
@@ -201,7 +228,7 @@ def gram_strain(basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.nd
     change = np.asarray(np.stack([d11, d12, d22]) - basis.gram.T, np.float32)
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
     at_vertex = np.zeros((len(tensor), len(basis.vertex_weight)), np.float32)
-    _add_listed(basis.vertex_faces, tensor, at_vertex)
+    _add_listed(basis.ranked_vertex_faces, tensor, at_vertex)
     p0, p1, p2 = np.take(at_vertex * basis.vertex_weight, basis.corners, axis=1).transpose(1, 0, 2)
     strain = np.einsum("df,kdf->kf", p0 + p1 + p2, basis.to_plane.transpose(1, 2, 0))
     lowest, highest = basis.range.transpose(1, 2, 0)
