@@ -8,7 +8,8 @@ import bpy
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.folder import remove_request, request_folder
 from ..stga_addon.requests.results import Written
-from ..stga_addon.requests.values import Extend, Refine, Resume, Train
+from ..stga_addon.requests.values import Extend, Refine, Resume
+from ..stga_addon.requests.values import Train as TrainRequest
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effects.decisions import parse_choices
@@ -151,7 +152,7 @@ class Train(bpy.types.Operator):
         request = self._request(head_of(context))
         return start_training(self, context, request, python_of(self, context))
 
-    def _request(self, head: Any) -> Train | Resume:
+    def _request(self, head: Any) -> TrainRequest | Resume:
         run = file_path(self.directory, "run folder").resolve()
         capture, flame, principal_point = capture_source(head)
         if not capture.is_dir():
@@ -164,7 +165,7 @@ class Train(bpy.types.Operator):
         preset = None if self.preset == "none" else self.preset
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
         settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
-        return Train(
+        return TrainRequest(
             run, capture, settings, flame, principal_point, device=device_of(self), selection=training_selection(head)
         )
 
@@ -175,7 +176,7 @@ def device_of(operator: Any) -> str:
 
 
 def start_training(
-    operator: Any, context: Any, request: Train | Resume | Refine | Extend, python: str | None
+    operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend, python: str | None
 ) -> set[str]:
     """Start a worker for a training and monitor it, or wait for it; python: as of `python_of`. Raises StgaError."""
     folder, run = request_folder(request.run), request.run
