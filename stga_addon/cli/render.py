@@ -100,7 +100,8 @@ def run(options: Namespace) -> None:
 
 
 def _check_film_options(options: Namespace) -> None:
-    """Fill in the defaults of a video and a turntable. Raises StgaError for an option that would have no effect."""
+    """Fill in the defaults of a video and a turntable. Raises StgaError for an option that would have no effect,
+    and for more images than a turntable may have."""
     turns = options.turntable is not None
     films = turns or options.video is not None
     for name, has_effect, needed, default in (
@@ -112,6 +113,10 @@ def _check_film_options(options: Namespace) -> None:
             setattr(options, name, default)
         elif not has_effect:
             raise StgaError(f"--{name}: has no effect without {needed}")
+    images = options.seconds * options.fps
+    if turns and images > MAX_TURNTABLE_IMAGES:
+        asked = f"--seconds {options.seconds:g}: is {images:.0f} images at {options.fps:g} frames per second"
+        raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
 
 
 def _check_mesh_options(options: Namespace) -> None:
@@ -172,7 +177,7 @@ def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
     timesteps: Sequence[int] = subject.timesteps or (0,)
     path = [start] * len(timesteps)
     if options.turntable is not None:
-        count = max(len(timesteps), round(min(options.seconds * options.fps, MAX_TURNTABLE_IMAGES)), 1)
+        count = max(len(timesteps), round(options.seconds * options.fps), 1)
         timesteps = to_and_fro(timesteps, count)
         cameras = _turntable(options.turntable, start, views, subject.center(), count)
         path = [replace(start, camera=camera) for camera in cameras]
