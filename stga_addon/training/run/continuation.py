@@ -58,7 +58,8 @@ def select_for_takes(
     """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old takes; and the
     views among those compared that do not look like the head at all, as where images of two cameras were exchanged.
 
-    starts: first timesteps of the new takes, ascending. A triangle looks different where the avatar's residual in a few views of the new takes is larger than in a few of
+    starts: first timesteps of the new takes, ascending.
+    A triangle looks different where the avatar's residual in a few views of the new takes is larger than in a few of
     the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
     """
     views = capture.views["train"]
