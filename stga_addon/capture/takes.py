@@ -10,10 +10,14 @@ import numpy as np
 
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
-from .model import Capture, View
+from .model import Capture, View, evenly_spread
 
 MAX_NEUTRAL_DIFFERENCE_M = 1e-4
 """Largest distance between the neutral meshes of two takes of one head: trackers write rounded shape coefficients."""
+MAX_SCALE_FACTOR = 5.0
+"""Largest ratio of the head's sizes in two takes; another unit than the meter makes it 10 or more."""
+COMPARED = 8
+"""Views, and timesteps, of a take whose scale is looked at."""
 
 RATE_TOLERANCE = 0.01
 """Relative difference up to which the frame rates of takes are the same."""
@@ -84,6 +88,41 @@ def require_same_head(first: Capture, other: Capture) -> None:
 def _common_rate(rates: Sequence[float]) -> float | None:
     """None where there are none, or differences of more than 1 %."""
     return rates[0] if rates and max(rates) <= (1 + RATE_TOLERANCE) * min(rates) else None
+
+
+def require_same_scale(first: Capture, other: Capture) -> None:
+    """Raise StgaError where `other`, a take of the same head, has meshes or cameras in another unit of length.
+
+    Its tracked meshes must be as large as the neutral one, and the head must take a similar share of the images.
+    """
+    posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
+    factor = float(np.median(posed)) / _extent(other.neutral)
+    if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
+        raise StgaError(
+            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral mesh; expected meters"
+        )
+    factor = _share_of_images(first) / _share_of_images(other)
+    if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
+        apart = f"{factor:.3g} times smaller" if factor > 1 else f"{1 / factor:.3g} times larger"
+        raise StgaError(
+            f"{other.root}: its head appears {apart} in the images than in those of {first.root}; "
+            "expected cameras and tracking in meters"
+        )
+
+
+def _extent(vertices: np.ndarray) -> float:
+    """Meters along the longest axis."""
+    return float(np.ptp(vertices, axis=0).max())
+
+
+def _share_of_images(take: Capture) -> float:
+    """Size of the head in pixels by that of the image, the median of some training views."""
+    shares = []
+    for view in evenly_spread(take.views["train"], COMPARED):
+        camera, mesh = view.camera, take.mesh(view.timestep)
+        distance = float(np.linalg.norm(mesh.mean(0) - camera.position))
+        shares.append(camera.fl_x * _extent(mesh) / (distance * max(camera.width, camera.height)))
+    return float(np.median(shares))
 
 
 def _first_free_index(take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]) -> int:

@@ -55,7 +55,7 @@ def required_capture(capture: Capture | None) -> Capture:
 def timesteps_between(capture: Capture, span: tuple[int, int] | None) -> tuple[int, ...]:
     """The capture's timesteps from the first to the last of `span`, inclusive; None: all of them.
 
-    Raises StgaError where there is none.
+    Says so where the span reaches beyond them. Raises StgaError where there is none.
     """
     if span is None:
         return tuple(capture.timesteps)
@@ -63,6 +63,9 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None) -> tuple[i
     timesteps = tuple(timestep for timestep in capture.timesteps if first <= timestep <= last)
     if not timesteps:
         raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
+    own = min(capture.timesteps), max(capture.timesteps)
+    if first < own[0] or last > own[1]:
+        print(f"--frames {first}:{last}: the capture has timesteps {own[0]} to {own[1]}")
     return timesteps
 
 

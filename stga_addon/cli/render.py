@@ -102,7 +102,8 @@ def run(options: Namespace) -> None:
 
 
 def _check_film_options(options: Namespace) -> None:
-    """Fill in the defaults of a video and a turntable. Raises StgaError for an option that would have no effect."""
+    """Fill in the defaults of a video and a turntable. Raises StgaError for an option that would have no effect,
+    and for more images than a turntable may have."""
     turns = options.turntable is not None
     films = turns or options.video is not None
     for name, has_effect, needed, default in (
@@ -114,6 +115,8 @@ def _check_film_options(options: Namespace) -> None:
             setattr(options, name, default)
         elif not has_effect:
             raise StgaError(f"--{name}: has no effect without {needed}")
+    if turns:
+        _turntable_images(options, options.fps or DEFAULT_FPS)  # before anything is read
 
 
 def _check_mesh_options(options: Namespace) -> None:
@@ -176,7 +179,7 @@ def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
     timesteps: Sequence[int] = subject.timesteps or (0,)
     path = [start] * len(timesteps)
     if options.turntable is not None:
-        count = max(len(timesteps), round(min(options.seconds * subject.fps, MAX_TURNTABLE_IMAGES)), 1)
+        count = max(len(timesteps), _turntable_images(options, subject.fps), 1)
         timesteps = to_and_fro(timesteps, count)
         cameras = _turntable(options.turntable, start, views, subject.center(), count)
         path = [replace(start, camera=camera) for camera in cameras]
@@ -185,6 +188,15 @@ def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
     with writer as write:
         for view in tqdm(path, desc="Rendering", unit="image"):
             write(to_uint8(subject.image(view)))
+
+
+def _turntable_images(options: Namespace, fps: float) -> int:
+    """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
+    images = options.seconds * fps
+    if images > MAX_TURNTABLE_IMAGES:
+        asked = f"--seconds {options.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
+        raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
+    return round(images)
 
 
 def _turntable(turn: float, start: View, views: Sequence[View], center: np.ndarray, count: int) -> list[Camera]:

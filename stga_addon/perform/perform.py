@@ -23,6 +23,7 @@ from ..requests.values import (
     Track,
     Train,
 )
+from ..schema import validate
 from ..worker.status import StatusWriter, status_writer
 
 PREVIEW_INTERVAL_S = 4.0
@@ -49,6 +50,7 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the report stopped work that
     has nothing to keep; KeyboardInterrupt after Ctrl-C.
     """
+    validate(request)
     module, function = WORK[type(request)]
     work: Callable[[Request, Report, Say], Result] = getattr(import_module(module, __package__), function)
     return work(request, report, say)

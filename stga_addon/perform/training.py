@@ -11,7 +11,7 @@ from ..avatar.file import read_avatar, write_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..capture.region import SELECTED_WEIGHT, find_region
-from ..capture.takes import first_timesteps, join_takes, require_same_head
+from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
 from ..format import format_duration
 from ..progress import Progress, Report, Say
@@ -31,6 +31,8 @@ from ..training.run.open_run import OpenedRun, device_of, open_run
 from ..training.run.progress import Progress as TrainingProgress
 from ..training.run.replay import is_faced
 
+MAX_NAMED_VIEWS = 6
+"""Views that a warning names."""
 Selection = dict[int, np.ndarray]
 """timestep -> (F,) bool: triangles to train."""
 
@@ -99,7 +101,7 @@ def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selecte
     """timestep of the take -> (F,) bool: what extending the run by it would train. Raises StgaError."""
     report(Progress(stage="Comparing the avatar with the images"))
     wanted = Extend(request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame)
-    _, _, selection, run = _joined_takes(wanted)
+    _, _, selection, run = _joined_takes(wanted, say)
     start = run.takes[-1].start
     return Selected({timestep - start: faces for timestep, faces in selection.items()})
 
@@ -192,7 +194,7 @@ def _region(request: Refine, capture: Capture) -> np.ndarray:
 def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     device = _continuing_device(request, say)
     report(Progress(stage="Comparing the avatar with the images"))
-    opened, capture, selection, run = _joined_takes(request)
+    opened, capture, selection, run = _joined_takes(request, say)
     needed = np.any(list(selection.values()), axis=0)
     face = read_avatar(request.parent / AVATAR).splats.face
     growth = request.growth * float(needed[face].mean())
@@ -208,14 +210,18 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     return Prepared(request.run, run, capture, selection, resumes=False, falls_back=False)
 
 
-def _joined_takes(request: Extend) -> tuple[OpenedRun, Capture, Selection, Run]:
+def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Selection, Run]:
     """The run, its capture joined with the new takes, what these train, and the run with them.
 
     Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
-    in the run already.
+    in the run already. Says which views do not show the head as the avatar does.
     """
     opened = open_run(request.parent, flame=request.flame)
     run, new = opened.run, [_open_new_take(opened, path) for path in request.captures]
+    roots = [take.root for take in new]
+    twice = next((root for root in roots if roots.count(root) > 1), None)
+    if twice is not None:
+        raise StgaError(f"{twice}: is given twice; expected each take once")
     everything = [*opened.takes, *new]
     capture = with_refined_tracking(join_takes(everything), request.parent)
     starts = first_timesteps(everything)[len(opened.takes) :]
@@ -224,7 +230,10 @@ def _joined_takes(request: Extend) -> tuple[OpenedRun, Capture, Selection, Run]:
         for take, start in zip(new, starts, strict=True)
     ]
     continuation = _continuation(request.parent, (starts[0], max(capture.timesteps)))
-    selection = select_for_takes(continuation, capture, run.settings)
+    selection, unlike = select_for_takes(continuation, capture, run.settings, starts)
+    if unlike:
+        names = ", ".join(view.name for view in unlike[:MAX_NAMED_VIEWS])
+        say(f"warning: {names}: does not look like the head from this camera; are images swapped?")
     run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
     return opened, capture, selection, run
 
@@ -235,6 +244,7 @@ def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
     require_same_head(opened.capture, take)
     if not take.views.get("train"):
         raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
+    require_same_scale(opened.takes[0], take)
     if any(take.root == old.root for old in opened.takes):
         raise StgaError(f"{take.root}: is a take of this run already")
     return take

@@ -217,6 +217,8 @@ def remove_environment(folder: Path) -> int:
 
     Raises StgaError while a process runs in one of them, or where one cannot be removed.
     """
+    if not (environments(folder) or (folder / CHOICE_FILE).exists() or status_folder(folder).exists()):
+        return 0  # and nothing is written where nothing was
     with status_writer(status_folder(folder)) as writer:
         writer.update(0.0, "Removing")
         venvs = environments(folder)

@@ -1,5 +1,6 @@
 """Running a CLI command on the open .blend file: its head as a folder that another Python reads."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..schema import from_json, setting, to_json
 
@@ -70,10 +71,10 @@ def read_head(folder: Path) -> OpenHead:
         raise StgaError(f"{path}: is not the head of an open .blend file ({error})") from error
 
     def selection() -> dict[int, np.ndarray] | None:
-        return _by_timestep(folder / SELECTION) if (folder / SELECTION).exists() else None
+        return _read_selection(folder / SELECTION) if (folder / SELECTION).exists() else None
 
     def played(capture: Capture) -> Capture:
-        meshes = _by_timestep(folder / PLAYED)
+        meshes = _read_meshes(folder / PLAYED, capture.neutral.shape)
         return replace(capture, timesteps=tuple(sorted(meshes)), mesh=meshes.__getitem__, flame=None)
 
     return OpenHead(
@@ -81,5 +82,31 @@ def read_head(folder: Path) -> OpenHead:
     )  # fmt: skip
 
 
-def _by_timestep(path: Path) -> dict[int, np.ndarray]:
-    return {int(name): array for name, array in read_npz(path).items()}
+def _read_selection(path: Path) -> dict[int, np.ndarray]:
+    """frame -> (F,) bool. Raises StgaError for arrays of another form."""
+    selection = _by_frame(path)
+    for frame, faces in selection.items():
+        if faces.dtype != bool or faces.ndim != 1:
+            raise StgaError(f"{path}: frame {frame}: expected bool (F,), got {faces.dtype} {faces.shape}")
+    return selection
+
+
+def _read_meshes(path: Path, shape: tuple[int, ...]) -> dict[int, np.ndarray]:
+    """frame -> vertices of a shape (V, 3), one frame at least. Raises StgaError for arrays of another form."""
+    meshes = _by_frame(path)
+    if not meshes:
+        raise StgaError(f"{path}: holds no frame")
+    for frame, mesh in meshes.items():
+        if mesh.dtype.kind != "f" or mesh.shape != shape or not np.isfinite(mesh).all():
+            found = f"{mesh.dtype} {mesh.shape}"
+            raise StgaError(f"{path}: frame {frame}: expected finite numbers {shape}, got {found}")
+    return meshes
+
+
+def _by_frame(path: Path) -> dict[int, np.ndarray]:
+    """Arrays by the frames that their names are. Raises StgaError for a name that is none."""
+    arrays = read_npz(path)
+    for name in arrays:
+        if not re.fullmatch(r"-?\d{1,9}", name, re.ASCII):
+            raise StgaError(f"{path}: expected frames as names, got {shorten(name)}")
+    return {int(name): array for name, array in arrays.items()}

@@ -10,7 +10,7 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..render.device import EXPECTED_DEVICE, is_device
 from ..schema import MAX_COUNT, setting
-from ..training.settings import TrainingSettings
+from ..training.settings import MAX_GROWTH, TrainingSettings
 
 PAINTED_REGION = "region.npz"
 """File of painted triangle weights in the folder of a refinement's request."""
@@ -85,7 +85,7 @@ class Refine:
     region: str = ""
     weights: np.ndarray | None = None
     frames: tuple[int, int] | None = setting(None, 0)
-    growth: float = setting(0.0, 0)
+    growth: float = setting(0.0, 0, MAX_GROWTH)
     seconds: float | None = setting(None, above=0)
     iterations: int | None = setting(None, 1, MAX_COUNT)
     seed: int = setting(0, 0)
@@ -113,7 +113,7 @@ class Extend:
     run: Path
     parent: Path
     captures: tuple[Path, ...]
-    growth: float = setting(0.0, 0)
+    growth: float = setting(0.0, 0, MAX_GROWTH)
     seconds: float | None = setting(None, above=0)
     iterations: int | None = setting(None, 1, MAX_COUNT)
     seed: int = setting(0, 0)

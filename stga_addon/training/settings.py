@@ -21,6 +21,7 @@ GLOBAL_UNITS = ("iteration", "frame")
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
 MAX_RATE = 1e3
+MAX_GROWTH = 100
 EXPOSURE_SIZE = 7
 """Numbers of a row of `TrainingSettings.exposure`."""
 
@@ -127,7 +128,7 @@ class TrainingSettings:
     hull_points: bool = True
     density_interval: int = setting(200, 0, MAX_COUNT)
     density_span: tuple[float, float] = setting((0.1, 0.6), 0)
-    growth: float = setting(0.25, 0, 100)
+    growth: float = setting(0.25, 0, MAX_GROWTH)
     background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
     random_background: bool = True
     scale: float = setting(1.0, 0.05, 1)

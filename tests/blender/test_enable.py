@@ -10,9 +10,10 @@ import pytest
 pytest.importorskip("bpy")
 
 ROOT = Path(__file__).resolve().parents[2]
-MAX_ENABLE_S = 0.3
+MAX_ENABLE_WORK = 30
+"""Processor time of enabling, by that of compiling a module of the standard library in the same process."""
 ENABLE = """
-import importlib.util, json, sys, time
+import importlib.util, inspect, json, sys, time
 import bpy, numpy, bpy_extras.io_utils
 
 class Refuse:
@@ -31,23 +32,32 @@ module.register()
 took = time.process_time() - begin
 panels = [name for name in dir(bpy.types) if name.startswith("STGA_PT_")]
 module.unregister()
-print("RESULT " + json.dumps([took, panels]))
+source = inspect.getsource(inspect)
+
+def compiling():
+    begin = time.process_time()
+    compile(source, "inspect", "exec")
+    return time.process_time() - begin
+
+reference = min(compiling() for _ in range(5))
+print("RESULT " + json.dumps([took / reference, panels]))
 """
 
 
 def test_enabling_needs_numpy_alone_and_no_time() -> None:
     """Catches an import that a plain Blender cannot satisfy, and one that makes every start of Blender slower.
 
-    The time is that of the processor: a busy machine does not count. The first start compiles bytecode.
+    The time is that of the processor, and compared with other work of the same process: a busy or slow machine does
+    not count. The first start compiles bytecode.
     """
-    times = []
+    shares = []
     for _ in range(3):
         command = [sys.executable, "-c", ENABLE, str(ROOT)]
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "tests")
         line = next((line for line in done.stdout.splitlines() if line.startswith("RESULT ")), None)
         assert line is not None, done.stderr[-2000:]
-        took, panels = json.loads(line.removeprefix("RESULT "))
+        share, panels = json.loads(line.removeprefix("RESULT "))
         assert "STGA_PT_show" in panels
-        times.append(took)
-    print(f"enabling took {min(times):.3f} s of processor time")
-    assert min(times) < MAX_ENABLE_S
+        shares.append(share)
+    print(f"enabling took as long as {min(shares):.1f} compilations")
+    assert min(shares) < MAX_ENABLE_WORK

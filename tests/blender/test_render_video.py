@@ -1,6 +1,7 @@
 """Render Video in background mode: the worker's images are those of the render engine."""
 
 import errno
+import gc
 import os
 import sys
 import tempfile
@@ -153,3 +154,52 @@ def test_finished_jobs_end_with_the_add_on(shown, temporary):
     operator._videos[bpy.context.scene.session_uid] = operator.Video(shown / "turn.mp4", folder, 1, 1)
     operator.unregister()
     assert not folder.exists()
+
+
+def around_each_image(monkeypatch, before, after) -> None:
+    """Call `before()` and `after()` around the recording of every image."""
+    recording = sys.modules["stga_checkout.operators.render_video"]._Recording
+    record_next = recording.record_next
+
+    def record(self) -> bool:
+        before()
+        more = record_next(self)
+        after()
+        return more
+
+    monkeypatch.setattr(recording, "record_next", record)
+
+
+def test_a_recording_follows_its_own_scene(shown, monkeypatch):
+    """Catches images of another scene, which the window shows meanwhile, and another scene's frame that is moved."""
+    render = {"path": "scene", "format": "png"}
+    assert bpy.ops.stga.render_video(filepath=str(shown / "alone"), **render) == {"FINISHED"}
+    own, other = bpy.context.scene, bpy.data.scenes.new("other")
+    other.frame_set(7)
+    window = bpy.context.window_manager.windows[0]
+    around_each_image(monkeypatch, lambda: setattr(window, "scene", other), lambda: None)
+    try:
+        assert bpy.ops.stga.render_video(filepath=str(shown / "images"), **render) == {"FINISHED"}
+        assert window.scene == other
+        assert (own.frame_current, other.frame_current) == (1, 7)
+    finally:
+        window.scene = own
+    for frame in ("0001.png", "0002.png", "0003.png"):
+        alone, beside = (np.asarray(Image.open(shown / name / frame)) for name in ("alone", "images"))
+        assert alone[..., 3].any()
+        assert np.array_equal(alone, beside)
+
+
+def test_a_recording_keeps_the_last_frame_only(shown, monkeypatch):
+    """Catches splats of every recorded frame that stay in memory until the video is rendered."""
+    posed, counts = sys.modules["stga_checkout.operators.render_video"].PosedSplats, []
+
+    def count() -> None:
+        gc.collect()
+        counts.append(sum(isinstance(each, posed) for each in gc.get_objects()))
+
+    around_each_image(monkeypatch, lambda: None, count)
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 12
+    assert bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png") == {"FINISHED"}
+    assert len(counts) == 12
+    assert 0 < max(counts) <= 2

@@ -283,6 +283,14 @@ def test_export_a_sequence(trained: Path, tmp_path: Path) -> None:
     assert low[0] > low[1] > low[2]
 
 
+def test_export_says_which_frames_there_are(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a range that is cut to the capture's without a word, and talk of one that is not."""
+    sequence = ["export", str(trained), "--format", "ply-sequence"]
+    for span, said in (("1:999999", True), ("0:3", False), ("0:2", False)):
+        assert main([*sequence, "--frames", span, "--out", str(tmp_path / span[2:])]) == 0
+        assert (f"--frames {span}: the capture has timesteps 0 to 3\n" in capsys.readouterr().out) == said
+
+
 def test_export_a_range_as_usd(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches timesteps outside the range, and a size that is not told before."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
@@ -688,6 +696,8 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
     assert main(["eval", str(tmp_path / "anna_3")]) == 0
     assert "--region: is missing" in refused(capsys, "refine", runs)
+    message = refused(capsys, "refine", tmp_path / "none", "--region", "mouth", "--growth", "1e9")
+    assert message == "stga: setting growth: expected a finite number from 0 up to 100, got 1000000000.0"
     assert "already holds a run" in refused(capsys, "refine", runs, "--region", "mouth", "--out", tmp_path / "anna_2")
     assert "does not continue another run" in refused(capsys, "refine", runs, "--resume")
     assert "neither a region of the capture" in refused(capsys, "refine", runs, "--region", "chin")
@@ -729,4 +739,7 @@ def test_extend(trained: Path, root: Path, tmp_path: Path, capsys: pytest.Captur
     assert main(["refine", str(out), "--region", "mouth", "--iterations", "3"]) == 0
     assert main(["extend", str(out), "--resume"]) == 0
     assert "CAPTURE: is missing" in refused(capsys, "extend", runs)
+    assert "growth: expected a finite number from 0 up to 100" in refused(
+        capsys, "extend", tmp_path / "none", take, "--growth", "101"
+    )
     assert "is a take of this run already" in refused(capsys, "extend", out, take)

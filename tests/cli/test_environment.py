@@ -47,6 +47,17 @@ def test_use_and_remove(stga, passing, tmp_path, monkeypatch, capsys):
     assert "/farm/python takes precedence: STGA_PYTHON" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("exists", [False, True])
+def test_removing_what_is_not_there_leaves_no_trace(stga, tmp_path, capsys, exists):
+    """Catches folders that `remove` makes, or takes away, where nothing was made."""
+    folder = tmp_path / "environment"
+    if exists:
+        folder.mkdir()
+    assert stga("remove") == 0
+    assert capsys.readouterr().out == f"Removed 0 environment(s) from {folder}\n"
+    assert list(tmp_path.rglob("*")) == ([folder] if exists else [])
+
+
 @pytest.mark.parametrize("arguments", [("use", "{}/none"), ("use", "null\0"), ("make", "--wheels", "{}/none")])
 def test_mistakes_are_sentences(stga, arguments, tmp_path, capsys):
     """Catches a traceback for a Python or a folder of wheels that is not there, and a choice stored all the same."""

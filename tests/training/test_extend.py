@@ -16,8 +16,10 @@ from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.strain import COLOR_RANGE
+from stga_addon.capture.meshes import read_mesh
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.takes import require_same_scale
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
@@ -269,3 +271,79 @@ def test_the_benchmark_shows_what_the_old_take_pays() -> None:
     assert rows[0] == ["over before", "new take", "where it moves", "old take", "where it moves"]
     assert rows[2] == ["extend", "+4.00", "+6.00", "-0.50", "-2.00"]
     assert rows[3] == ["anew", "+4.00", "+6.00", "-0.50", "-2.00"]
+
+
+def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:
+    """The take with its cameras, and its tracked but not its neutral meshes, in millimeters."""
+    for path in sorted(root.glob("transforms_*.json")) if cameras else ():
+        values = json.loads(path.read_text())
+        for frame in values["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 1000
+        path.write_text(json.dumps(values))
+    for path in sorted(root.glob("meshes/0*.obj")) if meshes else ():
+        vertices, faces = read_mesh(path)
+        factory.write_mesh(path, 1000 * vertices, faces)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("cameras", "meshes", "expected"),
+    [
+        (True, False, r"new: its head appears 1e\+03 times smaller in the images than in those of .*old"),
+        (True, True, r"new: its tracked meshes are 1e\+03 times as large as the neutral mesh"),
+        (False, True, r"new: its tracked meshes are 1e\+03 times as large as the neutral mesh"),
+    ],
+)
+def test_a_take_in_millimeters(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path, cameras: bool, meshes: bool, expected: str
+) -> None:
+    """Catches a take in another unit than the run's, on which training is lost without a word."""
+    take = in_millimeters(Path(shutil.copytree(takes[0], tmp_path / "new")), cameras, meshes)
+    with pytest.raises(StgaError, match=expected):
+        prepare_extension(parent, (take,))
+
+
+def test_a_flame_take_in_millimeters(tmp_path: Path) -> None:
+    """Catches a FLAME take whose cameras and translation are in millimeters; its meshes' size is the model's."""
+    root, model = factory.write_flame_capture(tmp_path / "old")
+    run, settings = tmp_path / "run", quick_settings("global", iterations=1, lattice=0, density_interval=0)
+    train(open_capture(root, model), run, Run(root, model, "vhap", settings))
+    moved = in_millimeters(Path(shutil.copytree(root, tmp_path / "new")), cameras=True)
+    for path in (moved / "flame_param").glob("*.npz"):
+        parameters = dict(np.load(path))
+        np.savez(path, **{**parameters, "translation": 1000 * parameters["translation"]})
+    with pytest.raises(StgaError, match=r"new: its head appears (9|1e\+03)\d* times smaller"):
+        prepare_extension(run, (moved,))
+
+
+def test_takes_from_another_distance_fit(takes: tuple[Path, Path]) -> None:
+    """Catches a refusal of cameras that stand three times as far away, or zoom."""
+    first = open_capture(takes[0])
+    views = [
+        replace(view, camera=replace(view.camera, fl_x=view.camera.fl_x / 3, fl_y=view.camera.fl_y / 3))
+        for view in first.views["train"]
+    ]
+    require_same_scale(first, replace(first, views={"train": tuple(views)}))
+    require_same_scale(replace(first, views={"train": tuple(views)}), first)
+
+
+def test_a_take_given_twice(takes: tuple[Path, Path], parent: Path) -> None:
+    """Catches one take that is trained as two, and weighs twice."""
+    again = takes[1] / ".." / takes[1].name
+    with pytest.raises(StgaError, match="new: is given twice"):
+        prepare_extension(parent, (takes[1], again))
+
+
+def test_views_that_show_something_else_are_named(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
+    """Catches exchanged images that are trained without a word, and a warning about a take that looks different."""
+    said: list[str] = []
+    request = Extend(parent / "unused", parent, (takes[1],), iterations=1, device="cpu")
+    prepare(request, ignore, said.append)
+    assert not [line for line in said if "swapped" in line]
+    take = Path(shutil.copytree(takes[0], tmp_path / "take"))
+    red = np.where(factory.silhouette()[..., None], [255, 0, 0], 255).astype(np.uint8)
+    Image.fromarray(red).save(take / "images/00001_01.png")
+    prepare(replace(request, captures=(take,)), ignore, said.append)
+    (line,) = [line for line in said if "swapped" in line]
+    assert line == "warning: images/00001_01.png: does not look like the head from this camera; are images swapped?"

@@ -1,6 +1,10 @@
 """Continuing a finished run in another folder: refining a region of its avatar, or extending it by further takes."""
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 import torch
@@ -18,7 +22,7 @@ from ..evaluate.evaluation_views import (
     read_evaluation_view,
     visible_pixels,
 )
-from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
+from ..evaluate.residuals import RESIDUAL_SCALE, Residuals, triangle_residuals
 from ..optimize.exposure import exposure_correction
 from ..optimize.state import (
     TrainState,
@@ -42,28 +46,44 @@ MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
 """How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
 COMPARED_VIEWS = 36
 """Views of the old takes, and of the new ones, in which residuals are compared."""
+MIN_UNLIKE_RATIO, MIN_UNLIKE_RESIDUAL = 3.0, 0.05
+"""How much larger than the median of its take, and how large, the residual of a view is that shows something else."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
 
-def select_for_takes(continuation: Continuation, capture: Capture, settings: TrainingSettings) -> dict[int, np.ndarray]:
-    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old takes.
+def select_for_takes(
+    continuation: Continuation, capture: Capture, settings: TrainingSettings, starts: Sequence[int]
+) -> tuple[dict[int, np.ndarray], list[View]]:
+    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old takes; and the
+    views among those compared that do not look like the head at all, as where images of two cameras were exchanged.
 
+    starts: first timesteps of the new takes, ascending.
     A triangle looks different where the avatar's residual in a few views of the new takes is larger than in a few of
     the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
     """
     views = capture.views["train"]
     avatar, correct = read_avatar(continuation.parent / AVATAR), exposure_correction(settings)
     parts = [[view for view in views if continuation.includes(view.timestep) is new] for new in (False, True)]
-    old, new = (
-        triangle_residuals(avatar, capture, members, correct, RESIDUAL_SCALE).mean()
-        for members in (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
-    )
-    known, now = np.nan_to_num(old), np.nan_to_num(new)
+    old_views, new_views = (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
+    old = triangle_residuals(avatar, capture, old_views, correct, RESIDUAL_SCALE)
+    by_view = [triangle_residuals(avatar, capture, [view], correct, RESIDUAL_SCALE) for view in new_views]
+    new = reduce(add, by_view)
+    known, now = np.nan_to_num(old.mean()), np.nan_to_num(new.mean())
     differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
     timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
     moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
-    return {timestep: faces | differs for timestep, faces in moving.items()}
+    selection = {timestep: faces | differs for timestep, faces in moving.items()}
+    return selection, _unlike_views(new_views, by_view, starts)
+
+
+def _unlike_views(views: Sequence[View], residuals: Sequence[Residuals], starts: Sequence[int]) -> list[View]:
+    """The views whose residual stands out in their take."""
+    errors = np.array([each.error.sum() / max(each.weight.sum(), 1.0) for each in residuals])
+    takes = np.array([bisect_right(starts, view.timestep) for view in views])
+    usual = np.array([np.median(errors[takes == take]) for take in takes])
+    unlike = errors > np.maximum(MIN_UNLIKE_RATIO * usual, MIN_UNLIKE_RESIDUAL)
+    return [view for view, stands_out in zip(views, unlike, strict=True) if stands_out]
 
 
 def starting_state(continuation: Continuation, settings: TrainingSettings, triangles: int) -> TrainState:
