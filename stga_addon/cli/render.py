@@ -192,7 +192,7 @@ def _film(options: Namespace, subject: _Subject, views: Sequence[View]) -> None:
 
 def _turntable_images(options: Namespace, fps: float) -> int:
     """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
-    images = options.seconds * fps
+    images = float(options.seconds) * fps
     if images > MAX_TURNTABLE_IMAGES:
         asked = f"--seconds {options.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
         raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
