@@ -60,8 +60,9 @@ def start(context: Any, question: Question) -> None:
         try:
             question.show(scene, wait(folder, process))
         except StgaError as error:
-            setattr(getattr(scene, ids.SETTINGS), question.error, str(error))
-            raise
+            sentence = _without_option(str(error))
+            setattr(getattr(scene, ids.SETTINGS), question.error, sentence)
+            raise StgaError(sentence) from error
         finally:
             remove_request(folder)
         return
@@ -127,12 +128,17 @@ def _show_answer(uid: int) -> bool:
     return True
 
 
+def _without_option(sentence: str) -> str:
+    """The sentence without the command line's option, which the panel has not."""
+    return sentence.removeprefix("--effect ")
+
+
 def _shown(scene: Any, asked: _Asked) -> str:
     """Show the answer; returns why that failed."""
     try:
         last = monitor.inspect_status(asked.folder)
         if last.state.failed:
-            return last.status.error
+            return _without_option(last.status.error)
         result: Result = read_result(asked.folder)
         asked.question.show(scene, result)
     except StgaError as error:

@@ -17,14 +17,18 @@ from ..stga_addon.worker.status import WorkerState, failure_report, inspect_work
 from .environment import training_python
 
 
+def ask(folder: Path, request: Request) -> None:
+    """Write the request into the folder. Raises StgaError for what is known to fail, and while a worker is there."""
+    check_request(request)
+    write_request(folder, request)
+
+
 def start(folder: Path, request: Request, python: str) -> "Popen[bytes]":
     """Write the request into the folder and start a worker for it.
 
-    Raises StgaError for what is known to fail, while another worker is in the folder, or where the interpreter cannot
-    be started.
+    Raises StgaError as `ask` does, and where the interpreter cannot be started.
     """
-    check_request(request)
-    write_request(folder, request)
+    ask(folder, request)
     return start_worker(folder, python, worker_arguments(folder))
 
 
@@ -56,8 +60,8 @@ def python_of(operator: Any, context: Any) -> str | None:
     return training_python(context, operator.python)
 
 
-def perform_here(context: Any, folder: Path, request: Request) -> Result | None:
-    """Carry out the request in Blender's own Python, with Blender's progress at the pointer; None: it was cancelled.
+def perform_here(context: Any, folder: Path) -> Result | None:
+    """Carry out the request in the folder in Blender's own Python, with Blender's progress at the pointer; None: it was cancelled.
 
     Raises what the work raises.
     """
@@ -69,8 +73,6 @@ def perform_here(context: Any, folder: Path, request: Request) -> Result | None:
         manager.progress_update(100 * progress.share)
         return False
 
-    check_request(request)
-    write_request(folder, request)
     manager.progress_begin(0, 100)
     try:
         return perform_in_folder(folder, also=show)

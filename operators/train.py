@@ -20,7 +20,7 @@ from ..stga_addon.worker.status import request_cancel
 from . import ids, monitor
 from .common import capture_source, file_path, head_of, needs_head, reporting
 from .environment import environment_folder
-from .request import perform_here, python_of, start, wait, waits
+from .request import ask, perform_here, python_of, start, wait, waits
 
 
 def strategy_property() -> Any:
@@ -181,8 +181,9 @@ def start_training(
     """Start a worker for a training and monitor it, or wait for it; python: as of `python_of`. Raises StgaError."""
     folder, run = request_folder(request.run), request.run
     if python is None:
+        ask(folder, request)
         monitor.start_training(context.scene, run, None)
-        result = perform_here(context, folder, request)
+        result = perform_here(context, folder)
     else:
         process = start(folder, request, python)
         monitor.start_training(context.scene, run, process)

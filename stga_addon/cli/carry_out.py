@@ -5,7 +5,7 @@ import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from ..progress import Progress
+from ..progress import Progress, ignore
 from ..requests.results import Result
 from ..requests.values import Request
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 
-def carry_out(request: Request) -> Result:
-    """Carry out the request with a progress bar, and print what it says. Raises as `perform` does."""
+def carry_out(request: Request, with_bar: bool = True) -> Result:
+    """Carry out the request, with a progress bar if it takes long, and print what it says. Raises as `perform` does."""
     from ..perform.perform import perform
 
     with ProgressBar() as bar:
-        result = perform(request, bar.report, bar.say)
+        result = perform(request, bar.report if with_bar else ignore, bar.say)
     for line in getattr(result, "lines", ()):
         print(line)
     return result

@@ -21,4 +21,4 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    carry_out(Evaluate(options.run_folder, options.split, options.flame, options.moved_capture))
+    carry_out(Evaluate(options.run_folder, options.split, options.flame, options.moved_capture), with_bar=False)

@@ -54,7 +54,7 @@ def _write_selection(options: Namespace) -> None:
         raise StgaError(f"--{idle}: has no effect with --select-only")
     if len(options.takes) != 1:
         raise StgaError(f"--select-only: expected one CAPTURE, got {len(options.takes)}")
-    found = carry_out(SelectForTake(options.run_folder, options.takes[0], options.flame))
+    found = carry_out(SelectForTake(options.run_folder, options.takes[0], options.flame), with_bar=False)
     assert isinstance(found, Selected)
     arrays = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
     write_npz(options.select_only, arrays, compressed=True)

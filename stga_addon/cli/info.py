@@ -33,7 +33,8 @@ def run(options: Namespace) -> None:
         raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
     capture = None if options.json else open_named_capture(options)
     point, effects = principal_point_of(options), parse_choices(options.effect)
-    found = carry_out(Analyze(options.capture, options.flame, point, effects, options.device, options.presets))
+    request = Analyze(options.capture, options.flame, point, effects, options.device, options.presets)
+    found = carry_out(request, with_bar=False)
     assert isinstance(found, Analyzed)
     if capture is None:
         print(json.dumps(to_json(found)))

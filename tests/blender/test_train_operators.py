@@ -50,7 +50,8 @@ def ask_only(monkeypatch, extension) -> list:
     """Let the operators that train do nothing but ask; what they ask."""
     asked = []
     monkeypatch.setattr(extension.operators.request, "missing_packages", list)
-    monkeypatch.setattr(extension.operators.train, "perform_here", lambda context, folder, wanted: asked.append(wanted))
+    monkeypatch.setattr(extension.operators.train, "ask", lambda folder, wanted: asked.append(wanted))
+    monkeypatch.setattr(extension.operators.train, "perform_here", lambda context, folder: None)
     return asked
 
 

@@ -408,7 +408,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "train": (1, train),
     "track": (1, track),
     "avatar": (0.5, avatar),
-    "job": (0.5, lambda rng, case: [some_path(rng, case, "job", "run")]),
+    "perform": (0.5, lambda rng, case: [some_path(rng, case, "job", "run")]),
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
     "demo": (0.2, demo),

@@ -16,7 +16,7 @@ from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.exposure import exposure_correction
-from stga_addon.training.run import loop
+from stga_addon.training.run import loop, session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
@@ -29,7 +29,7 @@ CALLS = {
     "background": (cpu_backend, "change_background"),
     "hull-points": (initial_splats, "hull_points"),
     "density": (strategies, "control_density"),
-    "selection": (loop, "select_capture"),
+    "selection": (session, "select_capture"),
     "strain-color": (frames, "strain_basis"),
 }
 ITERATIONS = 12
@@ -81,7 +81,7 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
     capture, _ = write_head(tmp_path / "head")
     settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
     calls: Counter[str] = Counter()
-    for module, name in ((trainer, "refinable_tracking"), (cpu_backend, "frame_backward"), (loop, "write_tracking")):
+    for module, name in ((trainer, "refinable_tracking"), (cpu_backend, "frame_backward"), (session, "write_tracking")):
         monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
     loop.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
     if choice == "off":
