@@ -61,9 +61,9 @@ def python_of(operator: Any, context: Any) -> str | None:
 
 
 def perform_here(context: Any, folder: Path) -> Result | None:
-    """Carry out the request in the folder in Blender's own Python, with Blender's progress at the pointer; None: it was cancelled.
+    """Carry out the request in the folder in Blender's own Python, with Blender's progress at the pointer.
 
-    Raises what the work raises.
+    Returns None where it was cancelled. Raises what the work raises.
     """
     from ..stga_addon.perform.perform import perform_in_folder
 
