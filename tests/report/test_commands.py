@@ -30,13 +30,14 @@ def test_what_is_timed_is_what_will_train(
     """Catches a GPU that is given the minutes of the CPU."""
     timed: list[str] = []
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
-    monkeypatch.setattr("stga_addon.render.device.choose_device", lambda wanted: ("gpu:Card", "why"))
+    for module in ("render.device", "perform.training", "perform.analysis"):
+        monkeypatch.setattr(f"stga_addon.{module}.choose_device", lambda wanted: ("gpu:Card", "why"))
     device = ["--device", "gpu"]
     assert main(["presets", str(toy_root), *device]) == 0
     assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
     made = []
-    monkeypatch.setattr("stga_addon.training.run.loop.train", lambda *call: made.append(call[2].device) or tmp_path)
-    monkeypatch.setattr("stga_addon.report.run_summary.report_run", lambda folder: [])
+    monkeypatch.setattr("stga_addon.perform.training.train", lambda *call: made.append(call[2].device) or tmp_path)
+    monkeypatch.setattr("stga_addon.perform.training.report_run", lambda folder: [])
     assert main(["train", str(toy_root), "--preset", "draft", "--out", str(tmp_path), *device]) == 0
     assert timed == ["gpu:Card"] * 7
     assert made == ["gpu:Card"]

@@ -54,14 +54,17 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
         ({"version": 2}, r"run\.json: has run format version 2, this add-on reads 3$"),
         ({"version": None}, r"run\.json: has run format version None"),
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
-        ({"capture": None}, r"run\.json: a field is missing or malformed"),
+        ({"capture": None}, r"run\.json: setting capture: expected a path, got None"),
         ({"settings": None}, r"run\.json: settings: fields are missing"),
         ({"settings": {}}, r"run\.json: settings: fields are missing or unknown \(adam_epsilon, antialiased, "),
-        ({"device": "toaster"}, r"run\.json: .*device is 'toaster'"),
-        ({"principal_point": "corner"}, r"run\.json: .*principal_point is 'corner'"),
-        ({"identity": {"faces": 5}}, r"run\.json: a field is missing or malformed"),
-        ({"takes": [{"capture": "a"}]}, r"run\.json: a field is missing or malformed"),
-        ({"continuation": {"parent": "a", "avatar": "b", "first": 5, "last": 3}}, r"run\.json: .*continuation is"),
+        ({"device": "toaster"}, r"run\.json: setting device: expected auto, cpu, gpu or gpu:NAME, got 'toaster'"),
+        ({"principal_point": "corner"}, r"run\.json: setting principal_point: expected one of vhap, .*, got 'corner'"),
+        ({"identity": {"faces": 5}}, r"run\.json: identity: fields are missing or unknown \(cameras, "),
+        ({"takes": [{"capture": "a"}]}, r"run\.json: takes\.0: fields are missing or unknown \(identity, start\)"),
+        (
+            {"continuation": {"parent": "a", "avatar": "b", "first": 5, "last": 3}},
+            r"run\.json: continuation: its last timestep 3 is before its first, 5",
+        ),
     ],
 )
 def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> None:

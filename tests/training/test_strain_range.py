@@ -138,7 +138,7 @@ def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     train(toy, out, run, report=lambda progress: progress.iteration == 2)
-    limits, digest = color_range(len(toy.faces)), identity_of(toy, None, "vhap", settings).digest
+    limits, digest = color_range(len(toy.faces)), identity_of(toy, "vhap", settings).digest
     for arrays, says in (
         ((limits, "other"), "belongs to another run than run.json beside it"),
         (
