@@ -11,10 +11,10 @@ from typing import Any
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.folder import read_result, remove_request
+from ..stga_addon.requests.folder import FILES, read_result, remove_request
 from ..stga_addon.requests.results import Result
 from ..stga_addon.requests.values import Request
-from ..stga_addon.worker.status import WorkerState
+from ..stga_addon.worker.status import WorkerState, remove_status_folder
 from . import ids, monitor
 from .environment import training_python
 from .request import start as start_request
@@ -54,7 +54,11 @@ def start(context: Any, question: Question) -> None:
     """
     scene, python = context.scene, training_python(context)
     folder = Path(tempfile.mkdtemp(prefix="stga_"))
-    process = start_request(folder, question.request, python)
+    try:
+        process = start_request(folder, question.request, python)
+    except StgaError:
+        remove_status_folder(folder, FILES)
+        raise
     setattr(getattr(scene, ids.SETTINGS), question.error, "")
     if not monitor.has_timer():
         try:

@@ -151,3 +151,13 @@ def test_analysis_can_be_cancelled(chosen, extension, analyze):
     assert bpy.ops.stga.analyze_capture.poll()
     assert extension.operators.monitor.tick() is None
     assert chosen.analysis_error == ""
+
+
+def test_a_worker_that_cannot_be_started_leaves_nothing(chosen, extension, monkeypatch, tmp_path):
+    """Catches a temporary folder that is left behind for each attempt."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(extension.operators.background, "training_python", lambda context: str(tmp_path / "none"))
+    before = set(tmp_path.iterdir())
+    with pytest.raises(RuntimeError, match="cannot be started as a Python interpreter"):
+        bpy.ops.stga.analyze_capture()
+    assert set(tmp_path.iterdir()) == before
