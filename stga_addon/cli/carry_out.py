@@ -36,6 +36,8 @@ class ProgressBar:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.leave = self._bar.n > 0  # a bar of work that failed before it began would stand above the reason
         self._opened.close()
 
     def report(self, progress: Progress) -> bool:

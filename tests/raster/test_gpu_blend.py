@@ -16,8 +16,9 @@ from stga_addon.raster.gpu.tiles import choose_tiles, list_pairs
 
 CAPACITY = 1 << 14
 BACKGROUND = np.float32([0.9, 0.2, 0.6])
-TOLERANCE = 2e-5
-"""Of a column's gradient, relative to the largest of the scene."""
+TOLERANCE = 1e-4
+"""Of a column's gradient, relative to the largest of the scene. Software Vulkan rounds as the processor does: 4e-5 with
+AVX2."""
 CASES = {**SCENES, "many layers": cloud(30, count=700, size=(40, 40), log_scale=-1.5, logit=-3.0)}
 
 
