@@ -9,7 +9,7 @@ from ..stga_addon.requests.results import Analyzed
 from ..stga_addon.requests.values import Analyze
 from ..stga_addon.training.effects.decisions import parse_choices
 from . import background, ids
-from .background import Question
+from .background import BackgroundRequest
 from .common import capture_source, head_of, needs_head, reporting, scene_settings
 
 
@@ -27,7 +27,7 @@ class AnalyzeCapture(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         request = _request(head_of(context), scene_settings(context))
-        background.start(context, Question(request, _fill, "analysis_error"))
+        background.start(context, BackgroundRequest(request, _fill, "analysis_error"))
         return {"FINISHED"}
 
 

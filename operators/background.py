@@ -18,11 +18,11 @@ from ..stga_addon.worker.status import WorkerState, remove_status_folder
 from . import ids, monitor
 from .environment import training_python
 from .request import start as start_request
-from .request import wait
+from .request import wait_for_result
 
 
 @dataclass(frozen=True)
-class Question:
+class BackgroundRequest:
     """A request whose result changes the scene.
 
     show       puts the result into the scene; may raise StgaError
@@ -37,62 +37,62 @@ class Question:
 
 
 @dataclass(frozen=True)
-class _Asked:
-    question: Question
+class _Running:
+    work: BackgroundRequest
     folder: Path
     process: "Popen[bytes]"
 
 
-_asked: dict[int, _Asked] = {}
-"""Session id of a scene -> its question that is not answered yet."""
+_running: dict[int, _Running] = {}
+"""Session id of a scene -> its request that a worker carries out."""
 
 
-def start(context: Any, question: Question) -> None:
-    """Start a worker for the scene's question; without a window, where no timer runs, wait for it.
+def start(context: Any, work: BackgroundRequest) -> None:
+    """Start a worker for a request about the scene; without a window, where no timer runs, wait for it.
 
     Raises StgaError where it was waited for and failed.
     """
     scene, python = context.scene, training_python(context)
     folder = Path(tempfile.mkdtemp(prefix="stga_"))
     try:
-        process = start_request(folder, question.request, python)
+        process = start_request(folder, work.request, python)
     except StgaError:
         remove_status_folder(folder, FILES)
         raise
-    setattr(getattr(scene, ids.SETTINGS), question.error, "")
+    setattr(getattr(scene, ids.SETTINGS), work.error, "")
     if not monitor.has_timer():
         try:
-            question.show(scene, wait(folder, process))
+            work.show(scene, wait_for_result(folder, process))
         except StgaError as error:
             sentence = _without_option(str(error))
-            setattr(getattr(scene, ids.SETTINGS), question.error, sentence)
+            setattr(getattr(scene, ids.SETTINGS), work.error, sentence)
             raise StgaError(sentence) from error
         finally:
             remove_request(folder)
         return
     uid = scene.session_uid
-    _asked[uid] = _Asked(question, folder, process)
-    monitor.monitor_worker(folder, process, lambda: _show_answer(uid))
+    _running[uid] = _Running(work, folder, process)
+    monitor.monitor_worker(folder, process, lambda: _show_result(uid))
 
 
-def running(scene: Any) -> Question | None:
-    """The scene's question that is not answered yet."""
-    asked = _asked.get(scene.session_uid)
-    return None if asked is None else asked.question
+def running(scene: Any) -> BackgroundRequest | None:
+    """The scene's request that a worker carries out."""
+    worker = _running.get(scene.session_uid)
+    return None if worker is None else worker.work
 
 
 def is_waiting(scene: Any) -> bool:
-    """Whether the answer is there and is shown once the head leaves Edit Mode."""
-    asked = _asked.get(scene.session_uid)
-    if asked is None or not asked.question.changes_head:
+    """Whether the result is there and is shown once the head leaves Edit Mode."""
+    worker = _running.get(scene.session_uid)
+    if worker is None or not worker.work.changes_head:
         return False
     head = getattr(scene, ids.SETTINGS).head
-    finished = monitor.snapshot(asked.folder).state == WorkerState.FINISHED
+    finished = monitor.snapshot(worker.folder).state == WorkerState.FINISHED
     return finished and head is not None and head.mode == "EDIT"
 
 
 def needs_idle(operator: Any, context: Any) -> bool:
-    """Poll: whether no question of the scene is open; says so where one is."""
+    """Poll: whether no request about the scene is being carried out; says so where one is."""
     if running(context.scene) is None:
         return True
     operator.poll_message_set("Another command is running")
@@ -100,35 +100,36 @@ def needs_idle(operator: Any, context: Any) -> bool:
 
 
 def cancel(scene: Any) -> None:
-    """Drop the scene's question; what is shown stays."""
+    """End the scene's worker; what is shown stays."""
     _drop(scene.session_uid)
 
 
 def stop() -> None:
-    """Drop every question."""
-    for uid in list(_asked):
+    """End every worker."""
+    for uid in list(_running):
         _drop(uid)
 
 
 def _drop(uid: int) -> None:
-    asked = _asked.pop(uid)
-    monitor.forget_worker(asked.folder)
-    asked.process.kill()
-    asked.process.wait()
-    remove_request(asked.folder)
+    worker = _running.pop(uid)
+    monitor.forget_worker(worker.folder)
+    worker.process.kill()
+    worker.process.wait()
+    remove_request(worker.folder)
 
 
-def _show_answer(uid: int) -> bool:
-    """Show the answer of an ended worker, or why it failed, earlier results stay then; False: it must wait."""
-    asked, scene = _asked.get(uid), next((each for each in bpy.data.scenes if each.session_uid == uid), None)
-    if asked is None:
+def _show_result(uid: int) -> bool:
+    """Show the result of an ended worker, or why it failed, earlier results stay then; False: it must wait."""
+    worker, scene = _running.get(uid), next((each for each in bpy.data.scenes if each.session_uid == uid), None)
+    if worker is None:
         return True
     if scene is not None:
         if is_waiting(scene):
             return False
-        setattr(getattr(scene, ids.SETTINGS), asked.question.error, _shown(scene, asked))
-    del _asked[uid]
-    remove_request(asked.folder)
+        setattr(getattr(scene, ids.SETTINGS), worker.work.error, _shown(scene, worker))
+    del _running[uid]
+    monitor.forget_worker(worker.folder)
+    remove_request(worker.folder)
     return True
 
 
@@ -137,14 +138,14 @@ def _without_option(sentence: str) -> str:
     return sentence.removeprefix("--effect ")
 
 
-def _shown(scene: Any, asked: _Asked) -> str:
-    """Show the answer; returns why that failed."""
+def _shown(scene: Any, worker: _Running) -> str:
+    """Show the result; returns why that failed."""
     try:
-        last = monitor.inspect_status(asked.folder)
+        last = monitor.inspect_status(worker.folder)
         if last.state.failed:
             return _without_option(last.status.error)
-        result: Result = read_result(asked.folder)
-        asked.question.show(scene, result)
+        result: Result = read_result(worker.folder)
+        worker.work.show(scene, result)
     except StgaError as error:
         return str(error)
     except Exception as error:  # it must not end the timer

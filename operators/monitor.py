@@ -154,7 +154,7 @@ def _check_safely(scene: Any) -> float | None:
 
 def _check_worker_safely(folder: Path) -> float | None:
     """Check a worker that belongs to no scene; after an unexpected error, which is printed, it counts as ended."""
-    before = _snapshots[folder]
+    before = _snapshots.get(folder)
     try:
         _snapshots[folder] = inspect_status(folder)
     except Exception:
@@ -162,9 +162,10 @@ def _check_worker_safely(folder: Path) -> float | None:
         _snapshots[folder] = WorkerSnapshot()
     if _snapshots[folder] != before:
         redraw()
-    if not _snapshots[folder].state.is_alive:
-        _call_follower(folder)
-    return CHECK_INTERVAL_S if folder in _followers or _snapshots[folder].state.is_alive else None
+    if _snapshots[folder].state.is_alive:
+        return CHECK_INTERVAL_S
+    _call_follower(folder)
+    return CHECK_INTERVAL_S if folder in _followers else None
 
 
 def _call_follower(folder: Path) -> None:

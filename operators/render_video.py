@@ -28,8 +28,7 @@ from . import ids, monitor
 from .common import file_path, is_head, reporting, scene_settings
 from .environment import has_training_python, training_python
 from .render_engine import render_device
-from .request import start
-from .request import wait as wait_for
+from .request import start, wait_for_result
 
 RECORDING = "recording.bin"
 RECORDING_INTERVAL_S = 0.001
@@ -201,7 +200,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         process = start(video.folder, request, self._python)
         monitor.monitor_worker(video.folder, process)
         if wait:
-            wait_for(video.folder, process)
+            wait_for_result(video.folder, process)
             self.report({"INFO"}, f"Rendered {video.output}")
         return {"FINISHED"}
 

@@ -1,4 +1,4 @@
-"""Requests from Blender: starting a worker for one, waiting for it, and what is done when it has ended."""
+"""Requests from Blender: starting a worker for one, waiting for it, or carrying it out here."""
 
 import sys
 from pathlib import Path
@@ -32,17 +32,25 @@ def start(folder: Path, request: Request, python: str) -> "Popen[bytes]":
     return start_worker(folder, python, worker_arguments(folder))
 
 
-def wait(folder: Path, process: "Popen[bytes]") -> Result:
-    """Wait for the worker; what it found. Raises StgaError with its error where it failed (the traceback goes to the
-    console), or where it was cancelled."""
+def wait(folder: Path, process: "Popen[bytes]") -> Result | None:
+    """Wait for the worker; returns its result, None where it was cancelled.
+
+    Raises StgaError with its error where it failed; the traceback goes to the console.
+    """
     process.wait()
     last = inspect_worker(folder, process)
     if last.state.failed:
         print(failure_report(folder, last), file=sys.stderr)
         raise StgaError(last.status.error)
-    if last.state == WorkerState.CANCELLED:
-        raise StgaError("It was cancelled")
-    return read_result(folder)
+    return None if last.state == WorkerState.CANCELLED else read_result(folder)
+
+
+def wait_for_result(folder: Path, process: "Popen[bytes]") -> Result:
+    """`wait` for work that leaves nothing when it is cancelled: raises StgaError then, too."""
+    result = wait(folder, process)
+    if result is None:
+        raise StgaError("The worker was cancelled")
+    return result
 
 
 def waits(operator: Any) -> bool:

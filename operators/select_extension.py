@@ -12,7 +12,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import write_selection
 from . import background, ids, monitor
-from .background import Question
+from .background import BackgroundRequest
 from .common import capture_source, file_path, head_of, is_head, needs_own_head, reporting
 from .select import count_selected
 
@@ -42,7 +42,7 @@ class SelectExtension(bpy.types.Operator):
             _show(scene, str(take), dict(found.selection))
 
         request = SelectForTake(run, take, flame)
-        background.start(context, Question(request, show, "extension_error", changes_head=True))
+        background.start(context, BackgroundRequest(request, show, "extension_error", changes_head=True))
         return {"FINISHED"}
 
 

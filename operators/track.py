@@ -16,7 +16,7 @@ from . import ids, monitor
 from .common import file_path, reporting, scene_settings
 from .environment import training_python
 from .export_head_model import write_shape_key_model
-from .request import start, wait
+from .request import start, wait_for_result
 
 HEAD_MODEL = "head_model.npz"
 """In the capture's folder: the shape keys that it was tracked with."""
@@ -186,7 +186,7 @@ def start_tracking(operator: Any, context: Any, out: Path, request: Track | Solv
     if not bpy.app.background:
         _follow(context.scene)
         return {"FINISHED"}
-    wait(folder, process)
+    wait_for_result(folder, process)
     _import(context.scene)
     if settings.tracking_error:
         raise StgaError(settings.tracking_error)

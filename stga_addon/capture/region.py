@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import read_npz, write_npz
+from ..files import read_npz
 from ..flame.masks import faces_within
 from .meshes import read_regions
 from .model import Capture
@@ -24,11 +24,6 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
     if not region.any():
         raise StgaError(f"region '{name}': holds no triangle")
     return region
-
-
-def write_region(path: Path, weights: np.ndarray) -> None:
-    """Write a region file: weights (F,), 0 to 1 per triangle."""
-    write_npz(path, {WEIGHTS: weights.astype(np.float32)}, compressed=True)
 
 
 def _find(capture: Capture, name: str) -> np.ndarray:

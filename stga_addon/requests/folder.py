@@ -34,20 +34,6 @@ def request_folder(subject: Path) -> Path:
     return subject / "job"
 
 
-def folder_of(request: Request) -> Path | None:
-    """The folder of a request that belongs to what it writes; None for one that writes nothing of its own."""
-    match request:
-        case Train() | Resume() | Refine() | Extend():
-            return request_folder(request.run)
-        case Track():
-            return request_folder(request.out)
-        case SolveAgain():
-            return request_folder(request.capture)
-        case RenderRecording():
-            return request.recording.parent
-    return None
-
-
 def check_request(request: Request) -> None:
     """Raise StgaError for what can be known to fail before a worker is started."""
     match request:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,18 +13,10 @@ from ..render.device import EXPECTED_DEVICE, is_device
 from ..schema import MAX_COUNT, setting
 from ..training.settings import MAX_GROWTH, TrainingSettings
 
-PAINTED_REGION = "region.npz"
-"""File of painted triangle weights in the folder of a refinement's request."""
 
-
-def device_field() -> str:
+def device_field() -> Any:
     """A field for a device as `choose_device` takes it; "auto" continues a run on the device that trained it."""
-    return str_field("auto", accepts=is_device, expected=EXPECTED_DEVICE)
-
-
-def str_field(default: str, **limits: object) -> str:
-    field: str = setting(default, **limits)  # type: ignore[arg-type]
-    return field
+    return setting("auto", accepts=is_device, expected=EXPECTED_DEVICE)
 
 
 @dataclass(frozen=True)

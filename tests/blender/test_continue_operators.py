@@ -179,7 +179,7 @@ def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypa
     settings.extension_error = "of last time"
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     assert settings.extension_error == ""
-    background._asked[bpy.context.scene.session_uid].process.wait(60)
+    background._running[bpy.context.scene.session_uid].process.wait(60)
     assert extension.operators.monitor.tick() is not None
     assert background.is_waiting(bpy.context.scene)
     assert "stga_0" not in head.vertex_groups

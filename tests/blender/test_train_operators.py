@@ -190,6 +190,16 @@ def test_failed_worker_is_a_sentence(head, tmp_path):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=sys.executable)
 
 
+def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
+    """Catches a cancel from elsewhere that a script is told as a failure, and an avatar so far that is not stored."""
+    from .test_analyze_operator import write_interpreter
+
+    body = "(FOLDER.parent / 'avatar.npz').touch(); end('cancelled')"
+    python = write_interpreter(tmp_path / "python", body)
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=python) == {"FINISHED"}
+    assert bpy.context.scene.stga.avatar == str(tmp_path / "run/avatar.npz")
+
+
 def test_running_worker_cannot_be_replaced_or_dismissed(worker):
     """Catches a second worker in the same folder, and a dismissed training whose worker continues."""
     assert not bpy.ops.stga.train.poll()

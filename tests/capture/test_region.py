@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from stga_addon.capture.model import Capture
-from stga_addon.capture.region import find_region, write_region
+from stga_addon.capture.region import find_region
 from stga_addon.errors import StgaError
+from stga_addon.files import write_npz
 
 
 def test_names_and_files(toy: Capture, tmp_path: Path) -> None:
     """Catches a region of other triangles than those painted."""
     np.testing.assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
     weights = np.linspace(0, 1, len(toy.faces))
-    write_region(tmp_path / "painted.npz", weights)
+    write_npz(tmp_path / "painted.npz", {"weights": weights})
     np.testing.assert_array_equal(find_region(toy, str(tmp_path / "painted.npz")), weights >= 0.5)
     triangle = toy.faces[7]
     (tmp_path / "regions.json").write_text(json.dumps({"one": triangle.tolist()}))
@@ -42,6 +43,6 @@ def test_files_that_do_not_fit(toy: Capture, tmp_path: Path, weights: np.ndarray
 
 def test_an_empty_region_is_refused(toy: Capture, tmp_path: Path) -> None:
     """Catches a refinement that would train nothing and say so nowhere."""
-    write_region(tmp_path / "nothing.npz", np.zeros(len(toy.faces)))
+    write_npz(tmp_path / "nothing.npz", {"weights": np.zeros(len(toy.faces))})
     with pytest.raises(StgaError, match="holds no triangle"):
         find_region(toy, str(tmp_path / "nothing.npz"))

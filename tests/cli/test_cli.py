@@ -284,7 +284,7 @@ def test_export_a_sequence(trained: Path, tmp_path: Path) -> None:
 
 
 def test_export_says_which_frames_there_are(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a range that is cut to the capture's without a word, and talk of one that is not."""
+    """Catches a range that is cut to the capture's without a message, and a message about one that is not."""
     sequence = ["export", str(trained), "--format", "ply-sequence"]
     for span, said in (("1:999999", True), ("0:3", False), ("0:2", False)):
         assert main([*sequence, "--frames", span, "--out", str(tmp_path / span[2:])]) == 0

@@ -27,7 +27,6 @@ from stga_addon.requests.folder import (
     PREVIEW,
     REQUEST,
     check_request,
-    folder_of,
     read_request,
     read_result,
     remove_request,
@@ -424,17 +423,6 @@ def test_removed_request_leaves_other_files(tmp_path: Path, capture: Path) -> No
         (folder / name).touch()
     remove_request(folder)
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
-
-
-def test_a_request_lies_with_what_it_writes() -> None:
-    """Catches a request whose folder does not move along with its run, capture or recording."""
-    folders_of = {type(request): folder_of(request) for request in REQUESTS}
-    assert folders_of[Train] == Path("r/job")
-    assert folders_of[Refine] == folders_of[Extend] == Path("r_2/job")
-    assert folders_of[Track] == Path("o/job")
-    assert folders_of[SolveAgain] == HEAD / "job"
-    assert folders_of[RenderRecording] == Path("a")
-    assert folders_of[Analyze] is None
 
 
 @pytest.mark.slow

@@ -298,7 +298,7 @@ def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:
 def test_a_take_in_millimeters(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path, cameras: bool, meshes: bool, expected: str
 ) -> None:
-    """Catches a take in another unit than the run's, on which training is lost without a word."""
+    """Catches a take in another unit than the run's, on which training is wasted without an error."""
     take = in_millimeters(Path(shutil.copytree(takes[0], tmp_path / "new")), cameras, meshes)
     with pytest.raises(StgaError, match=expected):
         prepare_extension(parent, (take,))
@@ -336,7 +336,7 @@ def test_a_take_given_twice(takes: tuple[Path, Path], parent: Path) -> None:
 
 
 def test_views_that_show_something_else_are_named(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
-    """Catches exchanged images that are trained without a word, and a warning about a take that looks different."""
+    """Catches exchanged images that are trained without a warning, and a warning about a take that looks different."""
     said: list[str] = []
     request = Extend(parent / "unused", parent, (takes[1],), iterations=1, device="cpu")
     prepare(request, ignore, said.append)

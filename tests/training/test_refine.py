@@ -12,8 +12,8 @@ import pytest
 
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.model import Capture
-from stga_addon.capture.region import write_region
 from stga_addon.errors import StgaError
+from stga_addon.files import write_npz
 from stga_addon.perform.training import Prepared, prepare
 from stga_addon.progress import ignore
 from stga_addon.requests.values import Refine
@@ -140,7 +140,7 @@ def test_the_avatar_before_is_the_first_evaluation(parent: Path, toy: Capture, t
 def test_a_region_that_no_camera_faces_is_refused(parent: Path, toy: Capture, tmp_path: Path) -> None:
     """Catches a refinement that has no view to train on, which ends in a traceback after the start."""
     away = np.asarray(toy.neutral)[toy.faces].mean(1)[:, 2] < -0.09
-    write_region(tmp_path / "away.npz", away)
+    write_npz(tmp_path / "away.npz", {"weights": away})
     with pytest.raises(StgaError, match=r"region '.*away\.npz': faces no training camera from timestep 0 to 4"):
         prepare_refinement(parent, str(tmp_path / "away.npz"))
 
