@@ -1,16 +1,19 @@
-"""Reading of images and masks with Pillow, checked against the camera."""
+"""Reading of images and masks with Pillow, upright and in sRGB, checked against the camera."""
 
+import io
 import stat
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageCms, ImageOps
 
 from ..errors import StgaError
 from .camera import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, is_image_size
+from .color import is_srgb, to_srgb, with_gamma
 from .model import View
 
 WHITE = (255, 255, 255)
@@ -19,17 +22,24 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 BAND_PIXELS = 1 << 20
 """Pixels that are converted at a time: wide intermediate numbers of a large image would fill the memory."""
 
+ORIENTATION_TAG = 0x0112
+"""EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
+SRGB_GAMMA, GAMMA_TOLERANCE = 0.45455, 0.02
+"""PNG's gAMA of what is shown as sRGB."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
 # Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what else Pillow warns
 # about, such as damaged metadata, does not concern the pixels.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the file's header. Raises StgaError where it is no image or larger than images may be."""
+    """(width, height) as displayed, from the file's header. Raises StgaError where it is no image or larger than images
+    may be."""
     try:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
-            width, height = image.size
+            width, height = _displayed_size(image)
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if not is_image_size(width, height):
@@ -38,11 +48,21 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
+def is_plain(path: Path) -> bool:
+    """Whether programs that know neither EXIF's orientation nor color profiles show the image as it is read here."""
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            return _orientation(image) == 1 and _conversion(image, path) is None
+    except Exception:  # reading it will say what is wrong
+        return True
+
+
 def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarray:
     """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over `background` (0 to 255).
 
-    Gray, palette and 16-bit images are converted. Raises StgaError naming the file where it is missing,
-    truncated or not as large as the camera says.
+    Gray, palette and 16-bit images are converted, and so are color profiles, PNG's gAMA and cICP; EXIF's orientation is
+    applied unless the camera has the size of the pixels as stored. Raises StgaError naming the file where it is
+    missing, truncated or not as large as the camera says.
     """
     return _over(_decode(view.image, view, "image"), background)
 
@@ -127,9 +147,9 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
     try:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
-            size = image.size
-            if size == expected and is_image_size(*size):  # before any pixel is unpacked
-                return _as_uint8(image)
+            stored, size = image.size, _displayed_size(image)
+            if expected in (stored, size) and is_image_size(*expected):  # before any pixel is unpacked
+                return _as_uint8(_converted(image, path, upright=size == expected, colors=kind == "image"))
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if size == expected:
@@ -138,6 +158,88 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
     if kind == "mask":
         camera = f"the image {view.image} and its camera have {expected[0]} x {expected[1]}"
     raise StgaError(f"{path}: the {kind} has {size[0]} x {size[1]} pixels, but {camera}")
+
+
+def _displayed_size(image: Image.Image) -> tuple[int, int]:
+    width, height = image.size
+    return (height, width) if _orientation(image) >= 5 else (width, height)
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF's, 1 where there is none. Pillow turns TIFF by itself; a PNG's is not looked for behind its pixels."""
+    if image.format == "TIFF" or "exif" not in image.info:
+        return 1
+    try:
+        found = image.getexif().get(ORIENTATION_TAG, 1)
+    except Exception:  # damaged metadata does not concern the pixels
+        return 1
+    return found if isinstance(found, int) and 1 <= found <= 8 else 1
+
+
+def _converted(image: Image.Image, path: Path, upright: bool, colors: bool) -> Image.Image:
+    """The image with EXIF's orientation applied, where `upright`, and in sRGB, where `colors`."""
+    convert = _conversion(image, path) if colors else None
+    turned = ImageOps.exif_transpose(image) if upright and _orientation(image) != 1 else image
+    return turned if convert is None else convert(turned)
+
+
+def _conversion(image: Image.Image, path: Path) -> Callable[[Image.Image], Image.Image] | None:
+    """How the image's colors become sRGB, None where they are: by cICP, else its profile, else gAMA."""
+    if image.mode not in ("RGB", "RGBA", "CMYK"):
+        return None
+    codes = _cicp(path) if image.format == "PNG" else None
+    if codes is not None:
+        return None if is_srgb(*codes) else partial(_by_pixels, lambda pixels: to_srgb(pixels, *codes))
+    if image.info.get("icc_profile"):
+        return _by_profile(image.info["icc_profile"])
+    gamma = image.info.get("gamma")
+    if image.format != "PNG" or "srgb" in image.info or not isinstance(gamma, float) or not gamma > 0:
+        return None
+    if abs(gamma - SRGB_GAMMA) <= GAMMA_TOLERANCE:
+        return None
+    return partial(_by_pixels, lambda pixels: with_gamma(pixels, gamma))
+
+
+def _by_pixels(convert: Callable[[np.ndarray], np.ndarray], image: Image.Image) -> Image.Image:
+    """The image with its colors (H, W, 3) converted; alpha stays."""
+    pixels = np.asarray(image)
+    return Image.fromarray(np.concatenate([convert(pixels[..., :3]), pixels[..., 3:]], axis=2))
+
+
+def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
+    """Conversion from an ICC profile; None where it is sRGB's, or damaged."""
+    try:
+        profile = ImageCms.getOpenProfile(io.BytesIO(data))
+        if "sRGB" in ImageCms.getProfileDescription(profile):
+            return None
+    except (ImageCms.PyCMSError, OSError, TypeError, ValueError):
+        return None
+
+    def convert(image: Image.Image) -> Image.Image:
+        mode = "RGB" if image.mode == "CMYK" else image.mode
+        try:
+            converted = ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), outputMode=mode)
+        except ImageCms.PyCMSError:  # a profile of another kind of image
+            return image
+        return image if converted is None else converted
+
+    return convert
+
+
+def _cicp(path: Path) -> tuple[int, int] | None:
+    """Codes of primaries and transfer in a PNG's cICP chunk, which stands before the pixels; None without."""
+    with path.open("rb") as stream:
+        if stream.read(8) != PNG_SIGNATURE:
+            return None
+        while len(head := stream.read(8)) == 8:
+            length, name = int.from_bytes(head[:4], "big"), head[4:]
+            if name in (b"IDAT", b"IEND"):
+                return None
+            if name == b"cICP":
+                codes = stream.read(4)
+                return (codes[0], codes[1]) if len(codes) == 4 else None
+            stream.seek(length + 4, 1)
+    return None
 
 
 def _as_uint8(image: Image.Image) -> np.ndarray:

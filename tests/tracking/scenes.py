@@ -8,9 +8,9 @@ from stga_addon.capture.camera import look_at
 WIDTH, HEIGHT = 40, 30
 
 
-def rig(count=3):
+def rig(count=3, width=WIDTH, height=HEIGHT):
     """Cameras on an arc about the origin."""
-    return [look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), WIDTH, HEIGHT, 50.0) for a in 0.4 * np.arange(count)]
+    return [look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), width, height, 50.0) for a in 0.4 * np.arange(count)]
 
 
 def write_image(path, value=128, size=(WIDTH, HEIGHT)):

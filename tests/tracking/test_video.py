@@ -1,12 +1,15 @@
 """Every frame of a video by its number, whatever the container and codec."""
 
 import random
+import struct
 
 import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
+
+from .scenes import rig, write_colmap_text
 
 av = pytest.importorskip("av")
 
@@ -163,14 +166,107 @@ def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
 
 
 def test_variable_frame_rate(tmp_path):
-    """Catches a rate stated as constant where frames were dropped, and times that repeat a frame's number."""
-    durations = [1, 1, 1, 2, 1, 3] * 10
+    """Catches frames of a phone played evenly although gaps lie between them: out of step with sound and other cameras,
+    and motion taken for a jump."""
+    durations = [1, 1, 1, 2, 1, 3, 1, 75] * 8
     write_numbered(tmp_path / "a.mkv", "libx264", X264, len(durations), rate=50, durations=durations)
     footage = open_footage(tmp_path)
     (warning,) = footage.warnings
-    assert "a.mkv: has a variable frame rate (frames last 20 to 60 ms)" in warning
-    assert footage.fps == pytest.approx(50 * 6 / 9, rel=0.03)
-    assert_numbers(tmp_path / "a.mkv", list(range(len(durations))))
+    assert "a.mkv: has a variable frame rate (frames last 20 to 1500 ms)" in warning
+    assert footage.fps == pytest.approx(50, rel=1e-3)
+    times = [sum(durations[:number]) for number in range(len(durations))]
+    assert footage.timesteps == tuple(times)
+    assert [shown(footage.cameras[0].image(timestep)) for timestep in times] == list(range(len(durations)))
+
+
+def test_cameras_whose_rate_varies_apart(tmp_path):
+    """Catches frames of two cameras paired by their number although each has dropped others."""
+    durations = {"a": [1, 1, 2, 1, 1, 1, 2] * 3, "b": [1, 2, 1, 1, 1, 1, 2] * 3}
+    times = {}
+    for name, own in durations.items():
+        write_numbered(tmp_path / f"{name}.mkv", "libx264", X264, len(own), rate=50, durations=own)
+        times[name] = [sum(own[:number]) for number in range(len(own))]
+    write_colmap_text(tmp_path / "sparse/0", rig(2, COLUMNS * BLOCK, ROWS * BLOCK), ["a.png", "b.png"])
+    footage = open_footage(tmp_path)
+    assert footage.timesteps == tuple(sorted(set(times["a"]) & set(times["b"])))
+    for camera in footage.cameras:
+        found = [shown(camera.image(timestep)) for timestep in footage.timesteps]
+        assert found == [times[camera.name].index(timestep) for timestep in footage.timesteps]
+
+
+# A display matrix in the file's track header, and how a player shows the corners a b / c d of the stored picture.
+TURNS = {
+    "as stored": ((1, 0, 0, 1), "ab cd"),
+    "mirrored": ((-1, 0, 0, 1), "ba dc"),
+    "upside down": ((-1, 0, 0, -1), "dc ba"),
+    "mirrored top to bottom": ((1, 0, 0, -1), "cd ab"),
+    "turned clockwise": ((0, 1, -1, 0), "ca db"),
+    "turned counterclockwise": ((0, -1, 1, 0), "bd ac"),
+    "mirrored and turned": ((0, 1, 1, 0), "ac bd"),
+}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_display_matrices(tmp_path, turn):
+    """Catches a front camera's video that is shown mirrored, lying or upside down."""
+    matrix, expected = TURNS[turn]
+    path, levels = tmp_path / "phone.mp4", {"a": 30, "b": 90, "c": 150, "d": 210}
+    image = np.kron([[levels["a"], levels["b"]], [levels["c"], levels["d"]]], np.ones((32, 48))).astype(np.uint8)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"crf": "8"})
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        frame = av.VideoFrame.from_ndarray(np.repeat(image[..., None], 3, axis=2), format="rgb24")
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44  # of the track header, version 0: 16.16 and 2.30 fixed point
+    a, b, c, d = (value << 16 for value in matrix)
+    data[at : at + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    shown_image = open_footage(path).cameras[0].image(0)[..., 0].astype(int)
+    height, width = shown_image.shape
+    corners = shown_image[height // 4 :: height // 2, width // 4 :: width // 2]
+    names = np.array(list("abcd"))[np.abs(corners[..., None] - list(levels.values())).argmin(-1)]
+    assert " ".join("".join(row) for row in names) == expected
+
+
+# Signals (R, G, B), 0 to 1, of a video, and the sRGB they are to be shown as. Gray card and white: ITU-R BT.2408, table
+# 1 (26 and 203 cd/m²; 26 / 203 is 0.394 in sRGB). sRGB's red in Display P3: CSS Color 4.
+SIGNALS = {
+    "PQ, gray card": ((9, 16, 9), (0.38, 0.38, 0.38), (0.394, 0.394, 0.394)),
+    "PQ, white": ((9, 16, 9), (0.58, 0.58, 0.58), (1, 1, 1)),
+    "HLG, gray card": ((9, 18, 9), (0.38, 0.38, 0.38), (0.394, 0.394, 0.394)),
+    "HLG, white": ((9, 18, 9), (0.75, 0.75, 0.75), (1, 1, 1)),
+    "Display P3, gray": ((12, 1, 1), (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+    "Display P3, red of sRGB": ((12, 1, 1), (0.9175, 0.2003, 0.1386), (1, 0, 0)),
+    "BT.709": ((1, 1, 1), (0.9, 0.2, 0.15), (0.9, 0.2, 0.15)),
+}
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_colors_of_phones(tmp_path, name):
+    """Catches HDR shown flat and dark, and wide colors shown pale."""
+    (primaries, transfer, matrix), signal, expected = SIGNALS[name]
+    path, deep = tmp_path / "a.mov", transfer != 1
+    codec, pixels = ("libx265", "yuv444p10le") if deep else ("libx264", "yuv444p")
+    if codec not in av.codecs_available:
+        pytest.skip(f"this PyAV lacks {codec}")
+    options = {"crf": "4"} | ({"x265-params": "log-level=0"} if deep else {})
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, pixels
+        context = stream.codec_context
+        context.color_primaries, context.color_trc, context.colorspace, context.color_range = (
+            primaries, transfer, matrix, 1,
+        )  # fmt: skip
+        image = np.broadcast_to(np.round(65535 * np.array(signal)), (64, 64, 3)).astype(np.uint16)
+        frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(format=pixels, dst_colorspace=matrix)
+        for number in range(4):
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    found = open_footage(path).cameras[0].image(0)[32, 32] / 255
+    np.testing.assert_allclose(found, expected, atol=0.025)
 
 
 @pytest.mark.parametrize(("name", "rate"), [("a.mp4", 60), ("a.mkv", 30), ("a.mts", 50), ("a.avi", 25)])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size, read_image, read_mask
+from ...capture.images import image_size, is_plain, read_image, read_mask
 from ...capture.model import View
 from ...errors import StgaError
 
@@ -41,4 +41,5 @@ class ImageFrames:
         return str(self.views[timestep].image)
 
     def file(self, timestep: int) -> Path | None:
-        return self.views[timestep].image
+        image = self.views[timestep].image
+        return image if is_plain(image) else None

@@ -28,7 +28,7 @@ class Frames(Protocol):
         """What a message calls the frame: its file, in a video with the number of the frame."""
 
     def file(self, timestep: int) -> Path | None:
-        """The image file that holds the frame; None in a video."""
+        """The image file whose stored pixels are the frame; None in a video, and where they are turned or converted."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class FootageCamera:
         return self.frames.source(timestep)
 
     def file(self, timestep: int) -> Path | None:
-        """An image file with the same pixels as `image`; None for frames of videos and of distorted lenses."""
+        """An image file whose stored pixels are those of `image`; None where there is none."""
         return self.frames.file(timestep) if self.undistortion is None else None
 
 

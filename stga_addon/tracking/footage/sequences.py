@@ -71,7 +71,8 @@ def frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
 def synchronized(
     sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], sources: Sources, frames: FrameRange
 ) -> dict[str, Frames]:
-    """Frames of each camera; timestep t is frame t + offset of its recording.
+    """Frames of each camera; timestep t is frame t + offset of its recording. Timesteps of which a video whose rate
+    varies has no frame are left out.
 
     Raises StgaError where a camera has fewer frames than another, lacks one in between, or is of another size.
     """
@@ -79,15 +80,26 @@ def synchronized(
     if unknown:
         raise StgaError(f"Offset for camera {min(unknown)}: expected one of {', '.join(sequences)}")
     first, last = _common_range(sequences, frames)
-    timesteps = [t for t in range(first, last) if frames.selects(t)]
+    recorded = {name: _numbers(sequence) for name, sequence in sequences.items()}
+    shared = set.intersection(
+        *({number - frames.offsets.get(name, 0) for number in own} for name, own in recorded.items())
+    )
+    timesteps = [t for t in sorted(shared) if first <= t < last and frames.selects(t)]
     if not timesteps:
         raise StgaError(f"Frames from {frames.start} on: the cameras have only {last} in common")
     _require_same_gaps(sequences, frames, timesteps)
     result = {}
     for name, sequence in sequences.items():
-        numbers = {t: t + frames.offsets.get(name, 0) for t in timesteps}
+        numbers = {t: recorded[name][t + frames.offsets.get(name, 0)] for t in timesteps}
         result[name] = _frames(sequence, numbers, shots[name], sources)
     return result
+
+
+def _numbers(sequence: Sequence) -> dict[int, int]:
+    """Timestep, without offset -> number of the frame, the first of several."""
+    if not isinstance(sequence, Video):
+        return dict(enumerate(range(len(sequence))))
+    return {timestep: number for number, timestep in reversed(list(enumerate(sequence.timesteps)))}
 
 
 def _common_range(sequences: Mapping[str, Sequence], frames: FrameRange) -> tuple[int, int]:
@@ -95,7 +107,7 @@ def _common_range(sequences: Mapping[str, Sequence], frames: FrameRange) -> tupl
 
     Recordings of different length may start at different moments, so they need a `stop` or offsets.
     """
-    lengths = {name: len(s.times) if isinstance(s, Video) else len(s) for name, s in sequences.items()}
+    lengths = {name: s.timesteps[-1] + 1 if isinstance(s, Video) else len(s) for name, s in sequences.items()}
     longest = max(lengths, key=lambda name: lengths[name])
     for name, length in lengths.items():
         if frames.stop is not None and length - frames.offsets.get(name, 0) < frames.stop:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...capture.camera import is_image_size
+from ...capture.color import is_srgb, to_srgb
 from ...errors import StgaError
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf")
@@ -22,6 +23,9 @@ SEEKABLE_CONTAINERS = (*TIMED_CONTAINERS, "mpegts")
 """Containers in which a frame has the same presentation time after a seek as in order."""
 CODECS_WITH_HIDDEN_PACKETS = ("vp8",)
 """Whose reference frames that are not shown are packets of their own."""
+
+DISPLAY_MATRIX_ONE = 1 << 16
+"""In the fixed-point numbers of a display matrix (ISO/IEC 14496-12, track header)."""
 
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
@@ -41,7 +45,8 @@ class Video:
 
     times     presentation times of the frames that are shown, ascending, in the stream's time base; their numbers where
               the file holds no reliable times
-    fps       frames per second, the average where it varies; 0 where unknown
+    timesteps  of the frames, not descending: their numbers, but where the rate varies their times in units of 1 / fps
+    fps       frames per second; without its gaps where it varies; 0 where unknown
     size      (width, height) as displayed
     seekable  whether a frame is recognized by its time; False: frames are counted from the beginning
     warnings  one sentence each
@@ -49,6 +54,7 @@ class Video:
 
     path: Path
     times: tuple[int, ...]
+    timesteps: tuple[int, ...]
     fps: float
     size: tuple[int, int]
     seekable: bool = True
@@ -71,12 +77,13 @@ def read_video(path: Path) -> Video:
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
         time_base = float(stream.time_base)
     if not seekable:
-        return Video(path, tuple(range(len(times))), next(iter(rates), 0.0), size, seekable=False)
+        numbers = tuple(range(len(times)))
+        return Video(path, numbers, numbers, next(iter(rates), 0.0), size, seekable=False)
     shown = tuple(time for time in times[left_out:] if time is not None)
-    warnings = _rate_warnings(path, shown, time_base)
+    timesteps, fps, warnings = _timed(path, shown, time_base, rates)
     if left_out:
         warnings += (f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",)
-    return Video(path, shown, _frame_rate(shown, time_base, rates), size, warnings=warnings)
+    return Video(path, shown, timesteps, fps, size, warnings=warnings)
 
 
 def video_size(path: Path) -> tuple[int, int]:
@@ -280,16 +287,22 @@ def _frame_rate(times: Sequence[int], time_base: float, rates: list[float]) -> f
     return next((rate for rate in rates if abs(rate - measured) <= RATE_TOLERANCE * measured), measured)
 
 
-def _rate_warnings(path: Path, times: Sequence[int], time_base: float) -> tuple[str, ...]:
+def _timed(
+    path: Path, times: Sequence[int], time_base: float, rates: list[float]
+) -> tuple[tuple[int, ...], float, tuple[str, ...]]:
+    """Timesteps of the frames, frames per second, and a sentence where the rate varies."""
     durations = np.diff(times)
     if not len(durations) or durations.max() <= VARIABLE_RATE_FACTOR * np.median(durations):
-        return ()
+        return tuple(range(len(times))), _frame_rate(times, time_base, rates), ()
+    usual = durations[durations <= VARIABLE_RATE_FACTOR * np.median(durations)]
+    fps = 1 / (time_base * float(usual.mean()))
+    timesteps = np.round((np.array(times) - times[0]) * time_base * fps).astype(int)
     low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
-    average = 1 / (time_base * float(durations.mean()))
-    return (
-        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); it is played at the average of "
-        f"{average:.4g} frames per second",
-    )
+    missing = timesteps[-1] + 1 - len(np.unique(timesteps))
+    return tuple(timesteps.tolist()), fps, (
+        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); they are numbered by their times, "
+        f"{fps:.4g} a second, and {missing} numbers have none",
+    )  # fmt: skip
 
 
 def _reason(error: Exception) -> str:
@@ -297,12 +310,32 @@ def _reason(error: Exception) -> str:
 
 
 def _pixels(frame: Any) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, turned as the video asks for."""
+    """(H, W, 3) uint8 sRGB, turned and mirrored as the video asks for."""
     matrix = frame.colorspace
     if matrix == 2 and frame.height >= MIN_HD_LINES:  # FFmpeg's "unspecified"
         matrix = 1  # BT.709
-    rgb = frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
-    return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90)))
+    codes = int(frame.color_primaries), int(frame.color_trc)
+    deep = not is_srgb(*codes)  # 8 bits of HDR are too few for its dark colors
+    rgb = frame.reformat(format="rgb48le" if deep else "rgb24", src_colorspace=matrix).to_ndarray()
+    return _displayed(to_srgb(rgb, *codes) if deep else rgb, _display_matrix(frame))
+
+
+def _display_matrix(frame: Any) -> np.ndarray:
+    """(2, 2) whole numbers a video's header maps stored pixels with: row vector (x, y) times the matrix, y down."""
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return np.eye(2, dtype=int)
+    turn = np.sign(np.round(np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2) / DISPLAY_MATRIX_ONE))
+    whole = np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]
+    return turn.astype(int) if whole else np.eye(2, dtype=int)
+
+
+def _displayed(pixels: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """The pixels mirrored and turned by quarters."""
+    if turn[0, 0] == 0:  # the stored x becomes y
+        pixels, turn = pixels.swapaxes(0, 1), turn[::-1]
+    columns, rows = np.sign(np.diag(turn)).tolist()
+    return np.ascontiguousarray(pixels[::rows, ::columns])
 
 
 def _pyav(path: Path) -> Any:

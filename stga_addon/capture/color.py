@@ -1,0 +1,102 @@
+"""Conversion of recorded colors to sRGB, by the code points of ITU-T H.273 (videos, PNG's cICP)."""
+
+from functools import lru_cache
+
+import numpy as np
+
+CHROMATICITIES = {
+    1: ((0.640, 0.330), (0.300, 0.600), (0.150, 0.060)),  # BT.709, sRGB
+    9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),  # BT.2020, BT.2100
+    12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),  # Display P3
+}
+"""Code of color primaries -> CIE xy of red, green and blue. White is D65; all other codes are taken as sRGB's."""
+D65 = (0.3127, 0.3290)
+SRGB = 1
+LINEAR, PQ, HLG = 8, 16, 18
+GAMMAS = {4: 2.2, 5: 2.8}
+"""Code of transfer characteristics -> exponent. Codes that are not named here are taken as sRGB's curve."""
+
+REFERENCE_WHITE_CD_M2 = 203.0
+"""Luminance of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's white; what is brighter is clipped."""
+HLG_PEAK_CD_M2, HLG_SYSTEM_GAMMA = 1000.0, 1.2
+BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
+BAND_PIXELS = 1 << 18
+
+
+def is_srgb(primaries: int, transfer: int) -> bool:
+    """Whether colors of these codes are shown as sRGB without a conversion."""
+    return primaries not in (9, 12) and transfer not in (LINEAR, PQ, HLG, *GAMMAS)
+
+
+def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
+    """Colors (H, W, 3), uint8 or uint16 full range, as uint8 sRGB.
+
+    primaries, transfer: codes of ITU-T H.273. What sRGB cannot hold is clipped.
+    """
+    if is_srgb(primaries, transfer):
+        return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+    table = _linear(transfer, np.iinfo(pixels.dtype).max + 1)
+    matrix = _to_bt709(primaries if primaries in CHROMATICITIES else SRGB)
+    found = np.empty(pixels.shape, np.uint8)
+    step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
+    for start in range(0, len(pixels), step):
+        light = table[pixels[start : start + step]]
+        if transfer == HLG:
+            light = _displayed(light)
+        found[start : start + step] = 255 * encode_srgb(np.clip(light @ matrix.T, 0, 1)) + 0.5
+    return found
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """sRGB's signal of linear light, both 0 to 1 (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(signal: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB's signal, both 0 to 1 (IEC 61966-2-1)."""
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+
+
+def with_gamma(pixels: np.ndarray, gamma: float) -> np.ndarray:
+    """uint8 pixels whose file says that they are light to the power of `gamma` (PNG's gAMA), as sRGB."""
+    levels = encode_srgb((np.arange(256) / 255) ** (1 / gamma))
+    return np.asarray((255 * levels + 0.5).astype(np.uint8)[pixels])
+
+
+@lru_cache(maxsize=8)
+def _linear(transfer: int, levels: int) -> np.ndarray:
+    """(levels,) light of each signal: 1 is diffuse white. HLG: of the scene, before `_displayed`."""
+    signal = np.arange(levels) / (levels - 1)
+    if transfer == LINEAR:
+        light = signal
+    elif transfer == PQ:  # SMPTE ST 2084
+        root = signal ** (32 / 2523)
+        ratio = np.maximum(root - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * root)
+        light = 10000 / REFERENCE_WHITE_CD_M2 * ratio ** (16384 / 2610)
+    elif transfer == HLG:  # ITU-R BT.2100, table 5
+        a, b, c = 0.17883277, 0.28466892, 0.55991073
+        light = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
+    elif transfer in GAMMAS:
+        light = signal ** GAMMAS[transfer]
+    else:
+        light = decode_srgb(signal)
+    return light.astype(np.float32)
+
+
+def _displayed(scene: np.ndarray) -> np.ndarray:
+    """HLG's light of the scene (…, 3), BT.2020, as that of a display, 1 being diffuse white (BT.2100's OOTF)."""
+    luminance = np.maximum(scene @ BT2020_LUMINANCE.astype(scene.dtype), 1e-6)
+    return HLG_PEAK_CD_M2 / REFERENCE_WHITE_CD_M2 * luminance[..., None] ** (HLG_SYSTEM_GAMMA - 1) * scene
+
+
+@lru_cache(maxsize=8)
+def _to_bt709(primaries: int) -> np.ndarray:
+    """(3, 3) from linear light of these primaries to that of BT.709."""
+    return (np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(primaries)).astype(np.float32)
+
+
+def _to_xyz(primaries: int) -> np.ndarray:
+    """(3, 3) from linear light to CIE XYZ (SMPTE RP 177)."""
+    x, y = np.array([*CHROMATICITIES[primaries], D65]).T
+    xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+    return np.asarray(xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]))
