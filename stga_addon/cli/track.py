@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
-from ..requests.values import Track
+from ..requests.values import WORLDS, Track
 from .arguments import real_number, usable_path, whole_number
 from .carry_out import carry_out
 
@@ -49,6 +49,13 @@ def add_footage(parser: ArgumentParser) -> None:
         metavar="CAMERA=FRAMES",
         help="frames by which a camera's recording is later; may be repeated",
     )
+    parser.add_argument(
+        "--world",
+        choices=WORLDS,
+        default="auto",
+        help="the capture's: in meters with the head near the origin, or the cameras' own (default: the cameras' where "
+        "they were exported from a Blender scene)",
+    )
     parser.add_argument("--meshes", action="store_true", help="write an OBJ per timestep as well")
 
 
@@ -68,6 +75,7 @@ def tracking_request(options: Namespace, out: Path) -> Track:
     return Track(
         options.footage, options.model, out, options.cameras, options.landmarks, options.detector, options.focal,
         options.start, options.stop, options.step, dict(options.offset), options.meshes,
+        options.world,
     )  # fmt: skip
 
 

@@ -30,7 +30,9 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     steps("Opening the footage", 0, 1)
     frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}))
     footage = open_footage(request.footage, request.cameras, frames, request.focal)
-    found = track(footage, request.model, request.out, request.landmarks, request.detector, request.meshes, steps)
+    found = track(
+        footage, request.model, request.out, request.landmarks, request.detector, request.meshes, request.world, steps
+    )
     error = f"Reprojection error {found.median_px:.1f} px (median)"
     report(Progress(1.0, "Tracked", error))
     lines = [

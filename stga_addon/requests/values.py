@@ -18,6 +18,8 @@ def device_field() -> Any:
     """A field for a device as `choose_device` takes it; "auto" continues a run on the device that trained it."""
     return setting("auto", accepts=is_device, expected=EXPECTED_DEVICE)
 
+WORLDS = "auto", "head", "keep"
+
 
 @dataclass(frozen=True)
 class Train:
@@ -143,6 +145,8 @@ class Track:
     start, stop, step   timesteps, `stop` excluded
     offset          camera -> frames by which its recording is later
     meshes          write an OBJ per timestep as well
+    world           the capture's: "head": in meters, y up, the head near the origin; "keep": the cameras'; "auto": as
+                    the calibration says, else "head"
     """
 
     footage: Path
@@ -157,6 +161,7 @@ class Track:
     step: int = setting(1, 1)
     offset: Mapping[str, int] | None = None
     meshes: bool = False
+    world: str = setting("auto", choices=WORLDS)
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,21 @@ from ..files import write_json
 from . import tags
 from .render.camera import image_size, render_camera
 
+Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
 
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
     """Write the cameras at the current frame as transforms.json with pinholes; how many.
 
     cameras: camera objects. Each is named after its object: footage has a folder, a video or an image of that name.
-    Image size: the scene's resolution, or that of the capture that the camera was imported from.
+    Axes are those of captures, y up, and the file says that a capture keeps this world: imported, it lies among the
+    cameras. Image size: the scene's resolution, or that of the capture that the camera was imported from.
     Raises StgaError for a camera that is not perspective, is mirrored, or where there are none.
     """
     entries = [_entry(camera.name, _camera(camera.evaluated_get(depsgraph), depsgraph)) for camera in cameras]
     if not entries:
         raise StgaError("No cameras to export; add them, or select some")
-    write_json(path, {"camera_model": "PINHOLE", "frames": entries})
+    write_json(path, {"camera_model": "PINHOLE", "world": "keep", "frames": entries})
     return len(entries)
 
 
@@ -43,5 +46,5 @@ def _entry(name: str, camera: Camera) -> dict[str, Any]:
         "w": camera.width,
         "h": camera.height,
         **{key: float(value) for key, value in intrinsics.items()},
-        "transform_matrix": camera.camera_to_world_gl.tolist(),
+        "transform_matrix": (Z_UP_TO_Y_UP @ camera.camera_to_world_gl).tolist(),
     }

@@ -17,6 +17,8 @@ from .triangulation import Triangulation, rays, triangulate
 IDENTITY_TIMESTEPS = 12
 """Timesteps, spread over the take, that identity is solved from."""
 ROUNDS = 3
+MAX_HEAD_SCALE = 1.25
+"""Size of a head, or its inverse, relative to the average one, beyond which the cameras' world is not in meters."""
 MIN_VISIBILITY = 1e-3
 """Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than left open."""
 RESIDUAL_SCALE_M = 0.004
@@ -76,6 +78,29 @@ class HeadFit:
     static_offset: np.ndarray | None = None
 
 
+def in_cameras_world(fit: HeadFit) -> HeadFit:
+    """The same fit with the cameras where they are: only the scale of their world changes, about its origin.
+
+    The head is turned and moved by its root joint, whose place depends on the expression.
+    """
+    from scipy.spatial.transform import Rotation
+
+    model, world = fit.head.model, fit.to_capture
+    expressions = model.shapedirs[:, :, model.n_identity :]
+    joint, joint_dirs = model.j_regressor[0] @ model.v_template, np.einsum(
+        "v,vak->ak", model.j_regressor[0], expressions
+    )
+    moved = {}
+    for timestep, parameters in fit.parameters.items():
+        root = joint + joint_dirs @ parameters[:-RIGID_SIZE]
+        rigid = parameters[-RIGID_SIZE:].copy()
+        turned = world.rotation.T @ Rotation.from_rotvec(rigid[:3]).as_matrix()
+        rigid[:3] = Rotation.from_matrix(turned).as_rotvec()
+        rigid[POSE_SIZE:] = (root + rigid[POSE_SIZE:] - world.translation) @ world.rotation - root
+        moved[timestep] = np.concatenate([parameters[:-RIGID_SIZE], rigid])
+    return replace(fit, parameters=moved, to_capture=Similarity(world.scale, np.eye(3), np.zeros(3)))
+
+
 def is_face(pixels: np.ndarray) -> bool:
     """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one point."""
     return len(pixels) > 0 and bool((np.ptp(pixels, axis=0) >= MIN_FACE_PIXELS).all())
@@ -99,11 +124,13 @@ def fit_head(
     reliable: np.ndarray,
     take: Mapping[int, TimestepLandmarks],
     report: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    metric: bool = False,
 ) -> HeadFit:
     """Fit the model to the landmarks of the timesteps of `take`, each of which `determines_pose`.
 
     Rounds of triangulation, identity and scale from timesteps spread over the take, then all timesteps; from the second
-    round on, a camera's landmarks count by the angle at which it sees the surface.
+    round on, a camera's landmarks count by the angle at which it sees the surface. metric: the world of the cameras is
+    in meters, and the size of the head is the person's.
     """
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
@@ -111,7 +138,7 @@ def fit_head(
     neutral = places.on(head.model.v_template, head.model.faces)
     scale = 1.0  # without several cameras, the head's own size decides
     found = {t: triangulated(take[t], reliable, neutral, scale) for t in spread}
-    world = _average([_aligned(found[t], neutral, reliable) for t in spread])
+    world = _average([_aligned(found[t], neutral, reliable, metric) for t in spread])
     seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
     solved = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE))
     for number in range(ROUNDS):
@@ -120,7 +147,7 @@ def fit_head(
         found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
         observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
         starts = np.stack([rigid_start(at, observed[t]) for t in spread])
-        identity = solve_identity(head, places, [observed[t] for t in spread], starts)
+        identity = solve_identity(head, places, [observed[t] for t in spread], starts, metric)
         world = replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale)
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
@@ -136,11 +163,28 @@ def fit_head(
     return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world)
 
 
-def similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama)."""
+def is_metric(
+    head: HeadModel, places: SurfacePoints, reliable: np.ndarray, take: Mapping[int, TimestepLandmarks]
+) -> bool:
+    """Whether the face is as large in the cameras' world as a person's in meters; True of one camera, which does not
+    see size."""
+    several = [t for t in sorted(take) if len(take[t].cameras) > 1]
+    neutral = places.on(head.model.v_template, head.model.faces)
+    scales = [
+        _aligned(triangulated(take[t], reliable, neutral, 1.0), neutral, reliable, metric=False).scale
+        for t in evenly_spread(several, IDENTITY_TIMESTEPS)
+    ]
+    return not scales or 1 / MAX_HEAD_SCALE <= float(np.median(scales)) <= MAX_HEAD_SCALE
+
+
+def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> Similarity:
+    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama).
+
+    metric: of those with a scale of 1.
+    """
     rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
     a, b = source - source.mean(0), target - target.mean(0)
-    scale = float((b * (a @ rotation.T)).sum() / (a**2).sum())
+    scale = 1.0 if metric else float((b * (a @ rotation.T)).sum() / (a**2).sum())
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
@@ -187,10 +231,10 @@ def observed_landmarks(found: Triangulation, world: Similarity, reliable: np.nda
     return Observation(world.apply(found.position), root, np.where(found.seen & reliable, certain, 0.0))
 
 
-def _aligned(found: Triangulation, neutral: np.ndarray, reliable: np.ndarray) -> Similarity:
+def _aligned(found: Triangulation, neutral: np.ndarray, reliable: np.ndarray, metric: bool) -> Similarity:
     """The similarity that brings the landmarks onto the neutral head."""
     use = found.seen & reliable
-    return similarity(found.position[use], neutral[use])
+    return similarity(found.position[use], neutral[use], metric)
 
 
 def _average(found: Sequence[Similarity]) -> Similarity:

@@ -88,13 +88,15 @@ class SeenSurface:
 
 @dataclass(frozen=True)
 class Take:
-    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, images, masks."""
+    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, images, masks, and
+    whether the world of the cameras is in meters."""
 
     places: SurfacePoints
     reliable: np.ndarray
     landmarks: Mapping[int, TimestepLandmarks]
     images: Images
     masks: Images = no_masks
+    metric: bool = False
 
 
 def fit_surface(head: HeadModel, fit: HeadFit, take: Take, report: Report = lambda stage, done, total: None) -> HeadFit:
@@ -313,7 +315,7 @@ def _solved(
     """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the new scale."""
     together = [_joined(_landmarks(fit, t, take), LANDMARK_SHARE, own) for t, own in seen.items()]
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
-    identity = solve_identity(base, _both(take.places, points), together, starts)
+    identity = solve_identity(base, _both(take.places, points), together, starts, take.metric)
     world = fit.to_capture
     moved = HeadFit(
         person(base, identity.shape),

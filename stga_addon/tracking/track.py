@@ -17,7 +17,17 @@ from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .detectors import make_detector
-from .fit import MIN_FACE_M, HeadFit, TimestepLandmarks, determines_pose, fit_head, is_face
+from .fit import (
+    MAX_HEAD_SCALE,
+    MIN_FACE_M,
+    HeadFit,
+    TimestepLandmarks,
+    determines_pose,
+    fit_head,
+    in_cameras_world,
+    is_face,
+    is_metric,
+)
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
 from .footage.model import Footage, FootageCamera
 from .head_model import read_head_model
@@ -69,13 +79,16 @@ def track(
     landmarks: Path | None = None,
     task: Path | None = None,
     meshes: bool = False,
+    world: str = "auto",
     report: Report = lambda stage, done, total: None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
     landmarks: folder of landmark files in place of a detector; task: MediaPipe's .task file (`make_detector`).
     What was detected is kept in OUT/landmarks: called again after an interruption, those cameras are not detected
-    again. The capture's world is in meters, y up, with the head near its origin. Raises StgaError.
+    again. world: "head": meters as the head's size says, y up, the head near the origin; "keep": that of the cameras,
+    which is scaled about its origin where it is not in meters; "auto": as the calibration says, else "head".
+    Raises StgaError.
     """
     if is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
@@ -105,18 +118,20 @@ def track(
     take = {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
     if not take:
         raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
-    fit = fit_head(head, places, reliable, take, report)
+    keep = world == "keep" or (world == "auto" and footage.keeps_world)
+    metric = keep and is_metric(head, places, reliable, take)
+    fit = fit_head(head, places, reliable, take, report, metric)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
-    fit = fit_surface(
-        head, fit, Take(places, reliable, take, partial(_images, footage), partial(_masks, footage)), report
-    )
+    recorded = Take(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
+    fit = fit_surface(head, fit, recorded, report)
+    fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, found, fit) + scale_warnings(fit, places, reliable, footage, found),
+        _warnings(footage, found, fit, keep and not metric) + scale_warnings(fit, places, reliable, footage, found),
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -259,7 +274,9 @@ def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[flo
         )
 
 
-def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit) -> tuple[str, ...]:
+def _warnings(
+    footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit, is_scaled: bool
+) -> tuple[str, ...]:
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     blind = [name for name, own in found.items() if not own.confidence.any()]
     warnings = list(footage.warnings)
@@ -273,6 +290,11 @@ def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadF
     elif fit.static_offset is None:
         warnings.append(
             "the images do not show the skin's surface sharply enough: the head is fitted to landmarks alone"
+        )
+    if is_scaled:
+        warnings.append(
+            f"the cameras' world is kept but for its scale: in meters, the head would be more than "
+            f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {fit.to_capture.scale:.4g}"
         )
     if not footage.calibrated:
         warnings.append("the focal length is a guess; give it if it is known")

@@ -56,9 +56,10 @@ def test_points_project_as_in_blender(tmp_path):
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["left", "Camera.001", "on rail"]
     assert footage.timesteps == (0, 1)
+    assert footage.keeps_world
     points = np.random.default_rng(2).normal(0, 0.1, (12, 3))
     for camera in footage.cameras:
-        pixels, depths = camera.camera.project(points)
+        pixels, depths = camera.camera.project(points[:, [0, 2, 1]] * [1, 1, -1])  # captures are y up
         seen = [world_to_camera_view(bpy.context.scene, bpy.data.objects[camera.name], Vector(p)) for p in points]
         expected = [(x * WIDTH, (1 - y) * HEIGHT) for x, y, _ in seen]
         np.testing.assert_allclose(pixels, expected, atol=2e-3, err_msg=camera.name)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_raster import rasterize
@@ -17,6 +18,7 @@ from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import nearest_points
+from stga_addon.tracking.fit import Similarity
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
@@ -112,6 +114,38 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
     np.testing.assert_allclose(written, capture.mesh(1), atol=2e-6)
     assert read_json(folder / "out/tracking.json")["interpolated"] == [2]
     assert (folder / "out/contact_sheet.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("scale", "arguments"), [(1.06, ["--world", "keep"]), (1.0, []), (1000.0, ["--world", "keep"])]
+)
+def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
+    """Catches cameras and head moved, turned or scaled away from the scene that the footage was filmed in.
+
+    Without --world, the calibration says it. The head is 6 % larger than the model's, or in millimeters.
+    """
+    folder, meshes = recorded
+    turn = Rotation.from_euler("xyz", [100, -40, 20], degrees=True).as_matrix()
+    world, path = Similarity(scale, turn, np.array([2.0, -1.0, 0.5]) * scale), folder / "footage/transforms.json"
+    values = read_json(path)
+    for entry in values["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        pose[:3] = np.column_stack([turn @ pose[:3, :3], world.apply(pose[None, :3, 3])[0]])
+        entry["transform_matrix"] = pose.tolist()
+    write_json(path, values if arguments else {**values, "world": "keep"})
+    assert command(folder, *arguments) == 0
+    assert ("is kept but for its scale" in capsys.readouterr().out) == (scale == 1000)
+    capture, kept = open_capture(folder / "out", folder / "head.npz"), read_json(folder / "out/tracking.json")
+    unit = kept["meters_per_unit"]
+    assert unit == pytest.approx(1.0 if scale < 2 else 0.001, rel=1e-9 if scale < 2 else 0.03)
+    filmed = {camera.name: camera.camera for camera in open_footage(folder / "footage").cameras}
+    for view in capture.views["train"]:
+        camera = filmed[f"cam{view.camera_index}"]
+        np.testing.assert_allclose(view.camera.position, unit * camera.position, atol=1e-6)
+        np.testing.assert_allclose(view.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-9)
+    for timestep in (0, 3):
+        missed = (capture.mesh(timestep) - unit * world.apply(meshes[timestep]))[head.model.masks["face"]]
+        assert np.linalg.norm(missed, axis=1).mean() < 2e-3
 
 
 @pytest.mark.parametrize("fps", [None, 60000 / 1001])

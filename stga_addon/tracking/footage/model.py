@@ -82,6 +82,7 @@ class Footage:
     fps         frames per second of the videos, the average where it varies; None where not known, as for most images.
                 Timesteps are numbers of frames
     calibrated  False for one camera whose focal length is a guess, not read from a file or given
+    keeps_world  whether the calibration says that the capture is to keep its world
     warnings    one sentence each
     """
 
@@ -90,6 +91,7 @@ class Footage:
     timesteps: tuple[int, ...]
     fps: float | None = None
     calibrated: bool = True
+    keeps_world: bool = False
     warnings: tuple[str, ...] = ()
 
     def views(self) -> Iterator[tuple[int, FootageCamera]]:

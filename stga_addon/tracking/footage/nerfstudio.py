@@ -29,9 +29,9 @@ def read_nerfstudio(path: Path, principal_point: str | None = None) -> list[Shot
     frames = read_transforms(path, principal_point or ("vhap" if timed else "opencv"))
     timed = timed or any("keyframe" in entry for entry in entries)
     folder = path.parent.resolve()
-    fps = frame_rate(path, values)
+    fps, keeps_world = frame_rate(path, values), values.get("world") == "keep"
     return [
-        replace(_shot(folder, frame, {**values, **entry}, timed), fps=fps)
+        replace(_shot(folder, frame, {**values, **entry}, timed), fps=fps, keeps_world=keeps_world)
         for frame, entry in zip(frames, entries, strict=True)
     ]
 

@@ -58,19 +58,24 @@ def open_footage(
     if focal is not None:
         raise StgaError(f"{calibration}: has focal lengths; expected none besides")
     shots, warnings = read_calibration(calibration, principal_point, partial(_image_size, sources))
+    found = _calibrated(root, sources, calibration, shots, frames)
+    warnings = (*warnings, *found.warnings)
+    return replace(found, keeps_world=all(shot.keeps_world for shot in shots), warnings=warnings)
+
+
+def _calibrated(root: Path, sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
     if frames.offsets and not any(names):
         raise StgaError(f"{calibration}: lists images, which offsets do not apply to; expected none")
     if timed:
         found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
-        return _footage(root, found, next((shot.fps for shot in shots if shot.fps is not None), None), warnings)
+        return _footage(root, found, next((shot.fps for shot in shots if shot.fps is not None), None))
     if any(names):
         rig = _by_name(shots, names, root)
         sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
-        footage = _rig(root, sources, sequences, rig, frames)
-        return replace(footage, warnings=(*warnings, *footage.warnings))
-    return _footage(root, _listed_cameras(_with_stills(shots, sources), calibration), warnings=warnings)
+        return _rig(root, sources, sequences, rig, frames)
+    return _footage(root, _listed_cameras(_with_stills(shots, sources), calibration))
 
 
 def _sources(path: Path) -> tuple[Sources, Path]:

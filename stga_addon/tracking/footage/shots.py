@@ -18,6 +18,7 @@ class Shot:
     mask      its foreground mask
     camera_name  what the file calls the camera of several images
     fps       frames per second that the file states, whose numbers the timesteps are
+    keeps_world  whether the file says that its world is that of a scene, which the capture is to keep
     """
 
     label: str
@@ -29,3 +30,4 @@ class Shot:
     mask: Path | None = None
     camera_name: str | None = None
     fps: float | None = None
+    keeps_world: bool = False

@@ -299,10 +299,11 @@ def _timed(
     timesteps = np.round((np.array(times) - times[0]) * time_base * fps).astype(int)
     low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
     missing = timesteps[-1] + 1 - len(np.unique(timesteps))
-    return tuple(timesteps.tolist()), fps, (
-        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); they are numbered by their times, "
-        f"{fps:.4g} a second, and {missing} numbers have none",
-    )  # fmt: skip
+    warning = (
+        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); its frames are numbered by their "
+        f"times, {fps:.4g} a second, and {missing} numbers have none"
+    )
+    return tuple(timesteps.tolist()), fps, (warning,)
 
 
 def _reason(error: Exception) -> str:
