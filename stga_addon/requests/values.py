@@ -18,6 +18,7 @@ def device_field() -> Any:
     """A field for a device as `choose_device` takes it; "auto" continues a run on the device that trained it."""
     return setting("auto", accepts=is_device, expected=EXPECTED_DEVICE)
 
+
 WORLDS = "auto", "head", "keep"
 
 

@@ -87,8 +87,9 @@ def in_cameras_world(fit: HeadFit) -> HeadFit:
 
     model, world = fit.head.model, fit.to_capture
     expressions = model.shapedirs[:, :, model.n_identity :]
-    joint, joint_dirs = model.j_regressor[0] @ model.v_template, np.einsum(
-        "v,vak->ak", model.j_regressor[0], expressions
+    joint, joint_dirs = (
+        model.j_regressor[0] @ model.v_template,
+        np.einsum("v,vak->ak", model.j_regressor[0], expressions),
     )
     moved = {}
     for timestep, parameters in fit.parameters.items():

@@ -41,7 +41,8 @@ from .landmarks import (
     write_places,
 )
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
-from .surface import Take, fit_surface
+from .seen_surface import RecordedTake
+from .surface import fit_surface
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
@@ -122,7 +123,7 @@ def track(
     metric = keep and is_metric(head, places, reliable, take)
     fit = fit_head(head, places, reliable, take, report, metric)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
-    recorded = Take(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
+    recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
     fit = fit_surface(head, fit, recorded, report)
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
@@ -274,9 +275,7 @@ def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[flo
         )
 
 
-def _warnings(
-    footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit, is_scaled: bool
-) -> tuple[str, ...]:
+def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit, is_scaled: bool) -> tuple[str, ...]:
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     blind = [name for name, own in found.items() if not own.confidence.any()]
     warnings = list(footage.warnings)

@@ -15,8 +15,8 @@ from stga_addon.tracking.fit import HeadFit, Similarity
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.outline import outline_offsets
 from stga_addon.tracking.posed_points import parameters_of
+from stga_addon.tracking.seen_surface import RecordedTake, near_landmarks, no_masks, outlines_agree, surface_points
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.surface import Take, near_landmarks, no_masks, outlines_agree, surface_points
 
 from .test_fit import frame_at, places_on
 from .test_surface import rig
@@ -81,6 +81,6 @@ def test_mattes_that_are_too_wide_are_not_followed():
     for wide, agree in ((0, True), (2, False)):
         grown = [binary_dilation(mask > 0, iterations=wide) if wide else mask > 0 for mask in masks]
         shown = [(camera, 255 * mask.astype(np.uint8)) for camera, mask in zip(cameras, grown, strict=True)]
-        take = Take(places, used, {}, lambda t: pytest.fail("no image is needed"), lambda t, own=shown: own)
-        assert outlines_agree(fit, take, points, near_landmarks(head, points, take)) is agree
-    assert not outlines_agree(fit, replace(take, masks=no_masks), points, np.ones(len(points), bool))
+        take = RecordedTake(places, used, {}, lambda t: pytest.fail("no image is needed"), lambda t, own=shown: own)
+        assert outlines_agree(fit, take, points, near_landmarks(head, points, take), 0.003) is agree
+    assert not outlines_agree(fit, replace(take, masks=no_masks), points, np.ones(len(points), bool), 0.003)

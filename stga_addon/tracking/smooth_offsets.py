@@ -1,0 +1,59 @@
+"""Smooth offsets of a mesh's vertices along its normals, from where cameras see points of its surface."""
+
+from typing import Any
+
+import numpy as np
+
+from .posed_points import SurfacePoints
+
+OFFSET_DENSITY = 1.5e10
+"""Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
+SMOOTHING_M = 0.009
+"""Length over which offsets are smoothed."""
+OFFSET_SIGMA_M = 0.03
+"""Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
+OFFSET_ITERATIONS = 5
+SURFACE_SIGMA_M = 0.0005
+
+
+def smooth_offsets(
+    vertices: np.ndarray, faces: np.ndarray, points: SurfacePoints, residual: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
+    """Smooth values (V,) of the vertices that take the values `residual` (N,) meters at the points, robustly.
+
+    weight (N,). Least squares with the squared Laplacian as prior; values vanish where no point is near.
+    """
+    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.linalg import spsolve
+
+    count = len(vertices)
+    rows = np.repeat(np.arange(len(points)), 3)
+    at = coo_array((points.barycentric.ravel(), (rows, faces[points.face].ravel())), shape=(len(points), count)).tocsr()
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    share = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
+    laplacian = _laplacian(vertices, faces)
+    prior = OFFSET_DENSITY * (
+        SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
+        + diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))
+    )
+    values, trust = np.zeros(count), weight / SURFACE_SIGMA_M**2
+    for _ in range(OFFSET_ITERATIONS):
+        miss = (residual - at @ values) / (2 * SURFACE_SIGMA_M)
+        robust = trust / (1 + miss**2) ** 2 if values.any() else trust / np.sqrt(1 + miss**2)
+        values = spsolve((at.T @ diags_array(robust) @ at + prior).tocsc(), at.T @ (robust * residual))
+    return np.asarray(values)
+
+
+def _laplacian(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Sparse (V, V), in 1/m²: difference from the mean of a vertex's neighbors, over their mean squared distance."""
+    from scipy.sparse import coo_array, diags_array, eye_array
+
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    size = (len(vertices),) * 2
+    length = ((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1)
+    degree = np.maximum(np.bincount(edges[:, 0], minlength=size[0]), 1)
+    squared = np.maximum(np.bincount(edges[:, 0], length, size[0]) / degree, 1e-8)
+    mean = coo_array((1 / degree[edges[:, 0]], edges.T), shape=size)
+    return (diags_array(4 / squared) @ (mean - eye_array(size[0]))).tocsr()
