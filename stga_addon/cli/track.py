@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
-from ..requests.values import WORLDS, Track
+from ..requests.values import SYNC, WORLDS, Track
 from .arguments import real_number, usable_path, whole_number
 from .carry_out import carry_out
 
@@ -50,6 +50,12 @@ def add_footage(parser: ArgumentParser) -> None:
         help="frames by which a camera's recording is later; may be repeated",
     )
     parser.add_argument(
+        "--sync",
+        choices=SYNC,
+        default="none",
+        help="find offsets that are not given by the videos' sound, or by what moves; auto: sound where all have it",
+    )
+    parser.add_argument(
         "--world",
         choices=WORLDS,
         default="auto",
@@ -75,7 +81,7 @@ def tracking_request(options: Namespace, out: Path) -> Track:
     return Track(
         options.footage, options.model, out, options.cameras, options.landmarks, options.detector, options.focal,
         options.start, options.stop, options.step, dict(options.offset), options.meshes,
-        options.world,
+        options.world, options.sync,
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     the same request continues."""
     steps = _steps(report)
     steps("Opening the footage", 0, 1)
-    frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}))
+    frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}), request.sync)
     footage = open_footage(request.footage, request.cameras, frames, request.focal)
     found = track(
         footage, request.model, request.out, request.landmarks, request.detector, request.meshes, request.world, steps

@@ -20,6 +20,7 @@ def device_field() -> Any:
 
 
 WORLDS = "auto", "head", "keep"
+SYNC = "none", "auto", "sound", "motion"
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,8 @@ class Track:
     focal           focal length of a single camera, in pixels
     start, stop, step   timesteps, `stop` excluded
     offset          camera -> frames by which its recording is later
+    sync            how offsets that are not given are found: from the videos' "sound", their "motion", "auto": sound
+                    where all have it; or "none"
     meshes          write an OBJ per timestep as well
     world           the capture's: "head": in meters, y up, the head near the origin; "keep": the cameras'; "auto": as
                     the calibration says, else "head"
@@ -163,6 +166,7 @@ class Track:
     offset: Mapping[str, int] | None = None
     meshes: bool = False
     world: str = setting("auto", choices=WORLDS)
+    sync: str = setting("none", choices=SYNC)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from ...capture.model import View
 from ...errors import StgaError
 from . import video
 from .calibrations import EXPECTED, find_calibration, read_calibration
+from .clocks import clock_offsets
 from .image_frames import ImageFrames
 from .lens import Lens
 from .model import Footage, FootageCamera, Frames
@@ -66,7 +67,7 @@ def open_footage(
 def _calibrated(root: Path, sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
-    if frames.offsets and not any(names):
+    if (frames.offsets or frames.sync != "none") and not any(names):
         raise StgaError(f"{calibration}: lists images, which offsets do not apply to; expected none")
     if timed:
         found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
@@ -115,8 +116,14 @@ def _rig(
     root: Path, sources: Sources, sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], frames: FrameRange
 ) -> Footage:
     fps = frames_per_second(sequences)
+    videos = {name: sequence for name, sequence in sequences.items() if isinstance(sequence, video.Video)}
+    warnings = tuple(warning for each in videos.values() for warning in each.warnings)
+    if frames.sync != "none":
+        if len(videos) < max(2, len(sequences)) or fps is None:
+            raise StgaError(f"{root}: expected a video of each of several cameras, whose clocks --sync compares")
+        found, sentences = clock_offsets(videos, fps, frames.sync)
+        frames, warnings = replace(frames, offsets={**found, **frames.offsets}), (*warnings, *sentences)
     recorded = synchronized(sequences, shots, sources, frames)
-    warnings = tuple(warning for s in sequences.values() if isinstance(s, video.Video) for warning in s.warnings)
     return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps, warnings)
 
 

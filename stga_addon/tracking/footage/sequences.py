@@ -19,12 +19,14 @@ class FrameRange:
     """Which frames are used: `start`, `start` + `step`, … before `stop` (None: to the end), counted from 0.
 
     offsets  camera -> how many frames later its recording shows the same moment; 0 for those not named
+    sync     how offsets that are not given are found, "sound", "motion" or "auto" as in `clock_offsets`, or "none"
     """
 
     start: int = 0
     stop: int | None = None
     step: int = 1
     offsets: Mapping[str, int] = field(default_factory=dict)
+    sync: str = "none"
 
     def __post_init__(self) -> None:
         if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):

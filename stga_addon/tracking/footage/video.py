@@ -71,7 +71,7 @@ def read_video(path: Path) -> Video:
     left_out = 0 if times is None or first[0] not in times else times.index(first[0])
     if times is None or times[left_out : left_out + len(first)] != first:
         times, left_out = _decoded_times(path), 0
-    with _opened(path) as container:
+    with opened_video(path) as container:
         stream = container.streams.video[0]
         seekable = _ascending(times) and (_is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream))
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
@@ -188,7 +188,7 @@ class VideoFrames:
 
 def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
     """Size (width, height) as displayed and times of the first frames in the order shown. Raises StgaError."""
-    with _opened(path) as container:
+    with opened_video(path) as container:
         frames = _decoded_frames(container)
         first = next(frames, None)
         if first is None:
@@ -201,7 +201,7 @@ def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened_video(path: Path) -> Iterator[Any]:
     """A container that has a video stream. Raises StgaError for what fails while it is open."""
     av = _pyav(path)
     try:
@@ -218,7 +218,7 @@ def _packet_times(path: Path) -> list[int] | None:
 
     Packets that an edit list hides are decoded, but not shown.
     """
-    with _opened(path) as container:
+    with opened_video(path) as container:
         stream = container.streams.video[0]
         timed = _is_of(container, TIMED_CONTAINERS) and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
         if not (timed or _is_intra_only(stream)):
@@ -230,7 +230,7 @@ def _packet_times(path: Path) -> list[int] | None:
 
 def _decoded_times(path: Path) -> Sequence[int | None]:
     """Times of all frames in the order shown."""
-    with _opened(path) as container:
+    with opened_video(path) as container:
         container.streams.video[0].thread_type = "AUTO"
         return [frame.pts for frame in _decoded_frames(container)]
 
