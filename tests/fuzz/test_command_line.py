@@ -382,6 +382,7 @@ def track(rng: random.Random, case: Path) -> list[str]:
         arguments += option(rng, 0.3, name, some_path(rng, case, "mesh", "mesh/transforms.json"))
     for name in ("--start", "--stop", "--step", "--focal"):
         arguments += option(rng, 0.2, name, "1", *NUMBERS)
+    arguments += option(rng, 0.2, "--sync", "auto", "motion", *TEXTS) + option(rng, 0.2, "--world", "keep", *TEXTS)
     return [*arguments, *option(rng, 0.2, "--offset", "0=1", *TEXTS), *output(rng, case, "new")]
 
 
