@@ -13,13 +13,17 @@ from ..requests.results import Result
 from ..requests.values import (
     Analyze,
     Evaluate,
+    Export,
     Extend,
     Refine,
+    Render,
     RenderRecording,
     Request,
     Resume,
+    Select,
     SelectForTake,
     SolveAgain,
+    TimePresets,
     Track,
     Train,
 )
@@ -33,11 +37,15 @@ WORK: dict[type[Any], tuple[str, str]] = {
     Resume: (".training", "perform_training"),
     Refine: (".training", "perform_training"),
     Extend: (".training", "perform_training"),
+    Select: (".selection", "select"),
     SelectForTake: (".training", "select_for_take"),
     Track: (".tracking", "perform_tracking"),
     SolveAgain: (".tracking", "solve_again"),
+    Render: (".render", "render"),
     RenderRecording: (".recording", "render_recording"),
+    Export: (".export", "export"),
     Analyze: (".analysis", "analyze"),
+    TimePresets: (".analysis", "time_each_preset"),
     Evaluate: (".evaluation", "evaluate_run"),
 }
 """Request -> the module that carries it out, loaded when it is needed, and its function."""

@@ -103,7 +103,10 @@ def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selecte
     wanted = Extend(request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame)
     _, _, selection, run = _joined_takes(wanted, say)
     start = run.takes[-1].start
-    return Selected({timestep - start: faces for timestep, faces in selection.items()})
+    selection = {timestep - start: faces for timestep, faces in selection.items()}
+    for timestep, faces in selection.items():
+        say(f"{timestep:5d}  {faces.mean():6.1%}")
+    return Selected(selection)
 
 
 def _table(rows: list[tuple[str, str]]) -> list[str]:
