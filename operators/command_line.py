@@ -2,7 +2,6 @@
 
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
+from ..stga_addon.flame.sequence import motion_arrays
+from ..stga_addon.requests.values import Played
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
@@ -21,7 +21,7 @@ from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids
-from .common import capture_source, file_path, is_head, scene_settings
+from .common import capture_of, capture_source, file_path, is_head, scene_settings
 from .environment import environment_folder, preferred_python, training_python
 
 IN_BLENDER = ("select", "export", "demo", "environment")
@@ -80,7 +80,7 @@ def _open_head() -> "OpenHead | None":
         avatar=file_path(avatar, "avatar") if avatar else None,
         fps=frames_per_second(bpy.context.scene),
         selection=lambda: training_selection(head),
-        played=lambda capture: _played(head, capture),
+        played=lambda: _played(head),
     )
 
 
@@ -117,17 +117,14 @@ def _make_avatar(arguments: list[str], options: Any) -> int:
     return 0
 
 
-def _played(head: Any, capture: Capture) -> Capture:
-    """The capture with the meshes that the head has in the scene's frames, however it is animated."""
-    scene = bpy.context.scene
-    frames = range(scene.frame_start, scene.frame_end + 1)
-
-    def mesh(frame: int) -> np.ndarray:
-        (vertices,) = [evaluated_vertices(head) for _ in iterate_frames((frame,))]
-        return np.asarray(vertices, np.float64)
-
-    flame = capture.flame and sample_motion(head, capture.flame, frames)
-    return replace(capture, timesteps=tuple(frames), mesh=mesh, flame=flame)
+def _played(head: Any) -> Played:
+    """What the head plays in the scene's frames, however it is animated. Raises StgaError where its capture has moved,
+    or a FLAME head has no rig."""
+    frames = range(bpy.context.scene.frame_start, bpy.context.scene.frame_end + 1)
+    meshes = {frame: np.asarray(evaluated_vertices(head), np.float64) for frame in iterate_frames(frames)}
+    flame = capture_of(head).flame
+    motion = None if flame is None else motion_arrays(sample_motion(head, flame, frames))
+    return Played(meshes, motion, training_selection(head))
 
 
 def register() -> None:

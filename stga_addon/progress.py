@@ -1,8 +1,11 @@
 """Progress of work, whatever it is, and how it is reported and cancelled."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -35,3 +38,15 @@ class Cancelled(Exception):
 def ignore(progress: Progress) -> bool:
     """A report that nobody reads."""
     return False
+
+
+def counted(items: Iterable[Item], total: int, report: Report, stage: str, unit: str) -> Iterator[Item]:
+    """The items, of which each is reported when the next one is asked for; unit: what one of them is called.
+
+    Raises Cancelled where the report says to stop.
+    """
+    report(Progress(stage=stage))
+    for number, item in enumerate(items, 1):
+        yield item
+        if report(Progress(number / total, stage, f"{unit} {number} of {total}")):
+            raise Cancelled

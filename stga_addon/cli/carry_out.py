@@ -3,11 +3,13 @@
 import math
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..files import write_npz
 from ..progress import Progress, ignore
-from ..requests.results import Result
-from ..requests.values import Request
+from ..requests.results import Result, Selected
+from ..requests.values import Request, Select, SelectForTake
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -24,6 +26,15 @@ def carry_out(request: Request, with_bar: bool = True) -> Result:
     for line in getattr(result, "lines", ()):
         print(line)
     return result
+
+
+def carry_out_selection(request: Select | SelectForTake, path: Path | None) -> None:
+    """Carry out the request, and write timestep -> triangles into an .npz file where there is a path."""
+    found = carry_out(request, with_bar=False)
+    assert isinstance(found, Selected)
+    if path is not None:
+        arrays = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
+        write_npz(path, arrays, compressed=True)
 
 
 class ProgressBar:

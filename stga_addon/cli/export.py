@@ -2,16 +2,13 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..avatar.file import Avatar
-from ..capture.model import Capture
 from ..errors import StgaError
-from ..export.formats import FORMATS, Meshes, check_suffix, export_avatar
-from ..export.playback import DEFAULT_FPS, playback_fps
+from ..export.formats import FORMATS
+from ..export.playback import DEFAULT_FPS
 from ..requests.open_head import OpenHead
+from ..requests.values import Export
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
-from .export_web import export_web
-from .inputs import open_avatar, required_capture, timesteps_between
-from .outputs import announce_size
+from .carry_out import carry_out
 
 NAME, HELP = "export", "write an avatar in another format"
 
@@ -46,25 +43,20 @@ def _default_rate(head: OpenHead | None) -> str:
 
 def run(options: Namespace) -> None:
     _check_options(options)
-    if options.fps is None and options.head is not None:
-        options.fps = options.head.fps
-    avatar, capture = open_avatar(options.avatar, options)
-    options.fps = playback_fps(capture, options.fps, numbered=options.format == "usd")
-    source = FORMATS[options.format].source
-    if options.format == "web":
-        export_web(avatar, capture, options)
-        return
-    if source == "motion":
-        meshes: Meshes = ()
-    elif source == "range":
-        meshes = _range(avatar, capture, options)
-    else:
-        meshes = _frame(avatar, capture, options.timestep)
-    export_avatar(options.out, avatar, options.format, meshes, None if capture is None else capture.flame, options.fps)
+    head, fps, played = options.head, options.fps, None
+    if head is not None:
+        fps = fps or head.fps
+        is_posed = FORMATS[options.format].source != "frame" or options.timestep is not None
+        played = head.played() if is_posed else None
+    request = Export(
+        options.avatar, options.out, options.format, options.capture, options.flame, played, options.timestep,
+        options.frames, fps, options.motion_only,
+    )  # fmt: skip
+    carry_out(request)
 
 
 def _check_options(options: Namespace) -> None:
-    """Refuse options that the format would ignore, and a file name of another format."""
+    """Refuse options that the format would ignore."""
     belongs_to = {
         "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
         "frames": [name for name, format in FORMATS.items() if format.source == "range"],
@@ -77,7 +69,6 @@ def _check_options(options: Namespace) -> None:
             raise StgaError(f"{flag} cannot be combined with --format {options.format}, only with {', '.join(formats)}")
     if options.head is None:
         _check_capture_options(options)
-    check_suffix(options.out, options.format)
 
 
 def _check_capture_options(options: Namespace) -> None:
@@ -86,24 +77,3 @@ def _check_capture_options(options: Namespace) -> None:
         raise StgaError(f"--capture: has no effect with --format {options.format} without --timestep")
     if options.flame is not None and options.capture is None and not options.avatar.is_dir():
         raise StgaError("--flame: has no effect without --capture")
-
-
-def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> Meshes:
-    """The mesh of one timestep, or the neutral mesh."""
-    if timestep is None:
-        yield 0, avatar.neutral
-        return
-    capture = required_capture(capture)
-    if timestep not in capture.timesteps:
-        raise StgaError(f"{capture.root}: has no timestep {timestep}")
-    yield timestep, capture.mesh(timestep)
-
-
-def _range(avatar: Avatar, capture: Capture | None, options: Namespace) -> Meshes:
-    """The meshes of --frames, with a progress bar; says how much room they take, and refuses what the disk lacks."""
-    from tqdm import tqdm
-
-    capture = required_capture(capture)
-    timesteps = timesteps_between(capture, options.frames)
-    announce_size(options.out, avatar, options.format, len(timesteps))
-    return ((timestep, capture.mesh(timestep)) for timestep in tqdm(timesteps, desc="Exporting", unit="frame"))

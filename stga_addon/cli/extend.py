@@ -3,12 +3,10 @@
 from argparse import ArgumentParser, Namespace
 
 from ..errors import StgaError
-from ..files import write_npz
 from ..requests.open_head import OpenHead
-from ..requests.results import Selected
 from ..requests.values import Extend, SelectForTake
 from .arguments import real_number, usable_path
-from .carry_out import carry_out
+from .carry_out import carry_out, carry_out_selection
 from .continuing import add_continued_run, continued_run, resumed_continuation
 
 NAME, HELP = "extend", "extend a finished avatar by further takes of the same head"
@@ -48,15 +46,10 @@ def run(options: Namespace) -> None:
 
 
 def _write_selection(options: Namespace) -> None:
-    """Write and print which triangles of each frame of the take would be trained."""
+    """Print and write which triangles of each frame of the take would be trained."""
     idle = next((name for name, default in TRAINING_OPTIONS.items() if getattr(options, name) != default), None)
     if idle is not None:
         raise StgaError(f"--{idle}: has no effect with --select-only")
     if len(options.takes) != 1:
         raise StgaError(f"--select-only: expected one CAPTURE, got {len(options.takes)}")
-    found = carry_out(SelectForTake(options.run_folder, options.takes[0], options.flame), with_bar=False)
-    assert isinstance(found, Selected)
-    arrays = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
-    write_npz(options.select_only, arrays, compressed=True)
-    for timestep, faces in found.selection.items():
-        print(f"{timestep:5d}  {faces.mean():6.1%}")
+    carry_out_selection(SelectForTake(options.run_folder, options.takes[0], options.flame), options.select_only)

@@ -2,12 +2,12 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..errors import StgaError
-from ..files import write_npz
 from ..requests.open_head import OpenHead
-from ..selection import SelectionOptions, select_capture
+from ..requests.values import Select
+from ..selection import SelectionOptions
 from .arguments import add_capture, real_number, usable_path
-from .inputs import open_named_capture
+from .carry_out import carry_out_selection
+from .inputs import principal_point_of
 
 NAME, HELP = "select", "show which triangles each frame selects for training"
 
@@ -30,14 +30,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    capture = open_named_capture(options)
-    if options.zero_pose is not None and capture.flame is None:
-        raise StgaError(f"--zero-pose: has no effect on {options.capture}, which was not tracked with FLAME")
-    chosen = SelectionOptions(threshold=options.threshold, zero_pose=options.zero_pose or SelectionOptions.zero_pose)
-    selection = select_capture(capture, chosen)
-    print(f"threshold {1000 * options.threshold:g} mm, {len(capture.faces)} triangles")
-    for timestep, faces in selection.items():
-        regions = [name for name, members in capture.regions.items() if members.any() and faces[members].all()]
-        print(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
-    if options.out:
-        write_npz(options.out, {f"{t:05d}": faces for t, faces in selection.items()}, compressed=True)
+    point = principal_point_of(options)
+    request = Select(options.capture, options.flame, point, options.threshold, options.zero_pose)
+    carry_out_selection(request, options.out)

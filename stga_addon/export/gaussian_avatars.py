@@ -10,7 +10,7 @@ from ..avatar.file import Avatar
 from ..avatar.splats import Splats, no_strain_color
 from ..errors import StgaError
 from ..files import replacing_together, save_npz
-from ..flame.sequence import FlameSequence
+from ..flame.sequence import FlameSequence, motion_arrays
 from .ply import PROPERTIES, save_columns, splat_columns
 
 PLY_NAME = "point_cloud.ply"
@@ -39,7 +39,7 @@ def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence
         with new_file(folder / PLY_NAME) as partial:
             save_columns(partial, [*PROPERTIES, BINDING], columns)
         with new_file(folder / MOTION_NAME) as partial:
-            save_npz(partial, motion_arrays(sequence), compressed=True)
+            save_npz(partial, motion_arrays(sequence, np.float32), compressed=True)
     return [folder / PLY_NAME, folder / MOTION_NAME]
 
 
@@ -62,22 +62,3 @@ def in_convention(avatar: Avatar, convention: str) -> Splats:
         )
     )
     return to_local(to_world(splats, here), there, splats.face)
-
-
-def motion_arrays(sequence: FlameSequence) -> dict[str, np.ndarray]:
-    """flame_param.npz of a GaussianAvatars avatar, float32.
-
-    shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation (T, 3), eyes_pose (T, 6),
-    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100 for I and E with a
-    published FLAME.
-    """
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    no_offset = np.zeros_like(sequence.model.v_template)
-    names = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
-    arrays = {name: np.stack([getattr(frame, name) for frame in frames]) for name in names}
-    arrays["shape"] = sequence.shape
-    arrays["static_offset"] = no_offset if sequence.static_offset is None else sequence.static_offset
-    arrays["dynamic_offset"] = np.stack(
-        [no_offset if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames], dtype=np.float32
-    )
-    return {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -69,6 +69,11 @@ def ply_bytes(splats: Splats) -> int:
     return 4 * len(PROPERTIES) * len(splats)
 
 
+def is_ply(path: Path) -> bool:
+    """Whether a path is named as a PLY file."""
+    return path.suffix.lower() == ".ply"
+
+
 def read_ply(path: Path) -> Splats:
     """Read world-space splats from a 3D Gaussian Splatting PLY of SH degree 0 to 3.
 

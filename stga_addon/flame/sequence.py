@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from ..errors import StgaError
 from ..files import read_npz
@@ -124,7 +125,12 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     of `POSE_LAYOUTS`. Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and
     the field.
     """
-    arrays = _spelled_out(path, read_npz(path, max_compression=MAX_MOTION_EXPANSION))
+    return motion_of(path, read_npz(path, max_compression=MAX_MOTION_EXPANSION), model)
+
+
+def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameSequence:
+    """The motion in the arrays of a file, as `read_motion` reads it; errors name `path`."""
+    arrays = _spelled_out(path, arrays)
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
         raise StgaError(f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of")
@@ -147,6 +153,24 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     for timestep in timesteps:
         frame(timestep)  # report a wrong value when the file is opened, not minutes later
     return FlameSequence(model, shape, static_offset, timesteps, frame)
+
+
+def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dict[str, np.ndarray]:
+    """The motion as arrays that `motion_of` takes, and as flame_param.npz of a GaussianAvatars avatar holds in float32.
+
+    shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation (T, 3), eyes_pose (T, 6),
+    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100 for I and E with a
+    published FLAME.
+    """
+    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    none = np.zeros_like(sequence.model.v_template)
+    offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]
+    return {
+        **{name: np.stack([getattr(frame, name) for frame in frames], dtype=dtype) for name in FRAME_FIELDS},
+        "shape": sequence.shape.astype(dtype),
+        "static_offset": (none if sequence.static_offset is None else sequence.static_offset).astype(dtype),
+        "dynamic_offset": np.stack(offsets, dtype=dtype),
+    }
 
 
 def _timesteps(path: Path, found: np.ndarray, count: int) -> tuple[int, ...]:

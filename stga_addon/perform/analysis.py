@@ -1,10 +1,11 @@
 """Analysis of a capture before it is trained."""
 
 from ..capture.open import open_capture
+from ..format import format_duration
 from ..progress import Progress, Report, Say
 from ..render.device import choose_device
 from ..requests.results import Analyzed
-from ..requests.values import Analyze
+from ..requests.values import Analyze, TimePresets
 from ..training.effects.plan import plan_effects
 from ..training.settings import make_settings
 
@@ -24,3 +25,17 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
 
     report(Progress(0.5, "Timing the presets"))
     return Analyzed(plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)})
+
+
+def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:
+    """Time the presets; says what each is for. Raises StgaError."""
+    from ..report.preset_timing import time_presets
+
+    capture = open_capture(request.capture, request.flame, request.principal_point)
+    device, why = choose_device(request.device)
+    say(why)
+    timings = time_presets(capture, device=device)
+    for timing in timings:
+        time = f"about {format_duration(timing.seconds):<10}"
+        say(f"{timing.preset:<9} {timing.iterations:6d} iterations  {time}  {timing.purpose}")
+    return Analyzed((), {timing.preset: timing.seconds for timing in timings})

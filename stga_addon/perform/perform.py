@@ -8,37 +8,30 @@ from typing import Any
 
 from ..errors import StgaError
 from ..progress import Cancelled, Progress, Report, Say, ignore
+from ..requests import values
 from ..requests.folder import PREVIEW, has_request, read_request, write_result
 from ..requests.results import Result
-from ..requests.values import (
-    Analyze,
-    Evaluate,
-    Extend,
-    Refine,
-    RenderRecording,
-    Request,
-    Resume,
-    SelectForTake,
-    SolveAgain,
-    Track,
-    Train,
-)
+from ..requests.values import Request
 from ..schema import validate
 from ..worker.status import StatusWriter, status_writer
 
 PREVIEW_INTERVAL_S = 4.0
 """Seconds between two previews of a training."""
 WORK: dict[type[Any], tuple[str, str]] = {
-    Train: (".training", "perform_training"),
-    Resume: (".training", "perform_training"),
-    Refine: (".training", "perform_training"),
-    Extend: (".training", "perform_training"),
-    SelectForTake: (".training", "select_for_take"),
-    Track: (".tracking", "perform_tracking"),
-    SolveAgain: (".tracking", "solve_again"),
-    RenderRecording: (".recording", "render_recording"),
-    Analyze: (".analysis", "analyze"),
-    Evaluate: (".evaluation", "evaluate_run"),
+    values.Train: (".training", "perform_training"),
+    values.Resume: (".training", "perform_training"),
+    values.Refine: (".training", "perform_training"),
+    values.Extend: (".training", "perform_training"),
+    values.Select: (".selection", "select"),
+    values.SelectForTake: (".training", "select_for_take"),
+    values.Track: (".tracking", "perform_tracking"),
+    values.SolveAgain: (".tracking", "solve_again"),
+    values.Render: (".render", "render"),
+    values.RenderRecording: (".recording", "render_recording"),
+    values.Export: (".export", "export"),
+    values.Analyze: (".analysis", "analyze"),
+    values.TimePresets: (".analysis", "time_each_preset"),
+    values.Evaluate: (".evaluation", "evaluate_run"),
 }
 """Request -> the module that carries it out, loaded when it is needed, and its function."""
 

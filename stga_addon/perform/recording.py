@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager
 from typing import Any
 
-from ..progress import Cancelled, Progress, Report, Say
+from ..progress import Report, Say, counted
 from ..render.compose import Composer
 from ..render.recording import finished, is_video, recorded_images
 from ..render.video import sequence_writer, video_writer
@@ -19,11 +19,9 @@ def render_recording(request: RenderRecording, report: Report, say: Say) -> Writ
     try:
         composer = Composer(request.device)
         with _output(request) as write:
-            for index, image in enumerate(recorded_images(request.recording, request.images, composer)):
+            images = recorded_images(request.recording, request.images, composer)
+            for image in counted(images, request.images, report, "Rendering", "Image"):
                 write(finished(image, request.background, is_video(request.output)))
-                share = (index + 1) / max(request.images, 1)
-                if report(Progress(share, "Rendering", f"Image {index + 1} of {request.images}")):
-                    raise Cancelled
     finally:
         request.recording.unlink(missing_ok=True)
     return Written(request.output)

@@ -29,6 +29,7 @@ from ..training.run.identity import file_digest, identity_of
 from ..training.run.loop import train
 from ..training.run.open_run import OpenedRun, device_of, open_run
 from ..training.run.progress import Progress as TrainingProgress
+from ..training.run.progress import Report as TrainingReport
 from ..training.run.replay import is_faced
 
 MAX_NAMED_VIEWS = 6
@@ -54,6 +55,10 @@ class Prepared:
     resumes: bool
     falls_back: bool
 
+    def train(self, report: TrainingReport) -> Path:
+        """The path of the avatar. Raises as `training.run.loop.train`."""
+        return train(self.capture, self.folder, self.run, self.selection, self.resumes, report, self.falls_back)
+
 
 def perform_training(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Written:
     """Train the run that is asked for; returns the path of its avatar and its summary.
@@ -71,10 +76,7 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
         draw()
         return report(_as_progress(progress))
 
-    avatar = train(
-        prepared.capture, prepared.folder, prepared.run, prepared.selection, prepared.resumes, report_training,
-        prepared.falls_back,
-    )  # fmt: skip
+    avatar = prepared.train(report_training)
     lines = [*report_run(prepared.folder), f"avatar: {avatar}"]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
@@ -103,7 +105,10 @@ def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selecte
     wanted = Extend(request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame)
     _, _, selection, run = _joined_takes(wanted, say)
     start = run.takes[-1].start
-    return Selected({timestep - start: faces for timestep, faces in selection.items()})
+    selection = {timestep - start: faces for timestep, faces in selection.items()}
+    for timestep, faces in selection.items():
+        say(f"{timestep:5d}  {faces.mean():6.1%}")
+    return Selected(selection)
 
 
 def _table(rows: list[tuple[str, str]]) -> list[str]:

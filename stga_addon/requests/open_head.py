@@ -2,17 +2,16 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..capture.model import Capture
-from ..capture.open import open_capture
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..schema import from_json, setting, to_json
+from .values import Played
 
 FOLDER = "STGA_HEAD"
 """The environment variable that names the folder."""
@@ -25,7 +24,7 @@ class OpenHead:
 
     fps        frames per second of the scene
     selection  what the file's vertex groups train, timestep -> (F,) bool; None without any
-    played     the capture -> the same with the scene's frames: its meshes are the head's, however it is animated
+    played     what the head plays in the scene's frames
     """
 
     capture: Path
@@ -34,7 +33,7 @@ class OpenHead:
     avatar: Path | None
     fps: float
     selection: Callable[[], Mapping[int, np.ndarray] | None]
-    played: Callable[[Capture], Capture]
+    played: Callable[[], Played]
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,7 @@ def write_head(folder: Path, head: OpenHead, played: bool) -> None:
     if selection is not None:
         write_npz(folder / SELECTION, {str(timestep): faces for timestep, faces in selection.items()})
     if played:
-        capture = head.played(open_capture(head.capture, head.flame, head.principal_point))
-        write_npz(folder / PLAYED, {str(timestep): capture.mesh(timestep) for timestep in capture.timesteps})
+        write_npz(folder / PLAYED, {str(frame): mesh for frame, mesh in head.played().meshes.items()})
 
 
 def read_head(folder: Path) -> OpenHead:
@@ -73,9 +71,8 @@ def read_head(folder: Path) -> OpenHead:
     def selection() -> dict[int, np.ndarray] | None:
         return _read_selection(folder / SELECTION) if (folder / SELECTION).exists() else None
 
-    def played(capture: Capture) -> Capture:
-        meshes = _read_meshes(folder / PLAYED, capture.neutral.shape)
-        return replace(capture, timesteps=tuple(sorted(meshes)), mesh=meshes.__getitem__, flame=None)
+    def played() -> Played:
+        return Played(_by_frame(folder / PLAYED), selection=selection())
 
     return OpenHead(
         stored.capture, stored.flame, stored.principal_point, stored.avatar, stored.fps, selection, played
@@ -89,18 +86,6 @@ def _read_selection(path: Path) -> dict[int, np.ndarray]:
         if faces.dtype != bool or faces.ndim != 1:
             raise StgaError(f"{path}: frame {frame}: expected bool (F,), got {faces.dtype} {faces.shape}")
     return selection
-
-
-def _read_meshes(path: Path, shape: tuple[int, ...]) -> dict[int, np.ndarray]:
-    """frame -> vertices of a shape (V, 3), one frame at least. Raises StgaError for arrays of another form."""
-    meshes = _by_frame(path)
-    if not meshes:
-        raise StgaError(f"{path}: holds no frame")
-    for frame, mesh in meshes.items():
-        if mesh.dtype.kind != "f" or mesh.shape != shape or not np.isfinite(mesh).all():
-            found = f"{mesh.dtype} {mesh.shape}"
-            raise StgaError(f"{path}: frame {frame}: expected finite numbers {shape}, got {found}")
-    return meshes
 
 
 def _by_frame(path: Path) -> dict[int, np.ndarray]:

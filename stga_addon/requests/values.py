@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.camera_path import TURNTABLE_S
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
+from ..export.formats import FORMATS, check_suffix
+from ..flame.sequence import ZERO_POSES
 from ..render.device import EXPECTED_DEVICE, is_device
 from ..schema import MAX_COUNT, setting
+from ..selection import SelectionOptions
 from ..training.settings import MAX_GROWTH, TrainingSettings
 
 
@@ -182,6 +186,105 @@ class SolveAgain:
 
 
 @dataclass(frozen=True)
+class Played:
+    """What the head of an open .blend file plays in the frames of its scene, however it is animated.
+
+    meshes      frame -> (V, 3) meters
+    motion      FLAME parameters of these frames, arrays as `motion_of` takes them; None: the head has none
+    selection   frame -> (F,) bool: what the file's vertex groups train; None without any
+    """
+
+    meshes: Mapping[int, np.ndarray]
+    motion: Mapping[str, np.ndarray] | None = None
+    selection: Mapping[int, np.ndarray] | None = None
+
+    def check(self) -> None:
+        """Raise StgaError without any frame."""
+        if not self.meshes:
+            raise StgaError("played: holds no frame")
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render an avatar or a PLY as pictures, a video or a turntable.
+
+    source          folder of a run, avatar file or PLY
+    output          an .mp4 file, or a folder for PNGs
+    video           whether the output is a video
+    cameras         transforms file: an entry per picture, or what a video's camera is one of; None: of the capture
+    turntable       degrees by which one camera moves around the head, 0: as far as the cameras saw; None: it stands
+                    still
+    camera          index of the camera of a video or turntable; None: the central one
+    fps             frames per second of a video or turntable; None: the capture's
+    seconds         least duration of a turntable
+    capture, flame  whose meshes drive the avatar; None: those of the run
+    motion          another person's FLAME motion, which drives the avatar instead; `flame`: its model file
+    played          meshes that stand in for those of the capture
+    background      sRGB in 0…1
+    principal_point  convention of `cameras`; None: that of the avatar
+    """
+
+    source: Path
+    output: Path
+    video: bool = False
+    cameras: Path | None = None
+    turntable: float | None = setting(None, 0, 360)
+    camera: int | None = setting(None, 0)
+    fps: float | None = setting(None, 0)
+    seconds: float = setting(TURNTABLE_S, 0)
+    capture: Path | None = None
+    flame: Path | None = None
+    motion: Path | None = None
+    played: Played | None = None
+    background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
+    principal_point: str | None = setting(None, choices=PRINCIPAL_POINTS)
+    device: str = device_field()
+
+    @property
+    def is_film(self) -> bool:
+        """Whether one camera sees the motion, instead of a picture per camera."""
+        return self.video or self.turntable is not None
+
+    def check(self) -> None:
+        """Raise StgaError for a video of another name, and where nothing says what to render."""
+        if self.video and self.output.suffix.lower() != ".mp4":
+            raise StgaError(f"{self.output}: a video's name ends in .mp4")
+        if self.cameras is None and not self.is_film:
+            raise StgaError("--out needs --cameras, which says what to render, or --turntable")
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an avatar in another format.
+
+    source          folder of a run, or avatar file
+    output          the file, or the folder of a format of several
+    file_format     one of FORMATS
+    capture, flame  whose meshes pose the avatar; None: those of the run
+    played          meshes that stand in for those of the capture
+    timestep        of a format that holds one frame; None: the neutral mesh
+    frames          first and last timestep of a format that holds several; None: all
+    fps             of a format that has a frame rate; None: the capture's
+    motion_only     of a web page: leave out the blend shapes and the skeleton of the FLAME model
+    """
+
+    source: Path
+    output: Path
+    file_format: str = setting(choices=tuple(FORMATS))
+    capture: Path | None = None
+    flame: Path | None = None
+    played: Played | None = None
+    timestep: int | None = None
+    frames: tuple[int, int] | None = None
+    fps: float | None = setting(None, above=0)
+    motion_only: bool = False
+
+    def check(self) -> None:
+        """Raise StgaError for a file name of another format."""
+        check_suffix(self.output, self.file_format)
+
+
+@dataclass(frozen=True)
 class RenderRecording:
     """Render the images that Blender has recorded, and encode them.
 
@@ -216,6 +319,31 @@ class Analyze:
 
 
 @dataclass(frozen=True)
+class TimePresets:
+    """Find out how long each preset would train on this machine."""
+
+    capture: Path
+    flame: Path | None = None
+    principal_point: str = setting(DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
+    device: str = device_field()
+
+
+@dataclass(frozen=True)
+class Select:
+    """Find out which triangles each timestep of a capture selects for training.
+
+    threshold       meters that a triangle must move
+    zero_pose       FLAME motion that does not count (`SelectionOptions`); None: the head's
+    """
+
+    capture: Path
+    flame: Path | None = None
+    principal_point: str = setting(DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
+    threshold: float = setting(SelectionOptions.threshold, 0)
+    zero_pose: str | None = setting(None, choices=ZERO_POSES)
+
+
+@dataclass(frozen=True)
 class Evaluate:
     """Measure a run's avatar on all views of a split; the figures are also written into the run's folder.
 
@@ -228,7 +356,10 @@ class Evaluate:
     capture: Path | None = None
 
 
-Request = Train | Resume | Refine | Extend | SelectForTake | Track | SolveAgain | RenderRecording | Analyze | Evaluate
+Request = (
+    Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderRecording | Export
+    | Analyze | TimePresets | Evaluate
+)  # fmt: skip
 
 
 def _check_budget(seconds: float | None, iterations: int | None) -> None:

@@ -23,9 +23,9 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import info
 from stga_addon.cli.main import main, make_parser
-from stga_addon.cli.render import unique_names
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
+from stga_addon.perform.render import unique_names
 from stga_addon.selection import SelectionOptions
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run

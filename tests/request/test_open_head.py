@@ -1,17 +1,20 @@
 """The folder of the head that Blender has open: what is written is read back, and damage is one sentence."""
 
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from capture.factory import edit, write_mesh_capture
+from capture.factory import edit, write_flame_capture, write_mesh_capture
 
-from stga_addon.capture.model import Capture
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
+from stga_addon.perform.perform import perform
 from stga_addon.requests.open_head import HEAD, PLAYED, SELECTION, OpenHead, read_head, write_head
+from stga_addon.requests.values import Export, Played
 
 FACES, VERTICES = 320, 162
 
@@ -21,21 +24,20 @@ def folder(tmp_path: Path) -> Path:
     root = write_mesh_capture(tmp_path / "capture")
     chosen = {-2: np.zeros(FACES, bool), 10: np.arange(FACES) < 40}
 
-    def played(capture: Capture) -> Capture:
-        return replace(capture, timesteps=(-2, 10), mesh=lambda frame: capture.neutral + frame)
-
-    write_head(tmp_path, OpenHead(root, None, "opencv", None, 25.0, lambda: chosen, played), played=True)
+    played = Played({frame: open_capture(root).neutral + frame for frame in (-2, 10)})
+    write_head(tmp_path, OpenHead(root, None, "opencv", None, 25.0, lambda: chosen, lambda: played), played=True)
     return tmp_path
 
 
 def test_a_head_is_read_back(folder: Path) -> None:
     """Catches frames of the scene, which may be negative, that lose their sign, order or meshes."""
     head, capture = read_head(folder), open_capture(folder / "capture")
-    found, played = head.selection(), head.played(capture)
+    found, played = head.selection(), head.played()
     assert found is not None
-    assert {frame: int(faces.sum()) for frame, faces in found.items()} == {-2: 0, 10: 40}
-    assert played.timesteps == (-2, 10)
-    assert np.array_equal(played.mesh(-2), capture.neutral - 2)
+    for selection in (found, played.selection or {}):
+        assert {frame: int(faces.sum()) for frame, faces in selection.items()} == {-2: 0, 10: 40}
+    assert sorted(played.meshes) == [-2, 10]
+    assert np.array_equal(played.meshes[-2], capture.neutral - 2)
 
 
 @pytest.mark.parametrize(
@@ -60,17 +62,48 @@ def test_damaged_selections(folder: Path, name: str, array: np.ndarray, expected
     ("arrays", "expected"),
     [
         ({"mesh": np.zeros((VERTICES, 3))}, "played.npz: expected frames as names, got 'mesh'"),
-        ({"4": np.zeros((7, 3))}, r"played.npz: frame 4: expected finite numbers \(162, 3\), got float64 \(7, 3\)"),
-        ({"4": np.full((VERTICES, 3), np.nan)}, r"played.npz: frame 4: expected finite numbers \(162, 3\)"),
-        ({"4": np.full((VERTICES, 3), "a")}, r"played.npz: frame 4: expected finite numbers \(162, 3\), got <U1"),
-        ({}, "played.npz: holds no frame"),
+        ({"4": np.zeros((7, 3))}, r"played: frame 4: expected finite numbers \(162, 3\), got float64 \(7, 3\)"),
+        ({"4": np.full((VERTICES, 3), np.nan)}, r"played: frame 4: expected finite numbers \(162, 3\)"),
+        ({"4": np.full((VERTICES, 3), "a")}, r"played: frame 4: expected finite numbers \(162, 3\), got <U1"),
+        ({}, "played: holds no frame"),
     ],
 )
 def test_damaged_meshes(folder: Path, arrays: dict[str, np.ndarray], expected: str) -> None:
     """Catches a traceback, or meshes of another head, from a damaged file of what the head plays."""
     write_npz(folder / PLAYED, arrays)
     with pytest.raises(StgaError, match=expected):
-        read_head(folder).played(open_capture(folder / "capture"))
+        export_played(folder, read_head(folder).played())
+    assert not (folder / "page.stga").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"selection": {4: np.zeros(7, bool)}}, r"selection of frame 4: expected bool \(320,\), got bool \(7,\)"),
+        ({"selection": {4: np.zeros(FACES)}}, r"selection of frame 4: expected bool \(320,\), got float64"),
+        ({"motion": {"expr": np.zeros((2, 2))}}, "motion: expected 1 frames, got 2"),
+        ({"motion": {"expr": np.zeros((1, 9))}}, r"played: expr has shape \(9,\), expected \(2,\)"),
+        ({"motion": {"pose": np.zeros((1, 2))}}, r"played: pose has shape \(1, 2\)"),
+    ],
+)
+def test_what_a_head_cannot_have_played(folder: Path, changes: dict[str, Any], expected: str) -> None:
+    """Catches a traceback for arrays of another head in a request, or a page whose parts are of different frames."""
+    root, model = write_flame_capture(folder / "flame")
+    meshes = {4: open_capture(root, model).neutral}
+    if "selection" in changes:
+        root, model = folder / "capture", None
+        meshes = {4: open_capture(root).neutral}
+    with pytest.raises(StgaError, match=expected):
+        export_played(folder, Played(meshes, **changes), root, model)
+
+
+def export_played(folder: Path, played: Played, root: Path | None = None, model: Path | None = None) -> None:
+    """Export a page of an avatar that moves as `played`."""
+    root = root or folder / "capture"
+    capture = open_capture(root, model)
+    splats = lattice_splats(capture.neutral, capture.faces, order=0)
+    write_avatar(folder / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
+    perform(Export(folder / "a.npz", folder / "page.stga", "web", root, model, played))
 
 
 @pytest.mark.parametrize("fps", [float("inf"), float("nan"), 0, "25", None, 10**400])

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from capture.factory import ball, edit, write_mesh_capture
 
-from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
@@ -40,13 +42,18 @@ from stga_addon.requests.results import Analyzed, Result, Selected, Written
 from stga_addon.requests.values import (
     Analyze,
     Evaluate,
+    Export,
     Extend,
+    Played,
     Refine,
+    Render,
     RenderRecording,
     Request,
     Resume,
+    Select,
     SelectForTake,
     SolveAgain,
+    TimePresets,
     Track,
     Train,
 )
@@ -67,6 +74,9 @@ from stga_addon.worker.status import (
 )
 
 HEAD = Path("/captures/anna")
+PLAYED = Played(
+    {-2: np.zeros((5, 3)), 12: np.ones((5, 3))}, {"expr": np.ones((2, 4))}, {-2: np.arange(4) < 2, 12: np.ones(4, bool)}
+)
 REQUESTS: tuple[Request, ...] = (
     Train(
         Path("r"), HEAD, make_settings(iterations=3, preset="draft"), device="gpu:Name", selection={0: np.ones(4, bool)}
@@ -75,10 +85,15 @@ REQUESTS: tuple[Request, ...] = (
     Refine(Path("r_2"), Path("r"), "mouth", frames=(3, 5), growth=0.5, seconds=20.0),
     Refine(Path("r_2"), Path("r"), weights=np.arange(4, dtype=np.float32) / 4, iterations=3, seed=2),
     Extend(Path("r_2"), Path("r"), (Path("/smile"), Path("/frown")), iterations=3),
+    Select(HEAD, Path("flame.pkl"), threshold=0.01, zero_pose="all"),
     SelectForTake(Path("r"), Path("/smile")),
     Track(Path("f"), Path("m.glb"), Path("o"), focal=900.0, stop=9, step=3, offset={"left": -3}, meshes=True),
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
+    Render(Path("r"), Path("v.mp4"), True, turntable=90.0, camera=2, seconds=3.0, played=PLAYED),
+    Render(Path("a.npz"), Path("p"), cameras=Path("t.json"), motion=Path("m.npz"), background=(0.0, 1.0, 0.5)),
+    Export(Path("r"), Path("a.html"), "web", HEAD, played=PLAYED, frames=(3, 12), fps=30.0, motion_only=True),
+    TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
     Evaluate(Path("r"), "test", capture=HEAD),
 )
@@ -218,7 +233,7 @@ def test_what_is_no_request(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e400, -1, "3", True, None])
 def test_numbers_that_are_none(tmp_path: Path, value: Any) -> None:
     """Catches an infinite or negative number that reaches the work."""
-    write_request(tmp_path, REQUESTS[6])
+    write_request(tmp_path, next(request for request in REQUESTS if isinstance(request, Track)))
     values = json.loads((tmp_path / REQUEST).read_text())
     write_json(tmp_path / REQUEST, {**values, "step": value})
     with pytest.raises(StgaError, match="setting step: expected a whole number from 1"):
@@ -255,6 +270,76 @@ def test_a_worker_trains_what_this_process_would(tmp_path: Path, capture: Path) 
     options = ["--iterations", "12", "--seed", "3", "--strategy", "selective", "--principal-point", "opencv"]
     assert main(["train", str(capture), "--out", str(plain), *options]) == 0  # with hull points, by the rule
     assert len(read_npz(plain / "avatar.npz")["xyz"]) >= len(one["xyz"])
+
+
+@pytest.mark.slow
+def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path, capture: Path) -> None:
+    """Catches a render farm whose pictures or files differ from those that were looked at before: option by option,
+    `stga render` and `stga export` ask for what the requests say."""
+    pytest.importorskip("numba")
+    ball = open_capture(capture)
+    splats = lattice_splats(ball.neutral, ball.faces, order=0)
+    splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
+    avatar, cameras = tmp_path / "a.npz", capture / "transforms_val.json"
+    write_avatar(avatar, Avatar(splats, "stga", ball.neutral.astype(np.float32), ball.faces))
+    given = [str(avatar), "--capture", str(capture)]
+    turned = ["--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1", "--device", "cpu"]
+    asked_for: dict[str, tuple[list[str], Request]] = {
+        "pictures": (
+            ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],
+            Render(avatar, tmp_path / "pictures", cameras=cameras, capture=capture, background=(0.0, 0.0, 0.0)),
+        ),
+        "film.mp4": (
+            ["render", *given, *turned, "--video"],
+            Render(avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture, device="cpu"),
+        ),
+        "plys": (
+            ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],
+            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
+        ),
+        "page.stga": (
+            ["export", *given, "--format", "web", "--fps", "30", "--out"],
+            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0),
+        ),
+    }
+    for name, (words, request) in asked_for.items():
+        folder = tmp_path / f"{name}_job"
+        write_request(folder, request)
+        process = start_worker(folder, sys.executable, worker_arguments(folder))
+        assert process.wait(300) == 0, log_lines(folder, 50)
+        assert read_result(folder) == Written(tmp_path / name)
+        there = contents(tmp_path / name)
+        assert main([*words, str(tmp_path / "here" / name)]) == 0
+        assert contents(tmp_path / "here" / name) == there
+        assert there
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Name -> bytes of the files of a folder, or of one file."""
+    return {file.name: file.read_bytes() for file in (path.iterdir() if path.is_dir() else (path,))}
+
+
+@pytest.mark.slow
+def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Path) -> None:
+    """Catches a worker that renders a whole film after it was cancelled, or leaves half a video."""
+    pytest.importorskip("numba")
+    ball = open_capture(capture)
+    splats, avatar = lattice_splats(ball.neutral, ball.faces, order=0), tmp_path / "a.npz"
+    write_avatar(avatar, Avatar(splats, "stga", ball.neutral.astype(np.float32), ball.faces))
+    for name, kept in (("turn", 3), ("turn.mp4", 0)):
+        folder = tmp_path / f"{name}_job"
+        is_video = name.endswith(".mp4")
+        write_request(folder, Render(avatar, tmp_path / name, is_video, turntable=90.0, capture=capture, device="cpu"))
+
+        def cancel_at_the_second(progress: Progress, folder: Path = folder) -> bool:
+            if progress.detail.startswith("Image 2 of"):
+                request_cancel(folder)
+            return False
+
+        assert perform_in_folder(folder, also=cancel_at_the_second) is None
+        assert inspect_worker(folder).state == WorkerState.CANCELLED
+        assert len(list((tmp_path / name).glob("*.png"))) == kept
+        assert not (tmp_path / "turn.mp4").exists()
 
 
 def read_result_of(request: Train, instead: Path) -> Result:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.model import Capture
 from ...files import replacing, write_json
 from ...format import format_duration
+from ...perform.training import prepare
+from ...progress import ignore
 from ...report.run_summary import evaluation_share
-from ...training.effects.plan import with_effect_plan
-from ...training.run.folder import Run
-from ...training.settings import TrainingSettings
+from ...requests.values import Train
 from .chart import benchmark_chart
 from .scheduler import BenchmarkRun, PrintProgress, train_in_turns
 from .statistics import (
@@ -28,7 +27,7 @@ from .statistics import (
     summarize,
     within_spread,
 )
-from .variants import STANDARD, Changes, settings_of
+from .variants import STANDARD, Changes, settings_of, without_choices
 
 COLUMNS = {
     "iterations": ("iterations", 0),
@@ -51,24 +50,25 @@ Unfitted: without fitted exposure."""
 
 
 def run_benchmark(
-    capture: Capture,
-    run: Run,
+    request: Train,
     variants: Mapping[str, Changes],
     seconds: float,
     seeds: int,
-    out: Path,
     print_progress: PrintProgress = print,
 ) -> str:
-    """Train every variant for `seconds` with each seed; returns the report, which is also written to `out`.
+    """Train every variant for `seconds` with each seed; returns the report, which is also written.
 
-    run: how `capture` is opened again; its settings are ignored. Writes report.txt, benchmark.json, benchmark.csv and
-    benchmark.png beside the runs, also when interrupted; the same call then continues.
-    Raises StgaError where `out` holds a benchmark of other settings.
+    request: the capture to train, and as `run` the folder of the runs; its settings are ignored. Writes report.txt,
+    benchmark.json, benchmark.csv and benchmark.png beside the runs, also when interrupted; the same call then
+    continues. Raises StgaError where the folder holds a benchmark of other settings.
     """
     print_progress("Deciding effects")
-    runs = _runs(capture, run, variants, seconds)
-    fits = any(run.settings.exposure for run in runs.values())  # for all variants or none, so that they compare
-    by_seed = {seed: {name: _seeded(run, name, seed, out, fits) for name, run in runs.items()} for seed in range(seeds)}
+    out, requests = request.run, _requests(request, variants, seconds)
+    fits = any(each.settings.exposure for each in requests.values())  # for all variants or none, so that they compare
+    by_seed = {
+        seed: {name: BenchmarkRun(_seeded(each, seed), fits) for name, each in requests.items()}
+        for seed in range(seeds)
+    }
     for of_seed in by_seed.values():
         for one in of_seed.values():
             one.check()
@@ -84,35 +84,34 @@ def run_benchmark(
         print_progress(f"Finished runs are reported in {out / 'report.txt'}; run the same command to continue")
         raise
     finally:
-        report = _write_report(run, by_seed, seconds, out)
+        report = _write_report(request.capture, by_seed, seconds, out)
     return report
 
 
-def _runs(capture: Capture, run: Run, variants: Mapping[str, Changes], seconds: float) -> dict[str, Run]:
-    """variant -> its run; a variant with the settings of an earlier one is left out."""
-    runs: dict[str, Run] = {}
+def _requests(request: Train, variants: Mapping[str, Changes], seconds: float) -> dict[str, Train]:
+    """variant -> its training, with the effects that are decided for all seeds; a variant with the settings of an
+    earlier one is left out."""
+    requests: dict[str, Train] = {}
     for name, changes in variants.items():
-        decided = with_effect_plan(replace(run, settings=settings_of(changes, seconds)), capture)
-        if not any(_same(decided.settings, other.settings) for other in runs.values()):
-            runs[name] = decided
-    return runs
+        undecided = replace(request, run=request.run / name, settings=settings_of(changes, seconds))
+        settings = without_choices(prepare(undecided, ignore, lambda line: None).run.settings)
+        if not any(replace(settings, preset=other.settings.preset) == other.settings for other in requests.values()):
+            requests[name] = replace(undecided, settings=settings)
+    return requests
 
 
-def _same(a: TrainingSettings, b: TrainingSettings) -> bool:
-    return replace(a, preset=None, effects=None) == replace(b, preset=None, effects=None)
+def _seeded(request: Train, seed: int) -> Train:
+    run = request.run.with_name(f"{request.run.name}-{seed}")
+    return replace(request, run=run, settings=replace(request.settings, seed=seed))
 
 
-def _seeded(run: Run, name: str, seed: int, out: Path, fits_exposure: bool) -> BenchmarkRun:
-    return BenchmarkRun(replace(run, settings=replace(run.settings, seed=seed)), out / f"{name}-{seed}", fits_exposure)
-
-
-def _write_report(run: Run, by_seed: Mapping[int, Mapping[str, BenchmarkRun]], seconds: float, out: Path) -> str:
+def _write_report(capture: Path, by_seed: Mapping[int, Mapping[str, BenchmarkRun]], seconds: float, out: Path) -> str:
     """Write what is finished so far; returns the report."""
     names = list(by_seed[0])
     found = [outcome_of(name, of_seed[name]) for name in names for of_seed in by_seed.values()]
     outcomes = [outcome for outcome in found if outcome is not None]
     curves = mean_curves(outcomes)
-    report = report_text(outcomes, curves, seconds, run.capture)
+    report = report_text(outcomes, curves, seconds, capture)
     with replacing(out / "report.txt") as partial:
         partial.write_text(report + "\n", encoding="utf-8")
     write_json(out / "benchmark.json", _as_json(outcomes, seconds))
@@ -120,7 +119,7 @@ def _write_report(run: Run, by_seed: Mapping[int, Mapping[str, BenchmarkRun]], s
     if curves:
         fitted = any(one.fits_exposure for of_seed in by_seed.values() for one in of_seed.values())
         views = "held-out views, exposure not fitted" if fitted else "held-out views"
-        title = f"{run.capture.name}: PSNR on {views}, {len(by_seed)} seeds; bold: Pareto front"
+        title = f"{capture.name}: PSNR on {views}, {len(by_seed)} seeds; bold: Pareto front"
         with replacing(out / "benchmark.png") as partial:
             benchmark_chart(curves, title).savefig(partial, format="png")
     return report

@@ -4,11 +4,11 @@ import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from ...capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ...cli.arguments import add_capture, duration, usable_path, whole_number
-from ...cli.inputs import open_named_capture
+from ...cli.inputs import open_named_capture, principal_point_of
 from ...errors import StgaError
 from ...requests.open_head import OpenHead
+from ...requests.values import Train
 from ...training.settings import make_settings
 from .variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 
@@ -27,7 +27,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ...training.run.folder import Run
     from .benchmark import run_benchmark
 
     variants = select_variants(SETTING_VARIANTS if options.knobs else MAIN_VARIANTS, options.only)
@@ -37,8 +36,9 @@ def run(options: Namespace) -> None:
         if not capture.views.get(split):
             raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
     flame = None if options.flame is None else options.flame.resolve()
-    run = Run(options.capture.resolve(), flame, options.principal_point or DEFAULT_PRINCIPAL_POINT, settings)
-    print(run_benchmark(capture, run, variants, options.budget, options.seeds, options.out.resolve(), _print_progress))
+    out, root, point = options.out.resolve(), options.capture.resolve(), principal_point_of(options)
+    request = Train(out, root, settings, flame, point, device="cpu")
+    print(run_benchmark(request, variants, options.budget, options.seeds, _print_progress))
 
 
 def _print_progress(text: str) -> None:

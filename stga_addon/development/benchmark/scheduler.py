@@ -12,8 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import StgaError
-from ...training.run.folder import Run, has_run, read_run, write_run
+from ...requests.folder import request_folder, write_request
+from ...requests.values import Train
+from ...training.run.folder import has_run, read_run
 from ...worker.launch import same_interpreter_environment
+from .variants import without_choices
 from .worker import FIT_EXPOSURE, QUALITY
 
 TURN_S = 2.0
@@ -26,11 +29,17 @@ PrintProgress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class BenchmarkRun:
-    """A run and its folder; fits_exposure: whether its avatar is measured with fitted exposure (`worker`)."""
+    """A training whose effects are decided.
 
-    run: Run
-    out: Path
+    fits_exposure  whether its avatar is measured with fitted exposure (`worker`)
+    """
+
+    request: Train
     fits_exposure: bool = False
+
+    @property
+    def out(self) -> Path:
+        return self.request.run
 
     @property
     def finished(self) -> bool:
@@ -38,7 +47,11 @@ class BenchmarkRun:
 
     def check(self) -> None:
         """Raise StgaError where the folder holds another run."""
-        if has_run(self.out) and read_run(self.out) != self.run:
+        if not has_run(self.out):
+            return
+        run, asked = read_run(self.out), self.request
+        before = run.capture, run.flame, run.principal_point, without_choices(run.settings)
+        if before != (asked.capture, asked.flame, asked.principal_point, asked.settings):
             raise StgaError(f"{self.out}: holds a run with other settings; choose another --out, or delete it")
 
 
@@ -54,7 +67,7 @@ def train_in_turns(runs: Sequence[BenchmarkRun], print_progress: PrintProgress) 
         for worker in workers:  # one at a time, because starting loads the processor too
             print_progress(f"Starting {worker.name}")
             worker.start()
-        rounds = max((math.ceil((run.run.settings.seconds or 0) / TURN_S) for run in runs), default=1)
+        rounds = max((math.ceil((run.request.settings.seconds or 0) / TURN_S) for run in runs), default=1)
         rng = random.Random(0)
         for turn in range(1, rounds + 1):
             print_progress(f"Training, turn {turn} of {rounds}")
@@ -82,7 +95,7 @@ class _Worker:
     def start(self) -> None:
         """Start the process and wait until it is ready to train."""
         if not has_run(self._run.out):
-            write_run(self._run.out, self._run.run)
+            write_request(request_folder(self._run.out), self._run.request)
         # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
         options = [FIT_EXPOSURE] if self._run.fits_exposure else []
         with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:

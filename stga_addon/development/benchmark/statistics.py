@@ -69,7 +69,7 @@ def outcome_of(variant: str, run: BenchmarkRun) -> Outcome | None:
     """The run's outcome so far; None before its first evaluation."""
     lines = read_metrics(run.out)
     quality = read_json(run.out / QUALITY) if run.finished else {}
-    return Outcome(variant, run.run.settings.seed, lines, quality) if lines else None
+    return Outcome(variant, run.request.settings.seed, lines, quality) if lines else None
 
 
 def summarize(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Spread]]:

@@ -1,5 +1,6 @@
 """Variants that a benchmark compares: presets and strategies, or single settings."""
 
+from dataclasses import replace
 from typing import Any
 
 from ...errors import StgaError
@@ -48,6 +49,11 @@ def settings_of(changes: Changes, seconds: float) -> TrainingSettings:
     GaussianAvatars, which fix them."""
     fixed = changes.get("schedule") == "paper" or changes.get("strategy") == "gaussian-avatars"
     return make_settings(**{"seconds": seconds, "effects": None if fixed else {}, **changes})
+
+
+def without_choices(settings: TrainingSettings) -> TrainingSettings:
+    """Settings whose effects are decided: what was asked for no longer counts."""
+    return replace(settings, effects=None)
 
 
 def select_variants(variants: dict[str, Changes], only: list[str] | None) -> dict[str, Changes]:

@@ -2,19 +2,24 @@
 
     python -m stga_addon.development.benchmark.worker FOLDER [--fit-exposure]
 
-Trains or resumes the run of FOLDER/run.json. Each line on stdin is a share of the budget to train up to; the end of
-stdin means save and end. Each line, and the start, is answered by a line of JSON on stdout: {"share": …,
-"iteration": …} when ready for the next, {"done": …} at the end, or {"error": …}.
+Trains as the request in FOLDER asks (`requests.folder`), or resumes the run in FOLDER. Each line on stdin is a share
+of the budget to train up to; the end of stdin means save and end. Each line, and the start, is answered by a line of
+JSON on stdout: {"share": …, "iteration": …} when ready for the next, {"done": …} at the end, or {"error": …}.
 """
 
 import json
 import sys
+from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from ...errors import StgaError
 from ...files import write_json
+from ...progress import ignore
+from ...requests.folder import read_request, request_folder
+from ...requests.values import Resume, Train
+from ...training.run.folder import has_run
 from ...worker.stdout import claim_stdout
 
 if TYPE_CHECKING:
@@ -56,18 +61,19 @@ class Turns:
 def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool = False) -> None:
     """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that were not trained."""
     from ...avatar.file import read_avatar
+    from ...perform.training import prepare
     from ...report.preset_timing import seconds_per_iteration
     from ...training.evaluate.metrics import evaluate_avatar
     from ...training.optimize.flame_refinement import with_refined_tracking
-    from ...training.run.loop import train
-    from ...training.run.open_run import open_run
 
     turns = Turns(requests, replies)
     try:
-        opened = open_run(folder)
-        run, capture = opened.run, opened.capture
-        seconds_per_iteration(capture, run.settings, WARM_UP_S)
-        avatar = read_avatar(train(capture, folder, run, resume=True, report=turns.report))
+        request = Resume(folder, device="cpu") if has_run(folder) else read_request(request_folder(folder))
+        assert isinstance(request, Train | Resume)
+        prepared = prepare(request, ignore, partial(print, file=sys.stderr))
+        capture = prepared.capture
+        seconds_per_iteration(capture, prepared.run.settings, WARM_UP_S)
+        avatar = read_avatar(prepared.train(turns.report))
         if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
             trained = with_refined_tracking(capture, folder)

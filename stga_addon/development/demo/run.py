@@ -16,11 +16,11 @@ from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
 from ...cli.carry_out import carry_out
-from ...cli.export_web import capture_views
 from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
 from ...files import replacing, write_json
+from ...perform.export_web import capture_views
 from ...render.render import render_avatar, to_uint8
 from ...requests.values import Train
 from ...selection import SelectionOptions, select_capture

@@ -18,8 +18,9 @@ from stga_addon.development.benchmark.scheduler import BenchmarkRun, train_in_tu
 from stga_addon.development.benchmark.variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
+from stga_addon.requests.folder import request_folder, write_request
+from stga_addon.requests.values import Train
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
@@ -29,7 +30,7 @@ VARIANTS = {"standard": TINY, "coarse": {**TINY, "scale": 0.5}}
 
 
 def run_in(capture: Capture, out: Path, **changes: Any) -> BenchmarkRun:
-    return BenchmarkRun(Run(capture.root, None, "vhap", make_settings(**{**TINY, **changes})), out)
+    return BenchmarkRun(Train(out, capture.root, make_settings(**{**TINY, **changes}), device="cpu"))
 
 
 def progress(share: float, iteration: int = 1) -> Progress:
@@ -54,7 +55,7 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     """Catches a worker that writes no figures of the finished avatar, and mistakes that end in a traceback."""
     monkeypatch.setattr("stga_addon.development.benchmark.worker.WARM_UP_S", 0.01)
     run = run_in(toy, tmp_path / "run", iterations=20)
-    write_run(run.out, run.run)
+    write_request(request_folder(run.out), run.request)
     replies = io.StringIO()
     work(run.out, io.StringIO("0.5\n1.0\n"), replies)
     first, second, last = (json.loads(line) for line in replies.getvalue().splitlines())
@@ -66,7 +67,8 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     work(run.out, io.StringIO(), io.StringIO(), fits_exposure=True)
     assert "psnr_unmatched" in json.loads((run.out / QUALITY).read_text())["val"]
     replies = io.StringIO()
-    write_run(tmp_path / "lost", replace(run.run, capture=tmp_path / "nowhere"))
+    lost = replace(run.request, run=tmp_path / "lost", capture=tmp_path / "nowhere")
+    write_request(request_folder(lost.run), lost)
     work(tmp_path / "lost", io.StringIO(), replies)
     assert "nowhere" in json.loads(replies.getvalue())["error"]
 
@@ -84,16 +86,16 @@ def interrupt_at(text: str, printed: list[str]) -> Callable[[str], None]:
 def test_a_benchmark_is_interrupted_and_goes_on(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches training lost to Ctrl-C, runs trained twice or not in turns, and files that are missing at the end."""
     monkeypatch.setattr(scheduler, "TURN_S", 0.5)
-    run = Run(toy.root, None, "vhap", make_settings(seconds=1.0))
+    request = Train(tmp_path, toy.root, make_settings(seconds=1.0), device="cpu")
     printed: list[str] = []
     with pytest.raises(KeyboardInterrupt):
-        run_benchmark(toy, run, VARIANTS, 2.0, 1, tmp_path, interrupt_at("turn 2 of 4", printed))
+        run_benchmark(request, VARIANTS, 2.0, 1, interrupt_at("turn 2 of 4", printed))
     assert printed[-1] == f"Finished runs are reported in {tmp_path / 'report.txt'}; run the same command to continue"
     assert "no run is finished yet" in (tmp_path / "report.txt").read_text()
     kept = {name: read_checkpoint(tmp_path / f"{name}-0").elapsed_s for name in VARIANTS}
     assert all(0.5 <= elapsed < 1.9 for elapsed in kept.values())
     printed.clear()
-    report = run_benchmark(toy, run, VARIANTS, 2.0, 1, tmp_path, printed.append)
+    report = run_benchmark(request, VARIANTS, 2.0, 1, printed.append)
     assert (
         printed[1]
         == f"{len(VARIANTS)} runs of 2 s: {2 * len(VARIANTS)} s of training, plus the time to start and to evaluate"
@@ -109,10 +111,10 @@ def test_a_benchmark_is_interrupted_and_goes_on(toy: Capture, tmp_path: Path, mo
     assert (tmp_path / "benchmark.csv").read_text().startswith("variant,seed,iteration,seconds,")
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     printed.clear()
-    assert run_benchmark(toy, run, VARIANTS, 2.0, 1, tmp_path, printed.append) == report
+    assert run_benchmark(request, VARIANTS, 2.0, 1, printed.append) == report
     assert printed == ["Deciding effects"]
     with pytest.raises(StgaError, match="holds a run with other settings"):
-        run_benchmark(toy, run, VARIANTS, 3.0, 2, tmp_path, printed.append)
+        run_benchmark(request, VARIANTS, 3.0, 2, printed.append)
 
 
 def test_exposure_is_fitted_for_all_or_none(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,11 +123,12 @@ def test_exposure_is_fitted_for_all_or_none(toy: Capture, tmp_path: Path, monkey
     monkeypatch.setattr(
         benchmark, "train_in_turns", lambda runs, print_progress: started.extend(run.fits_exposure for run in runs)
     )
-    run, rows = Run(toy.root, None, "vhap", make_settings(seconds=1.0)), ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
+    request = Train(tmp_path / "none", toy.root, make_settings(seconds=1.0), device="cpu")
+    rows = ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
     plain = {name: {**changes, "effects": {"exposure": "off"}} for name, changes in VARIANTS.items()}
-    run_benchmark(toy, run, plain, 2.0, 1, tmp_path / "none", lambda text: None)
+    run_benchmark(request, plain, 2.0, 1, lambda text: None)
     with_rows = {"paper": {**TINY, "schedule": "paper"}, "corrected": {**TINY, "exposure": rows, "effects": None}}
-    run_benchmark(toy, run, with_rows, 2.0, 1, tmp_path / "all", lambda text: None)
+    run_benchmark(replace(request, run=tmp_path / "all"), with_rows, 2.0, 1, lambda text: None)
     assert started == [False, False, True, True]
 
 
@@ -155,7 +158,7 @@ def test_one_failure_does_not_end_the_others(toy: Capture, tmp_path: Path) -> No
     """Catches an hour of runs lost to one that cannot be trained."""
     good = run_in(toy, tmp_path / "good", seconds=0.5)
     lost = run_in(toy, tmp_path / "lost", seconds=0.5)
-    lost = replace(lost, run=replace(lost.run, capture=tmp_path / "nowhere"))
+    lost = replace(lost, request=replace(lost.request, capture=tmp_path / "nowhere"))
     printed: list[str] = []
     train_in_turns([lost, good], printed.append)
     assert good.finished

@@ -1,0 +1,218 @@
+"""Rendering of an avatar or a PLY: one PNG per camera entry, a video of its motion, or a turntable."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from ..avatar.file import read_avatar
+from ..capture.camera import Camera, central_camera
+from ..capture.camera_path import covered_angles, to_and_fro, turntable
+from ..capture.model import View
+from ..capture.open import open_capture
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
+from ..errors import StgaError
+from ..export.playback import DEFAULT_FPS, playback_fps
+from ..export.ply import is_ply, read_ply
+from ..files import replacing
+from ..flame.motion import transferred_motion
+from ..flame.sequence import sequence_mesh
+from ..progress import Report, Say, counted
+from ..render.compose import Composer
+from ..render.render import render as render_splats
+from ..render.render import render_avatar, to_uint8
+from ..render.video import sequence_writer, video_writer
+from ..requests.results import Written
+from ..requests.values import Render
+from ..training.run.folder import read_run
+from .inputs import avatar_path, check_topology, open_avatar
+
+MAX_TURNTABLE_IMAGES = 100_000
+
+
+def render(request: Render, report: Report, say: Say) -> Written:
+    """Render the pictures or the video. A cancelled video is not written; pictures that are finished stay.
+
+    Raises StgaError.
+    """
+    if request.turntable is not None:
+        _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
+    principal_point = request.principal_point or _principal_point(request.source)
+    views = None
+    if request.cameras is not None:
+        views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
+    composer = Composer(request.device)
+    composer.choose()
+    subject = (_subject if request.motion is None else _reenacted)(request, composer)
+    if request.is_film:
+        _film(request, subject, subject.views if views is None else views, report)
+    else:
+        assert views is not None
+        pictured = views if request.motion is None else _every_timestep(subject, views)
+        _write_pictures(request.output, subject, pictured, report)
+    return Written(request.output)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """What is rendered.
+
+    image      view -> image (3, H, W)
+    timesteps  of its motion, ascending; none where nothing moves
+    center     of the head or splats at the first timestep, (3,) meters
+    fps        at which it plays
+    views      of its capture
+    """
+
+    image: Callable[[View], np.ndarray]
+    timesteps: tuple[int, ...]
+    center: Callable[[], np.ndarray]
+    fps: float
+    views: Sequence[View] = ()
+
+
+def _write_pictures(folder: Path, subject: _Subject, views: Sequence[View], report: Report) -> None:
+    names = unique_names([view.name for view in views])
+    captured, target = {view.image for view in views}, folder.resolve()
+    overwritten = next((name for name in names if target / name in captured), None)
+    if overwritten is not None:
+        raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
+    for view, name in counted(zip(views, names, strict=True), len(views), report, "Rendering", "Image"):
+        with replacing(folder / name) as partial:
+            Image.fromarray(to_uint8(subject.image(view))).save(partial, format="PNG")
+
+
+def _film(request: Render, subject: _Subject, views: Sequence[View], report: Report) -> None:
+    """Write the subject's motion as one camera sees it, which stands still or orbits."""
+    start = _chosen_camera(request, views)
+    timesteps: Sequence[int] = subject.timesteps or (0,)
+    path = [start] * len(timesteps)
+    if request.turntable is not None:
+        count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
+        timesteps = to_and_fro(timesteps, count)
+        cameras = _turntable(request.turntable, start, views, subject.center(), count)
+        path = [replace(start, camera=camera) for camera in cameras]
+    path = [replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)]
+    writer = video_writer(request.output, subject.fps) if request.video else sequence_writer(request.output)
+    with writer as write:
+        for view in counted(path, len(path), report, "Rendering", "Image"):
+            write(to_uint8(subject.image(view)))
+
+
+def _turntable_images(request: Render, fps: float) -> int:
+    """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
+    images = request.seconds * fps
+    if images > MAX_TURNTABLE_IMAGES:
+        asked = f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
+        raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
+    return round(images)
+
+
+def _turntable(turn: float, start: View, views: Sequence[View], center: np.ndarray, count: int) -> list[Camera]:
+    """turn: degrees; 0: what the views cover."""
+    if not turn:
+        angles = covered_angles([view.camera for view in views], start.camera, center)
+    else:
+        angles = -np.radians(turn) / 2, np.radians(turn) / 2
+    return turntable(start.camera, center, count, angles)
+
+
+def _chosen_camera(request: Render, views: Sequence[View]) -> View:
+    """The first view of the camera to film with."""
+    first = {view.camera_index: view for view in reversed(views)}
+    if not first:
+        raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
+    if request.camera is None:
+        indices = sorted(first)
+        return first[indices[central_camera([first[index].camera for index in indices])]]
+    if request.camera not in first:
+        raise StgaError(f"--camera {request.camera}: there are only {', '.join(map(str, sorted(first)))}")
+    return first[request.camera]
+
+
+def _principal_point(source: Path) -> str:
+    """The convention that the avatar was trained with; a PLY has none."""
+    return DEFAULT_PRINCIPAL_POINT if is_ply(source) else read_avatar(avatar_path(source)).principal_point
+
+
+def _subject(request: Render, composer: Composer) -> _Subject:
+    """An avatar with its capture, or a plain world-space PLY."""
+    if is_ply(request.source):
+        splats = read_ply(request.source)
+        return _Subject(
+            lambda view: render_splats(splats, view.camera, request.background, composer=composer),
+            (),
+            lambda: np.median(splats.xyz, axis=0),
+            playback_fps(None, request.fps),
+        )
+    avatar, capture = open_avatar(request)
+    if capture is None:
+        raise StgaError(f"{request.source}: an avatar needs the meshes of a capture to follow; give --capture")
+
+    def mesh(view: View) -> np.ndarray:
+        if view.timestep not in capture.timesteps:
+            raise StgaError(f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for")
+        return np.asarray(capture.mesh(view.timestep))
+
+    return _Subject(
+        lambda view: render_avatar(avatar, mesh(view), view.camera, request.background, composer),
+        capture.timesteps,
+        lambda: _middle(capture.mesh(capture.timesteps[0])),
+        playback_fps(capture, request.fps),
+        [view for views in capture.views.values() for view in views],
+    )
+
+
+def _reenacted(request: Render, composer: Composer) -> _Subject:
+    """An avatar moved by another person's FLAME motion."""
+    if is_ply(request.source):
+        raise StgaError(f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
+    flame = request.flame or (read_run(request.source).flame if request.source.is_dir() else None)
+    avatar = read_avatar(avatar_path(request.source))
+    assert request.motion is not None
+    motion = open_capture(request.motion, flame)
+    if motion.flame is None:
+        raise StgaError(f"{request.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
+    check_topology(motion, avatar)
+    sequence = transferred_motion(motion.flame, avatar.neutral)
+
+    def mesh(timestep: int) -> np.ndarray:
+        return sequence_mesh(sequence, timestep)
+
+    return _Subject(
+        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, request.background, composer),
+        tuple(sequence.timesteps),
+        lambda: _middle(mesh(sequence.timesteps[0])),
+        playback_fps(motion, request.fps),
+    )
+
+
+def _middle(vertices: np.ndarray) -> np.ndarray:
+    """(3,) center of the vertices' bounding box."""
+    return np.asarray((vertices.min(0) + vertices.max(0)) / 2)
+
+
+def _every_timestep(subject: _Subject, views: list[View]) -> list[View]:
+    """Each timestep of the motion as the first pose of each camera sees it."""
+    cameras = {view.camera_index: view for view in reversed(views)}
+    return [
+        replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")
+        for timestep in subject.timesteps
+        for index in sorted(cameras)
+    ]
+
+
+def unique_names(paths: list[str]) -> list[str]:
+    """File names with the suffix .png; where entries share one, their folders become part of it, then a number."""
+    pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
+    names = [png.name for png in pngs]
+    if len(set(names)) < len(names):
+        names = ["_".join(part for part in png.parts if part not in ("..", "/")) for png in pngs]
+    unique: dict[str, None] = {}
+    for name in names:
+        numbered = (f"{PurePosixPath(name).stem}_{n}.png" for n in itertools.count(2))
+        unique[next(c for c in itertools.chain((name,), numbered) if c not in unique)] = None
+    return list(unique)
