@@ -14,7 +14,6 @@ from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_tri
 from ..stga_addon.training.run.folder import AVATAR, next_folder
 from . import ids
 from .common import capture_source, file_path, head_of, reporting, scene_settings
-from .request import python_of
 from .train import (
     adapter_property,
     device_of,
@@ -156,7 +155,7 @@ def _start(operator: Any, context: Any, request: RefineRequest | ExtendRequest) 
     settings = scene_settings(context)
     if not (request.parent / AVATAR).is_file():
         raise StgaError(f"{request.parent}: holds no trained avatar; train one first")
-    result = start_training(operator, context, request, python_of(operator, context))
+    result = start_training(operator, context, request)
     shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(request.parent)]
     if not shown and settings.splats is not None:
         shown = [settings.splats]

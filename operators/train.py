@@ -1,13 +1,11 @@
-"""Trains the avatar in a worker process beside Blender, and cancels or dismisses that training."""
+"""Trains the avatar in a worker process beside Blender."""
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.folder import remove_request, request_folder
-from ..stga_addon.requests.results import Written
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import Extend, Refine, Resume
 from ..stga_addon.requests.values import Train as TrainRequest
 from ..stga_addon.scene.compat import PATH_OPTIONS
@@ -16,11 +14,9 @@ from ..stga_addon.training.effects.decisions import parse_choices
 from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker.environment import stored_adapters
-from ..stga_addon.worker.status import request_cancel
-from . import ids, monitor
-from .common import capture_source, file_path, head_of, needs_head, reporting
-from .environment import environment_folder
-from .request import ask, perform_here, python_of, start, wait, waits
+from . import ids
+from .common import capture_source, environment_folder, file_path, head_of, needs_head, reporting
+from .request import needs_idle, python_of, start
 
 
 def strategy_property() -> Any:
@@ -97,12 +93,7 @@ def wait_property() -> Any:
 
 def may_train(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head and nothing is training; says what to do where not."""
-    if not needs_head(operator, context):
-        return False
-    if monitor.training_of(context.scene).snapshot.state.is_alive:
-        operator.poll_message_set("Training is running; cancel it first")
-        return False
-    return True
+    return needs_head(operator, context) and needs_idle(operator, context, Kind.TRAINING)
 
 
 class Train(bpy.types.Operator):
@@ -149,8 +140,7 @@ class Train(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        request = self._request(head_of(context))
-        return start_training(self, context, request, python_of(self, context))
+        return start_training(self, context, self._request(head_of(context)))
 
     def _request(self, head: Any) -> TrainRequest | Resume:
         run = file_path(self.directory, "run folder").resolve()
@@ -175,74 +165,8 @@ def device_of(operator: Any) -> str:
     return f"gpu:{operator.adapter}" if operator.device == "gpu" and operator.adapter else str(operator.device)
 
 
-def start_training(
-    operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend, python: str | None
-) -> set[str]:
-    """Start a worker for a training and monitor it, or wait for it; python: as of `python_of`. Raises StgaError."""
-    folder, run = request_folder(request.run), request.run
-    if python is None:
-        ask(folder, request)
-        monitor.start_training(context.scene, run, None)
-        result = perform_here(context, folder)
-    else:
-        process = start(folder, request, python)
-        monitor.start_training(context.scene, run, process)
-        if not waits(operator):
-            return {"FINISHED"}
-        result = wait(folder, process)
-    monitor.finish_training(context.scene)
-    operator.report({"INFO"}, f"Trained {result.path if isinstance(result, Written) else run}")
+def start_training(operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend) -> set[str]:
+    """Start a training, or wait for it. Raises StgaError."""
+    if start(context.scene, request, python_of(operator, context), wait=operator.wait):
+        operator.report({"INFO"}, f"Trained {request.run}")
     return {"FINISHED"}
-
-
-class CancelTraining(bpy.types.Operator):
-    """Stop training and keep the avatar trained so far; Resume continues from there"""
-
-    bl_idname = ids.CANCEL_TRAINING
-    bl_label = "Cancel Training"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if monitor.training_of(context.scene).snapshot.state.is_alive:
-            return True
-        cls.poll_message_set("No training is running")
-        return False
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        request_cancel(request_folder(_folder(context.scene)))
-        monitor.check_now(context.scene)
-        return {"FINISHED"}
-
-
-class DismissTraining(bpy.types.Operator):
-    """Remove the status and log of the last training; the run, its avatar and checkpoints stay"""
-
-    bl_idname = ids.DISMISS_TRAINING
-    bl_label = "Dismiss"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if monitor.training_of(context.scene).run is None:
-            cls.poll_message_set("Nothing was trained in this scene yet")
-            return False
-        if monitor.training_of(context.scene).snapshot.state.is_alive:
-            cls.poll_message_set("Training is running; cancel it first")
-            return False
-        return True
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        remove_request(request_folder(_folder(context.scene)))
-        monitor.dismiss_training(context.scene)
-        return {"FINISHED"}
-
-
-def _folder(scene: Any) -> Path:
-    """The run folder of the scene's training."""
-    folder = monitor.training_of(scene).folder
-    if folder is None:
-        raise StgaError("Nothing was trained in this scene yet")
-    return folder

@@ -6,10 +6,10 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, scene_settings
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.display.heat_map import shows_residuals
-from .effects import draw_running
+from .request import draw_running
 from .sidebar import SidebarPanel
-from .text import draw_text
 from .train_panel import TrainPanel
 
 
@@ -65,7 +65,5 @@ def _draw_extend(layout: Any, context: Any, settings: Any) -> None:
     extend = column.operator(ids.EXTEND, icon="ADD")
     extend.directory, extend.device, extend.take = settings.run_folder, settings.device, settings.take
     extend.adapter, extend.seconds = settings.adapter, settings.extend_seconds
-    if not draw_running(column, context):
+    if not draw_running(column, context, Kind.SELECTION):
         column.operator(ids.SELECT_EXTENSION, icon="GROUP_VERTEX").directory = settings.run_folder
-    if settings.extension_error:
-        draw_text(column, context, settings.extension_error, "ERROR")

@@ -76,9 +76,7 @@ class SceneSettings(bpy.types.PropertyGroup):
     footage_stop: track.stop_property()
     footage_step: track.step_property()
     tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last tracking
-    tracking_model: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of its head model
-    tracking_pending: bpy.props.BoolProperty(options={"HIDDEN"})  # it is to be imported when it is done
-    tracking_error: bpy.props.StringProperty(options={"HIDDEN"})  # why it could not be imported
+    tracking_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it was imported
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: bpy.props.IntProperty(options={"HIDDEN"})
     motion_source: bpy.props.PointerProperty(
@@ -124,8 +122,6 @@ class SceneSettings(bpy.types.PropertyGroup):
     adapter: adapter_property()
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
-    extension_error: bpy.props.StringProperty(options={"HIDDEN"})  # why it could not be selected what Extend trains
-    analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the analysis failed
     live_preview: bpy.props.BoolProperty(
         name="Live Preview", description="Update the splats every few seconds during training", default=True
     )
