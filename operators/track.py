@@ -23,68 +23,41 @@ def path_property(name: str, description: str, subtype: str = "FILE_PATH", **mor
     return bpy.props.StringProperty(name=name, description=description, subtype=subtype, options=PATH_OPTIONS, **more)
 
 
-def footage_property() -> Any:
-    return path_property("Footage", "Folder with a folder of images or a video for each camera; or one video")
+class TrackOptions:
+    """What is tracked, and with what: of the operator, and of the panel that calls it."""
 
-
-def cameras_property() -> Any:
-    return path_property(
+    footage: path_property("Footage", "Folder with a folder of images or a video for each camera; or one video")
+    cameras: path_property(
         "Cameras",
         "Calibration: COLMAP, Metashape, RealityCapture or transforms.json; empty: the one in the footage's folder",
     )
-
-
-def model_property() -> Any:
-    return path_property(
+    model: path_property(
         "Head Model",
         "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb); empty: the active object's shape keys",
     )
-
-
-def detector_property() -> Any:
-    return path_property("Detector", "Google's face_landmarker.task; empty: the network that comes with mediapipe")
-
-
-def focal_property() -> Any:
-    return bpy.props.FloatProperty(
+    directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
+    detector: path_property("Detector", "Google's face_landmarker.task; empty: the network that comes with mediapipe")
+    focal: bpy.props.FloatProperty(
         name="Focal Length", description="In pixels, of a single camera without calibration; 0: a guess", min=0.0
     )
+    start: bpy.props.IntProperty(name="Start", description="First frame of the footage, counted from 0", min=0)
+    stop: bpy.props.IntProperty(name="Stop", description="Frame to stop before; 0: all", min=0)
+    step: bpy.props.IntProperty(name="Step", description="Use every nth frame", min=1, default=1)
 
 
-def start_property() -> Any:
-    return bpy.props.IntProperty(name="Start", description="First frame of the footage, counted from 0", min=0)
-
-
-def stop_property() -> Any:
-    return bpy.props.IntProperty(name="Stop", description="Frame to stop before; 0: all", min=0)
-
-
-def step_property() -> Any:
-    return bpy.props.IntProperty(name="Step", description="Use every nth frame", min=1, default=1)
-
-
-class TrackFootage(bpy.types.Operator):
+class TrackFootage(bpy.types.Operator, TrackOptions):
     """Track the head that the footage shows, in a process that continues when Blender is closed, and import it"""
 
     bl_idname = ids.TRACK_FOOTAGE
     bl_label = "Track Footage"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    footage: footage_property()
-    model: model_property()
-    directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
-    cameras: cameras_property()
-    detector: detector_property()
     landmarks: bpy.props.StringProperty(
         name="Landmarks",
         description="Folder with landmark files of another detector",
         subtype="DIR_PATH",
         options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
-    focal: focal_property()
-    start: start_property()
-    stop: stop_property()
-    step: step_property()
     python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that tracks; empty: the training environment of the preferences",

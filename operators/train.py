@@ -19,21 +19,8 @@ from .common import capture_source, environment_folder, file_path, head_of, need
 from .request import needs_idle, python_of, start
 
 
-def strategy_property() -> Any:
-    """Training strategy: of the operator, and of the panel that calls it."""
-    return bpy.props.EnumProperty(
-        name="Strategy",
-        description="Which splats each iteration trains",
-        items=(
-            ("global", "Global", "Every iteration trains all splats; most accurate on the captures measured so far"),
-            ("selective", "Selective", "Local iterations train the triangles selected in each frame; global ones, all"),
-            ("gaussian-avatars", "GaussianAvatars", "The binding, losses and learning rates of GaussianAvatars"),
-        ),
-    )
-
-
 def preset_property(**more: Any) -> Any:
-    """Training preset: of the operator, and of the panel that calls it."""
+    """Training preset: of the operator, and of the panel, which also takes over its time."""
     purposes = [(name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()]
     return bpy.props.EnumProperty(
         name="Preset",
@@ -43,9 +30,15 @@ def preset_property(**more: Any) -> Any:
     )
 
 
-def device_property() -> Any:
-    """Training device: of the operator, and of the panel that calls it."""
-    return bpy.props.EnumProperty(
+def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
+    """The GPUs that the last test of the training environment found, in its order."""
+    return stored_adapters(environment_folder())
+
+
+class DeviceOptions:
+    """Where an operator trains: of the operators, and of the panel that calls them."""
+
+    device: bpy.props.EnumProperty(
         name="Device",
         description="Device that trains. Auto resumes a run on the device that it was trained on",
         items=(
@@ -54,16 +47,7 @@ def device_property() -> Any:
             ("gpu", "GPU", "A GPU; training fails if none works"),
         ),
     )
-
-
-def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
-    """The GPUs that the last test of the training environment found, in its order."""
-    return stored_adapters(environment_folder())
-
-
-def adapter_property() -> Any:
-    """GPU that trains where the device is one: of the operator, and of the panel that calls it."""
-    return bpy.props.StringProperty(
+    adapter: bpy.props.StringProperty(
         name="GPU",
         description="Name of the GPU; empty: the first. The list is that of the last test of the training environment",
         search=list_adapters,
@@ -71,32 +55,47 @@ def adapter_property() -> Any:
     )
 
 
-def python_property() -> Any:
-    """Interpreter of an operator that trains."""
-    return bpy.props.StringProperty(
+class TrainOptions(DeviceOptions):
+    """How an avatar is trained: of the operator, and of the panel that calls it."""
+
+    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
+    strategy: bpy.props.EnumProperty(
+        name="Strategy",
+        description="Which splats each iteration trains",
+        items=(
+            ("global", "Global", "Every iteration trains all splats; most accurate on the captures measured so far"),
+            ("selective", "Selective", "Local iterations train the triangles selected in each frame; global ones, all"),
+            ("gaussian-avatars", "GaussianAvatars", "The binding, losses and learning rates of GaussianAvatars"),
+        ),
+    )
+    preset: preset_property()
+
+
+class TrainingOperator:
+    """Options of an operator that trains which no panel has."""
+
+    iterations: bpy.props.IntProperty(
+        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
+    )
+    python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that trains; empty: the training environment of the preferences",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
-
-
-def wait_property() -> Any:
-    """Whether an operator that trains waits for the end."""
-    return bpy.props.BoolProperty(
+    wait: bpy.props.BoolProperty(
         name="Wait",
         description="Return when training has ended, as always without a window; "
         "Blender's own Python trains then, if it has the packages",
         options={"SKIP_SAVE"},
     )
 
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_head(cls, context) and needs_idle(cls, context, Kind.TRAINING)
 
-def may_train(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head and nothing is training; says what to do where not."""
-    return needs_head(operator, context) and needs_idle(operator, context, Kind.TRAINING)
 
-
-class Train(bpy.types.Operator):
+class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     """Train the avatar on the capture's images, in a process that continues when Blender is closed"""
 
     bl_idname = ids.TRAIN
@@ -109,17 +108,6 @@ class Train(bpy.types.Operator):
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
     )
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
-    iterations: bpy.props.IntProperty(
-        name="Iterations",
-        description="Number of iterations, instead of a time; 0: train for Minutes",
-        min=0,
-        options={"SKIP_SAVE"},
-    )
-    strategy: strategy_property()
-    preset: preset_property()
-    device: device_property()
-    adapter: adapter_property()
     seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
@@ -131,12 +119,6 @@ class Train(bpy.types.Operator):
         description="Continue the run in the folder with the settings and budget that it was started with",
         options={"SKIP_SAVE"},
     )
-    python: python_property()
-    wait: wait_property()
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return may_train(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -161,7 +143,7 @@ class Train(bpy.types.Operator):
 
 
 def device_of(operator: Any) -> str:
-    """What `choose_device` takes, of an operator with `device_property` and `adapter_property`."""
+    """What `choose_device` takes, of an operator with `DeviceOptions`."""
     return f"gpu:{operator.adapter}" if operator.device == "gpu" and operator.adapter else str(operator.device)
 
 

@@ -7,12 +7,14 @@ import bpy
 
 from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
+from ..operators.track import TrackOptions
 from ..operators.track_correct import tracking_keys
 from ..operators.training_python import has_training_python
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.shape_keys import has_shape_keys
 from ..stga_addon.tracking.folder import SHEET_FILE
+from .options import set_options
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
@@ -32,10 +34,10 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
         if tracking.subject is not None:
             box = draw_end(layout, context, tracking)
             draw_text(box, context, tracking.snapshot.status.detail)
-        for name in ("footage", "footage_cameras", "head_model", "capture_folder"):
-            layout.prop(settings, name)
+        for name in ("footage", "cameras", "model", "directory"):
+            layout.prop(settings.track, name)
         thing = context.view_layer.objects.active
-        if not settings.head_model:
+        if not settings.track.model:
             name = thing.name if has_shape_keys(thing) else "none"
             layout.label(text=f"Shape keys of the active object: {name}", icon="SHAPEKEY_DATA")
         _draw_button(layout, settings)
@@ -51,8 +53,8 @@ class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        for name in ("footage_start", "footage_stop", "footage_step", "focal", "detector"):
-            self.layout.prop(scene_settings(context), name)
+        for name in ("start", "stop", "step", "focal", "detector"):
+            self.layout.prop(scene_settings(context).track, name)
 
 
 class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
@@ -95,6 +97,4 @@ def _draw_keys(layout: Any, context: Any, head: Any) -> None:
 
 def _draw_button(layout: Any, settings: Any) -> None:
     track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
-    track.footage, track.model, track.directory = settings.footage, settings.head_model, settings.capture_folder
-    track.cameras, track.detector, track.focal = settings.footage_cameras, settings.detector, settings.focal
-    track.start, track.stop, track.step = settings.footage_start, settings.footage_stop, settings.footage_step
+    set_options(track, settings.track, TrackOptions)

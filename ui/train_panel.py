@@ -8,6 +8,7 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
 from ..operators.common import is_head, package, scene_settings
+from ..operators.train import TrainOptions
 from ..operators.training_python import has_training_python
 from ..stga_addon.format import format_duration
 from ..stga_addon.requests.monitor_state import Kind, RequestState
@@ -16,6 +17,7 @@ from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
+from .options import set_options
 from .properties import preset_times
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
@@ -56,9 +58,8 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     train = layout.operator(
         ids.TRAIN, text="Resume" if resume else "Train", icon="FRAME_NEXT" if resume else "MOD_PARTICLES"
     )
-    train.directory, train.minutes, train.resume = settings.run_folder, settings.minutes, resume
-    train.strategy, train.preset, train.device = settings.strategy, settings.preset, settings.device
-    train.adapter = settings.adapter
+    set_options(train, settings, TrainOptions)
+    train.directory, train.resume = settings.run_folder, resume
     train.effects = " ".join(chosen_effects(settings))
 
 
