@@ -136,9 +136,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         try:
-            more = self._recording.record_next()
-            monitor.redraw()
-            if more:
+            if self._recording.record_next():
                 return {"RUNNING_MODAL"}
             self._recording.render(self._python)
             context.window_manager.event_timer_remove(self._timer)
@@ -155,7 +153,6 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         """End the recording, also when Blender quits or loads another file meanwhile."""
         context.window_manager.event_timer_remove(self._timer)
         self._recording.discard()
-        monitor.redraw()
 
     def _frames(self, context: Any) -> list[int]:
         scene = context.scene

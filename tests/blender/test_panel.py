@@ -141,7 +141,8 @@ def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch,
 def test_unreadable_worker_does_not_end_the_timer_silently(extension, tmp_path, monkeypatch, capsys):
     """Catches an error about the training environment's worker that ends the monitoring of every training, unseen."""
     monitor = extension.operators.monitor
-    running = extension.stga_addon.worker.status.WorkerSnapshot("working")
+    status = extension.stga_addon.worker.status
+    running = status.WorkerSnapshot(status.WorkerState.WORKING)
     state = monitor.RequestState(Kind.ENVIRONMENT, tmp_path, tmp_path / "status", running)
     monkeypatch.setitem(monitor._states, (monitor.NO_SCENE, Kind.ENVIRONMENT), state)
     monkeypatch.setattr(monitor, "inspect_status", lambda folder: 1 / 0)
