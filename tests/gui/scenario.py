@@ -162,7 +162,7 @@ def videos() -> Iterator[Callable[[], bool]]:
             bpy.ops.stga.render_video(filepath=str(folder / name), seconds=0.5)
         video = request("video").folder
         if name != "recording":
-            yield lambda: request("video").snapshot.status.message not in ("", "Recording")
+            yield lambda: request("video").is_running and request("video").snapshot.status.message != "Recording"
         if name != "finished":
             bpy.ops.stga.cancel(request="video")
         yield lambda: not request("video").is_running
