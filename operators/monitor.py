@@ -279,7 +279,8 @@ def _remove(kind: Kind, folder: Path) -> None:
     if kind in STORED:  # a file from elsewhere may name any folder
         remove_request(folder)
     else:
-        refuse_running_worker(folder)
+        if kind not in TRANSIENT:  # whose worker has ended, or was killed
+            refuse_running_worker(folder)
         shutil.rmtree(folder, ignore_errors=True)
     _processes.pop(folder, None)
     _curves.pop(folder.parent, None)

@@ -141,7 +141,8 @@ def _import_tracked(scene: Any, state: RequestState) -> Answer:
 def _fill_effects(scene: Any, state: RequestState) -> Answer:
     """Fill the scene's table of effects."""
     assert state.folder is not None
-    settings, found = getattr(scene, ids.SETTINGS), read_result(state.folder)
+    settings = getattr(scene, ids.SETTINGS)
+    found: Any = read_result(state.folder)
     settings.preset_timing = json.dumps(dict(found.seconds))
     settings.effects.clear()
     for decision in found.plan:
@@ -156,9 +157,10 @@ def _select_for_take(scene: Any, state: RequestState) -> Answer:
     """Select what extending the run by the head's take would train."""
     assert state.folder is not None
     head = _head(scene, state)
+    found: Any = read_result(state.folder)
     if not is_head(head) or Path(head[tags.CAPTURE]) != state.subject:
         raise StgaError(f"{state.subject}: its head is no longer that of the scene")
-    write_selection(head, dict(read_result(state.folder).selection))
+    write_selection(head, dict(found.selection))
     count_selected(scene, head)
     return Shown(undoable=True)
 
