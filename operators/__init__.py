@@ -4,13 +4,13 @@ from typing import Any
 
 import bpy
 
-from . import background, ids, monitor, render_video, track
-from .analyze import AnalyzeCapture, CancelAnalysis
+from . import ids, monitor
+from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
 from .common import register_classes, unregister_classes
 from .continue_run import Extend, Refine
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
-from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
+from .environment import MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .export_cameras import ExportCameras
 from .export_head_model import ExportHeadModel
@@ -21,18 +21,17 @@ from .import_motion import ImportMotion
 from .import_ply import ImportPly
 from .pose import PoseHead
 from .preview_images import PreviewImages
-from .render_video import CancelVideo, DismissVideo, RenderVideo
+from .render_video import RenderVideo
+from .request import Cancel, Dismiss
 from .select import CountSelected, HeatMap, Select, ToggleRegion
 from .select_extension import SelectExtension
 from .show import MoreBounces, ShowAvatar, StandardView
-from .track import CancelTracking, DismissTracking, TrackFootage
+from .track import TrackFootage
 from .track_correct import MarkKey, SolveAgain, ViewFootage
-from .train import CancelTraining, DismissTraining, Train
+from .train import Train
 
 CLASSES = (
     TrackFootage,
-    CancelTracking,
-    DismissTracking,
     ViewFootage,
     MarkKey,
     SolveAgain,
@@ -45,25 +44,21 @@ CLASSES = (
     CountSelected,
     HeatMap,
     AnalyzeCapture,
-    CancelAnalysis,
     Train,
     Refine,
     Extend,
     SelectExtension,
-    CancelTraining,
-    DismissTraining,
+    Cancel,
+    Dismiss,
     CopyReport,
     MakeEnvironment,
     TestEnvironment,
-    CancelEnvironment,
     PoseHead,
     ShowAvatar,
     StandardView,
     MoreBounces,
     PreviewImages,
     RenderVideo,
-    CancelVideo,
-    DismissVideo,
     ApplyMotion,
     ImportPly,
     ExportAvatar,
@@ -93,14 +88,10 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
     monitor.register()
-    track.register()
 
 
 def unregister() -> None:
-    track.unregister()
     monitor.unregister()
-    background.stop()
-    render_video.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     unregister_classes(CLASSES)

@@ -21,8 +21,8 @@ from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids
-from .common import capture_of, capture_source, file_path, is_head, scene_settings
-from .environment import environment_folder, preferred_python, training_python
+from .common import capture_of, capture_source, environment_folder, file_path, is_head, scene_settings
+from .training_python import preferred_python, training_python
 
 IN_BLENDER = ("select", "export", "demo", "environment")
 """Commands that need none of the packages that Blender's Python may lack, or need Blender itself."""

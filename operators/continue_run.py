@@ -14,19 +14,41 @@ from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_tri
 from ..stga_addon.training.run.folder import AVATAR, next_folder
 from . import ids
 from .common import capture_source, file_path, head_of, reporting, scene_settings
-from .request import python_of
-from .train import (
-    adapter_property,
-    device_of,
-    device_property,
-    may_train,
-    python_property,
-    start_training,
-    wait_property,
-)
+from .train import DeviceOptions, TrainingOperator, device_of, start_training
 
 
-class Refine(bpy.types.Operator):
+class RefineOptions:
+    """What is refined, and for how long: of the operator, and of the panel that calls it."""
+
+    group: bpy.props.StringProperty(
+        name="Vertex Group",
+        description="Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the selected "
+        "triangles are refined instead",
+    )
+    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=20.0, min=0.1)
+    growth: bpy.props.FloatProperty(
+        name="More Splats",
+        description="Splats that may be added, as a share of those in the region",
+        default=0.0,
+        min=0.0,
+        soft_max=2.0,
+        subtype="FACTOR",
+    )
+
+
+class ExtendOptions:
+    """What a run is extended by, and for how long: of the operator, and of the panel that calls it."""
+
+    take: bpy.props.StringProperty(
+        name="Take",
+        description="Folder of a further capture of the same head",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS,
+    )
+    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
+
+
+class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator):
     """Train one region of the avatar further; all other splats stay as they are. In Edit Mode the region is the
     selected triangles, otherwise a vertex group"""
 
@@ -36,12 +58,6 @@ class Refine(bpy.types.Operator):
 
     directory: bpy.props.StringProperty(
         name="Run Folder", description="Folder of the run to refine", subtype="DIR_PATH", options=PATH_OPTIONS
-    )
-    group: bpy.props.StringProperty(
-        name="Vertex Group",
-        description="Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the selected "
-        "triangles are refined instead",
-        options={"SKIP_SAVE"},
     )
     region: bpy.props.StringProperty(
         name="Region",
@@ -58,26 +74,6 @@ class Refine(bpy.types.Operator):
         min=-1,
         options={"SKIP_SAVE"},
     )
-    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=20.0, min=0.1)
-    iterations: bpy.props.IntProperty(
-        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
-    )
-    growth: bpy.props.FloatProperty(
-        name="More Splats",
-        description="Splats that may be added, as a share of those in the region",
-        default=0.0,
-        min=0.0,
-        soft_max=2.0,
-        subtype="FACTOR",
-    )
-    device: device_property()
-    adapter: adapter_property()
-    python: python_property()
-    wait: wait_property()
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return may_train(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -89,7 +85,7 @@ class Refine(bpy.types.Operator):
         return _start(self, context, request)
 
 
-class Extend(bpy.types.Operator):
+class Extend(TrainingOperator, ExtendOptions, DeviceOptions, bpy.types.Operator):
     """Train a further take of the same head into the avatar, which keeps what it has learned"""
 
     bl_idname = ids.EXTEND
@@ -99,24 +95,6 @@ class Extend(bpy.types.Operator):
     directory: bpy.props.StringProperty(
         name="Run Folder", description="Folder of the run to extend", subtype="DIR_PATH", options=PATH_OPTIONS
     )
-    take: bpy.props.StringProperty(
-        name="Take",
-        description="Folder of a further capture of the same head",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
-    )
-    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
-    iterations: bpy.props.IntProperty(
-        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
-    )
-    device: device_property()
-    adapter: adapter_property()
-    python: python_property()
-    wait: wait_property()
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return may_train(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -156,7 +134,7 @@ def _start(operator: Any, context: Any, request: RefineRequest | ExtendRequest) 
     settings = scene_settings(context)
     if not (request.parent / AVATAR).is_file():
         raise StgaError(f"{request.parent}: holds no trained avatar; train one first")
-    result = start_training(operator, context, request, python_of(operator, context))
+    result = start_training(operator, context, request)
     shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(request.parent)]
     if not shown and settings.splats is not None:
         shown = [settings.splats]

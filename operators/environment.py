@@ -1,7 +1,6 @@
-"""Operators that make, test and cancel the training environment, and the choice of the Python that trains."""
+"""Operators that make and test the training environment."""
 
 import sys
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,54 +14,16 @@ from ..stga_addon.requests.environment_job import (
     check_arguments,
     make_arguments,
 )
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.worker.environment import find_training_python, status_folder
+from ..stga_addon.worker.environment import status_folder
 from ..stga_addon.worker.launch import prepare_status_folder, start_worker
-from ..stga_addon.worker.status import WorkerState, inspect_worker, request_cancel
 from . import ids, monitor
-from .common import file_path, package, preferences, reporting
+from .common import environment_folder, file_path, reporting
+from .request import final_snapshot, needs_idle
+from .training_python import training_python
 
 OFFLINE = "Allow Online Access in Preferences → System → Network first"
-
-
-def training_python(context: Any, given: str = "") -> str:
-    """The interpreter that trains: the one given, else that of `find_training_python`.
-
-    Raises StgaError where none of them can.
-    """
-    return bpy.path.abspath(given) if given else find_training_python(environment_folder(), preferred_python(context))
-
-
-def has_training_python(context: Any) -> bool:
-    """Whether `training_python` finds one, for panels: looked up when the environment's worker changes its state."""
-    folder = environment_folder()
-    return bool(_lookup(folder, preferred_python(context), monitor.snapshot(status_folder(folder)).state))
-
-
-@lru_cache(maxsize=1)
-def _lookup(folder: Path, preferred: str, state: WorkerState) -> str:
-    try:
-        return find_training_python(folder, preferred)
-    except StgaError:
-        return ""
-
-
-def preferred_python(context: Any) -> str:
-    """The Python in the preferences; "" where none is."""
-    stored = preferences(context)
-    return bpy.path.abspath(stored.training_python) if stored and stored.training_python else ""
-
-
-def environment_folder(create: bool = False) -> Path:
-    """The folder of the training environment; a checkout, which is no extension, has it among Blender's user data."""
-    try:
-        return Path(bpy.utils.extension_path_user(package(), path="environment", create=create))
-    except ValueError:
-        return Path(bpy.utils.user_resource("DATAFILES", path="stga_environment", create=create))
-
-
-def _is_busy() -> bool:
-    return monitor.snapshot(status_folder(environment_folder())).state.is_alive
 
 
 class MakeEnvironment(bpy.types.Operator):
@@ -91,7 +52,7 @@ class MakeEnvironment(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_idle_environment(cls)
+        return needs_idle(cls, context, Kind.ENVIRONMENT)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         return context.window_manager.invoke_props_dialog(
@@ -138,42 +99,12 @@ class TestEnvironment(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_idle_environment(cls)
+        return needs_idle(cls, context, Kind.ENVIRONMENT)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
         folder = environment_folder(create=True)
         return _run(self, folder, check_arguments(folder, training_python(context, self.python)))
-
-
-class CancelEnvironment(bpy.types.Operator):
-    """Stop making the training environment, and remove the incomplete one"""
-
-    bl_idname = ids.CANCEL_ENVIRONMENT
-    bl_label = "Cancel"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if _is_busy():
-            return True
-        cls.poll_message_set("No training environment is being made")
-        return False
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        folder = status_folder(environment_folder())
-        request_cancel(folder)
-        monitor.monitor_worker(folder)
-        return {"FINISHED"}
-
-
-def needs_idle_environment(operator: Any) -> bool:
-    """Poll: whether the training environment is not being made or tested."""
-    if _is_busy():
-        operator.poll_message_set("The training environment is being made or tested; wait, or cancel that")
-        return False
-    return True
 
 
 def _run(operator: Any, folder: Path, arguments: list[str]) -> set[str]:
@@ -184,11 +115,13 @@ def _run(operator: Any, folder: Path, arguments: list[str]) -> set[str]:
     status = status_folder(folder)
     prepare_status_folder(status)
     process = start_worker(status, sys.executable, arguments)
-    monitor.monitor_worker(status, process)
-    if bpy.app.background:
-        process.wait()
-        final = inspect_worker(status, process)
-        if final.state.failed:
-            raise StgaError(final.status.error)
-        operator.report({"INFO"}, final.status.message)
+    monitor.follow(None, Kind.ENVIRONMENT, folder, status, process)
+    if monitor.has_timer():
+        monitor.check_now(None, Kind.ENVIRONMENT)
+        return {"FINISHED"}
+    process.wait()
+    final = final_snapshot(status, process)
+    if final.state.failed:
+        raise StgaError(final.status.error)
+    operator.report({"INFO"}, final.status.message)
     return {"FINISHED"}

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon import __version__
-from ..stga_addon.requests.folder import request_folder
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.worker.status import failure_report
 from . import ids, monitor
 from .common import file_path, reporting
@@ -28,8 +28,8 @@ class CopyReport(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        run = monitor.training_of(context.scene).folder
-        folder = file_path(self.directory, "folder") if self.directory or run is None else request_folder(run)
+        training = monitor.state_of(context.scene, Kind.TRAINING).folder
+        folder = training if training and not self.directory else file_path(self.directory, "folder")
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
         context.window_manager.clipboard = f"{versions}\n{failure_report(folder, monitor.inspect_status(folder))}"
         self.report({"INFO"}, "Copied to the clipboard")

@@ -1,12 +1,12 @@
-"""Training monitor: a timer that reads the status of workers and shows their splats in the scene.
+"""Request monitor: one timer that reads the status of workers and brings their results into their scenes.
 
-What is to be done is decided by `requests.monitor_state`; this module reads files, carries out effects and owns the
-timer.
+What is to be done is decided by `requests.monitor_state`; this module reads files, owns the timer and carries out
+effects, those that depend on the kind of request by the table in `results`.
 """
 
+import shutil
 import traceback
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
@@ -16,111 +16,94 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.requests import monitor_state as states
-from ..stga_addon.requests.folder import PREVIEW, request_folder
-from ..stga_addon.requests.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, MonitorState, RunFiles, transition
+from ..stga_addon.requests.folder import PREVIEW, remove_request, request_folder
+from ..stga_addon.requests.monitor_state import (
+    CHECK_INTERVAL_S,
+    SLICE_INTERVAL_S,
+    STORED,
+    TRANSIENT,
+    Kind,
+    RequestState,
+    RunFiles,
+    transition,
+)
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
-from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
 from ..stga_addon.scene.viewports import open_sidebar
 from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
-from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker
+from ..stga_addon.worker.environment import status_folder
+from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker, refuse_running_worker, request_cancel
 from . import ids
-from .common import is_head
-from .show import show
+from .common import environment_folder, is_head
+from .results import KINDS, loader
 
 Curve = tuple[np.ndarray, str, str]
 """Pixels of a run's curve, the ranges of its axes and of the detail difference."""
 
-_states: dict[int, MonitorState] = {}
-"""Session id of a scene -> its training."""
+NO_SCENE = 0
+"""Stands for the session id of a scene, of the training environment, which belongs to none."""
+
+_states: dict[tuple[int, Kind], RequestState] = {}
+"""Session id of a scene and kind -> its request."""
 _curves: dict[Path, Curve | None] = {}
 """Run folder -> its curve as last read."""
-_snapshots: dict[Path, WorkerSnapshot] = {}
-"""Status folders of workers that belong to no scene: those of the training environment."""
-_followers: dict[Path, Callable[[], bool]] = {}
-"""Status folder -> called when its worker has ended, again until it returns True."""
 _processes: dict[Path, "Popen[bytes]"] = {}
-"""Status folder -> worker that this Blender started, whose exit code is known."""
+"""Folder of a request -> worker that this Blender started, whose exit code is known."""
 
 
-def training_of(scene: Any) -> MonitorState:
-    """The scene's training as the timer last saw it; without a window, where no timer runs, as it is."""
-    state = _states.get(scene.session_uid)
+def state_of(scene: Any, kind: Kind) -> RequestState:
+    """The scene's request as the timer last saw it; without a window, where no timer runs, as it is."""
+    state = _states.get(_key(scene, kind))
     if has_timer():
         if state is None:
             _start_timer()
-        return state or MonitorState()
-    if state is None:
-        run, result_shown = _stored(scene)
-        state = MonitorState(run, run, result_shown=result_shown)
-    if state.run is None:
+        return state or RequestState(kind)
+    state = state or _stored_state(scene, kind)
+    if state.folder is None:
         return state
-    folder = _locate(scene, state.run)
-    return replace(state, folder=folder, snapshot=inspect_status(request_folder(folder)))
+    folder = _locate(scene, state)
+    return replace(state, folder=folder, snapshot=inspect_status(folder))
 
 
-def curve(folder: Path) -> Curve | None:
-    """The curve of the run in this folder as the timer last read it; None before two evaluations."""
-    return _curves.get(folder)
+def curve(run: Path) -> Curve | None:
+    """The curve of a run as the timer last read it; None before two evaluations."""
+    return _curves.get(run)
 
 
-def start_training(scene: Any, run: Path, process: "Popen[bytes] | None") -> None:
-    """Monitor a run that was started for the scene; process: its worker, None where this process trains."""
-    if process is not None:
-        _processes[request_folder(run)] = process
-    _handle(scene, states.Started(run))
-    check_now(scene)
-
-
-def finish_training(scene: Any) -> None:
-    """Store the result of a training that was waited for, without showing it."""
-    _handle(scene, _read_status(scene, show_result=False))
-
-
-def dismiss_training(scene: Any) -> None:
-    """Forget the scene's training."""
-    state = training_of(scene)
-    if state.folder is not None:
-        _processes.pop(request_folder(state.folder), None)
-        _curves.pop(state.folder, None)
-    _handle(scene, states.Dismissed())
-
-
-def check_now(scene: Any) -> None:
-    """Read the status of the scene's training at once, and again as long as something is expected."""
-    if _read_scene(scene).run is not None:
-        _handle(scene, _read_status(scene))
-    _start_timer()
-
-
-def monitor_worker(
-    folder: Path, process: "Popen[bytes] | None" = None, when_ended: Callable[[], bool] | None = None
-) -> None:
-    """Monitor a worker until it ends; then call `when_ended`, again until it returns True, unless Blender renders."""
+def follow(scene: Any, kind: Kind, subject: Path, folder: Path, process: "Popen[bytes] | None" = None) -> None:
+    """The request in the folder is that of the scene. process: its worker; None: this process carries it out."""
+    _processes.pop(folder, None)
     if process is not None:
         _processes[folder] = process
-    if when_ended is not None:
-        _followers[folder] = when_ended
-    _snapshots[folder] = inspect_status(folder)
+    _handle(scene, kind, states.Started(subject, folder))
+
+
+def finish(scene: Any, kind: Kind) -> RequestState:
+    """Bring the result of a request that was waited for into the scene; a trained avatar is stored, not shown."""
+    state = _handle(scene, kind, _read_status(scene, _states[_key(scene, kind)], show_result=False))
+    return _handle(scene, kind, states.SceneFree()) if state.loading is not None else state
+
+
+def cancel(scene: Any, kind: Kind) -> None:
+    """Raises StgaError where the request's folder cannot be written."""
+    _handle(scene, kind, states.CancelAsked())
+    check_now(scene, kind)
+
+
+def dismiss(scene: Any, kind: Kind) -> None:
+    """Forget the request and remove its files. Raises StgaError where its worker is running, or they cannot be."""
+    _handle(scene, kind, states.Dismissed())
+
+
+def check_now(scene: Any, kind: Kind) -> None:
+    """Read the status of a request at once, and again as long as something is expected."""
+    state = _read_scene(scene, kind)
+    if state.folder is not None:
+        _handle(scene, kind, _read_status(scene, state))
     _start_timer()
-
-
-def forget_worker(folder: Path) -> None:
-    """No longer monitor a worker."""
-    for known in (_snapshots, _followers, _processes):
-        known.pop(folder, None)
-
-
-def snapshot(folder: Path) -> WorkerSnapshot:
-    """Status of a worker that belongs to no scene, as the timer last saw it; without a window, as it is."""
-    if folder not in _snapshots or not has_timer():
-        _snapshots[folder] = inspect_status(folder)
-    return _snapshots[folder]
 
 
 def inspect_status(folder: Path) -> WorkerSnapshot:
@@ -134,90 +117,99 @@ def has_timer() -> bool:
 
 
 def tick() -> float | None:
-    """Check every scene and worker; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
-    intervals = [_check_safely(scene) for scene in bpy.data.scenes if scene.library is None]
-    for folder in [folder for folder, last in _snapshots.items() if last.state.is_alive or folder in _followers]:
-        intervals.append(_check_worker_safely(folder))
+    """Check every request; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
+    scenes = [scene for scene in bpy.data.scenes if scene.library is None]
+    intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind if kind != Kind.ENVIRONMENT]
+    environment = _states.get((NO_SCENE, Kind.ENVIRONMENT))
+    if environment is None or environment.is_running:
+        intervals.append(_check_safely(None, Kind.ENVIRONMENT))
     return min((interval for interval in intervals if interval is not None), default=None)
 
 
-def _check_safely(scene: Any) -> float | None:
-    """Check one scene; an unexpected error is reported once, and ends the monitoring of this scene only."""
+def _check_safely(scene: Any, kind: Kind) -> float | None:
+    """Check one request; an unexpected error is reported once, and ends the monitoring of this request only."""
     try:
-        return _check(scene)
+        return _check(scene, kind)
     except Exception as error:
-        traceback.print_exc()
-        sentence = f"Monitoring stopped after an unexpected error ({type(error).__name__}: {error}); see the console"
-        _handle(scene, states.MonitorFailed(sentence))
+        _handle(scene, kind, states.Failed(f"Monitoring stopped after an unexpected {_describe(error)}", stops=True))
         return None
 
 
-def _check_worker_safely(folder: Path) -> float | None:
-    """Check a worker that belongs to no scene; after an unexpected error, which is printed, it counts as ended."""
-    before = _snapshots.get(folder)
-    try:
-        _snapshots[folder] = inspect_status(folder)
-    except Exception:
-        traceback.print_exc()
-        _snapshots[folder] = WorkerSnapshot()
-    if _snapshots[folder] != before:
-        redraw()
-    if _snapshots[folder].state.is_alive:
-        return CHECK_INTERVAL_S
-    _call_follower(folder)
-    return CHECK_INTERVAL_S if folder in _followers else None
-
-
-def _call_follower(folder: Path) -> None:
-    """Call what waits for the end of the worker, unless Blender renders: its thread reads what would be changed."""
-    if folder not in _followers or bpy.app.is_job_running("RENDER"):
-        return
-    try:
-        if not _followers[folder]():
-            return
-    except Exception:
-        traceback.print_exc()
-    _followers.pop(folder, None)
-    redraw()
-
-
-def _read_scene(scene: Any) -> MonitorState:
-    """Compare the scene's state with what is stored in the scene."""
-    run, result_shown = _stored(scene)
-    is_new = scene.session_uid not in _states
-    return _handle(scene, states.FileLoaded(run, result_shown) if is_new else states.SceneRead(run, result_shown))
-
-
-def _check(scene: Any) -> float | None:
-    state = _read_scene(scene)
-    if state.run is None or state.stopped:
+def _check(scene: Any, kind: Kind) -> float | None:
+    state = _read_scene(scene, kind)
+    if state.folder is None or state.stopped:
         return None
     if not state.building:
-        state = _handle(scene, _read_status(scene))
-    if state.loading is not None:
-        state = _show_loaded(scene)
+        state = _handle(scene, kind, _read_status(scene, state))
+    # Blender crashes where a mesh changes during these.
+    if state.loading is not None and not bpy.app.is_job_running("RENDER") and not _is_edited(scene, kind):
+        state = _handle(scene, kind, states.SceneFree())
     return state.interval_s
 
 
-def _stored(scene: Any) -> tuple[Path | None, bool]:
-    """What the scene stores of its training: the run, and whether its result was shown."""
-    settings = getattr(scene, ids.SETTINGS)
-    return Path(settings.training_run) if settings.training_run else None, settings.result_shown
+def _describe(error: Exception) -> str:
+    """Print the traceback of an error that is being handled; its description for a sentence."""
+    traceback.print_exc()
+    return f"error ({type(error).__name__}: {error}); see the console"
 
 
-def _locate(scene: Any, run: Path) -> Path:
-    """The run's folder; where it is gone, the scene's run folder, which may have moved along with the .blend file."""
-    beside = Path(bpy.path.abspath(getattr(scene, ids.SETTINGS).run_folder))
-    return next((folder for folder in (run, beside) if request_folder(folder).is_dir()), run)
+def _key(scene: Any, kind: Kind) -> tuple[int, Kind]:
+    return NO_SCENE if kind == Kind.ENVIRONMENT else scene.session_uid, kind
 
 
-def _read_status(scene: Any, show_result: bool | None = None) -> states.StatusRead:
-    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
-    assert run is not None
-    folder = _locate(scene, run)
-    files = RunFiles(_stamp(request_folder(folder) / PREVIEW), _stamp(folder / METRICS), _stamp(folder / TRACKING))
+def _is_edited(scene: Any, kind: Kind) -> bool:
+    changed = KINDS[kind].changed(scene, _states[_key(scene, kind)])
+    return changed is not None and changed.mode == "EDIT"
+
+
+def _stored_state(scene: Any, kind: Kind) -> RequestState:
+    """A request that was not seen yet, as it is stored."""
+    if kind == Kind.ENVIRONMENT:
+        return RequestState(kind, environment_folder(), status_folder(environment_folder()))
+    state = RequestState(kind)
+    if kind in STORED:
+        subject, result_shown = _read_stored(scene, kind)
+        state = replace(state, subject=subject, result_shown=result_shown)
+    return replace(state, folder=_locate(scene, state))
+
+
+def _read_stored(scene: Any, kind: Kind) -> tuple[Path | None, bool]:
+    settings, (subject, result_shown) = getattr(scene, ids.SETTINGS), KINDS[kind].stored or ("", "")
+    path = getattr(settings, subject)
+    return Path(path) if path else None, getattr(settings, result_shown)
+
+
+def _locate(scene: Any, state: RequestState) -> Path | None:
+    """The request's folder; where a run is gone, that in the scene's run folder, which may have moved along with the
+    .blend file."""
+    if state.kind not in STORED or state.subject is None:
+        return state.folder
+    named = request_folder(state.subject)
+    if state.kind == Kind.TRAINING and not named.is_dir():
+        beside = request_folder(Path(bpy.path.abspath(getattr(scene, ids.SETTINGS).run_folder)))
+        return beside if beside.is_dir() else named
+    return named
+
+
+def _read_scene(scene: Any, kind: Kind) -> RequestState:
+    """Compare the request's state with what is stored in the scene."""
+    key = _key(scene, kind)
+    if key not in _states:
+        _states[key] = _stored_state(scene, kind)
+    elif kind in STORED:
+        return _handle(scene, kind, states.SceneRead(*_read_stored(scene, kind)))
+    return _states[key]
+
+
+def _read_status(scene: Any, state: RequestState, show_result: bool | None = None) -> states.StatusRead:
+    folder = _locate(scene, state)
+    assert folder is not None
+    if state.kind != Kind.TRAINING:
+        return states.StatusRead(folder, inspect_status(folder))
+    settings, run = getattr(scene, ids.SETTINGS), folder.parent
+    files = RunFiles(_stamp(folder / PREVIEW), _stamp(run / METRICS), _stamp(run / TRACKING))
     shown = settings.show_result if show_result is None else show_result
-    return states.StatusRead(folder, inspect_status(request_folder(folder)), files, settings.live_preview, shown)
+    return states.StatusRead(folder, inspect_status(folder), files, settings.live_preview, shown)
 
 
 def _stamp(path: Path) -> states.Stamp | None:
@@ -228,113 +220,82 @@ def _stamp(path: Path) -> states.Stamp | None:
     return found.st_mtime_ns, found.st_size
 
 
-def _handle(scene: Any, event: states.Event) -> MonitorState:
-    """Feed the event to the scene's state and carry out the effects."""
-    state, effects = transition(_states.get(scene.session_uid, MonitorState()), event)
-    _states[scene.session_uid] = state
-    _carry_out(scene, effects)
+def _handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
+    """Feed the event to the request's state, carry out the effects, and feed their answers in turn.
+
+    Raises StgaError where files cannot be written or removed; the state is that of before then.
+    """
+    key = _key(scene, kind)
+    state, effects = transition(_states.get(key) or _stored_state(scene, kind), event)
+    answers = [_carry_out(scene, state, effect) for effect in effects]
+    _states[key] = state
+    for answer in answers:
+        if answer is not None:
+            state = _handle(scene, kind, answer)
     return state
 
 
-def _carry_out(scene: Any, effects: Iterable[states.Effect]) -> None:
-    settings = getattr(scene, ids.SETTINGS)
-    for effect in effects:
-        match effect:
-            case states.StoreTraining(run, result_shown):
-                settings.training_run, settings.result_shown = "" if run is None else str(run), result_shown
-            case states.StoreAvatar(path):
-                settings.avatar = str(path)
-            case states.LoadAvatar(path):
-                _loader.load(scene, path)
-            case states.ReadCurve(folder):
-                _curves[folder] = _read_curve(folder)
-            case states.PushUndo():
-                if has_timer():  # later: saving the scene's state takes as long as a slice
-                    bpy.app.timers.register(_push_undo, first_interval=SLICE_INTERVAL_S)
-            case states.Redraw():
-                redraw()
+def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states.Event | None:
+    match effect:
+        case states.Store(subject, result_shown):
+            names = KINDS[state.kind].stored
+            assert names is not None
+            for name, value in zip(names, (str(subject or ""), result_shown), strict=True):
+                setattr(getattr(scene, ids.SETTINGS), name, value)
+        case states.StoreAvatar(path):
+            getattr(scene, ids.SETTINGS).avatar = str(path)
+        case states.LoadAvatar(path):
+            loader.load(scene, path)
+        case states.Show():
+            return _show(scene, state)
+        case states.ReadCurve(run):
+            _curves[run] = _read_curve(run)
+        case states.StopWorker(folder):
+            request_cancel(folder)
+        case states.KillWorker(folder):
+            _processes[folder].kill()
+            _processes[folder].wait()
+        case states.RemoveFiles(folder):
+            _remove(state.kind, folder)
+        case states.PushUndo():
+            if has_timer():  # later: saving the scene's state takes as long as a slice
+                bpy.app.timers.register(_push_undo, first_interval=SLICE_INTERVAL_S)
+        case states.Redraw():
+            redraw()
+    return None
 
 
-def _read_curve(folder: Path) -> Curve | None:
+def _show(scene: Any, state: RequestState) -> states.Event | None:
     try:
-        return curve_image(read_metrics(folder))
+        return KINDS[state.kind].show(scene, state)
+    except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
+        return states.Failed(str(error).strip().removeprefix("Error: "))
+    except Exception as error:
+        return states.Failed(f"Unexpected {_describe(error)}")
+
+
+def _remove(kind: Kind, folder: Path) -> None:
+    """Raises StgaError while the worker is running, or where a file cannot be removed."""
+    if kind in STORED:  # a file from elsewhere may name any folder
+        remove_request(folder)
+    else:
+        if kind not in TRANSIENT:  # whose worker has ended, or was killed
+            refuse_running_worker(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+    _processes.pop(folder, None)
+    _curves.pop(folder.parent, None)
+
+
+def _read_curve(run: Path) -> Curve | None:
+    try:
+        return curve_image(read_metrics(run))
     except (StgaError, KeyError, TypeError, ValueError):
         return None  # training reports a damaged file
 
 
-def _show_loaded(scene: Any) -> MonitorState:
-    """Show the avatar that was loaded for the scene, in the object that shows this run or in a new one."""
-    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
-    shown = next((thing for thing in scene.objects if thing.get(tags.RUN) == str(run)), None)
-    if bpy.app.is_job_running("RENDER") or (shown is not None and shown.mode == "EDIT"):
-        return _states[scene.session_uid]  # Blender crashes where a mesh changes during these
-    try:
-        loaded = _loader.result(scene)
-        if loaded is None:
-            return _states[scene.session_uid]
-        if not is_head(settings.head):
-            raise StgaError("No head in the scene to show the avatar on; import the capture")
-        event = _present(scene, shown, *loaded)
-    except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
-        event = states.AvatarFailed(str(error))
-    if not isinstance(event, states.SliceBuilt):
-        _loader.discard(scene)
-    return _handle(scene, event)
-
-
-def _present(scene: Any, shown: Any, avatar: Avatar, attributes: SplatAttributes) -> states.Event:
-    """Show the avatar, or build the next slice of what its object needs."""
-    settings, run = getattr(scene, ids.SETTINGS), _states[scene.session_uid].run
-    check_head(avatar, settings.head)
-    if shown is not None and can_update(shown, avatar):
-        update_splats(shown, attributes)
-        return states.AvatarShown(created=False)
-    if build_next_node_group(avatar):
-        return states.SliceBuilt()
-    if shown is not None:
-        bpy.data.objects.remove(shown)
-    assert run is not None
-    shown = show(scene, avatar, settings.head, f"{settings.head.name} {run.name}", attributes=attributes)
-    shown[tags.RUN] = str(run)
-    return states.AvatarShown(created=True)
-
-
 def _push_undo() -> None:
     if bpy.ops.ed.undo_push.poll():
-        bpy.ops.ed.undo_push(message="Show Training")
-
-
-class _Loader:
-    """Reads avatar files in a thread, one for each scene."""
-
-    def __init__(self) -> None:
-        self._pool: ThreadPoolExecutor | None = None
-        self._loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
-
-    def load(self, scene: Any, path: Path) -> None:
-        self._pool = self._pool or ThreadPoolExecutor(1, "stga")
-        self._loading[scene.session_uid] = self._pool.submit(_load, path)
-
-    def result(self, scene: Any) -> tuple[Avatar, SplatAttributes] | None:
-        """The file's content; None while it is being read. Raises StgaError where it cannot be read."""
-        future = self._loading[scene.session_uid]
-        return future.result() if future.done() else None
-
-    def discard(self, scene: Any) -> None:
-        self._loading.pop(scene.session_uid, None)
-
-    def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-        self._pool, self._loading = None, {}
-
-
-_loader = _Loader()
-
-
-def _load(path: Path) -> tuple[Avatar, SplatAttributes]:
-    avatar = read_avatar(path)
-    return avatar, avatar_attributes(avatar)
+        bpy.ops.ed.undo_push(message="Show Result")
 
 
 def _start_timer() -> None:
@@ -351,10 +312,20 @@ def redraw() -> None:
                         region.tag_redraw()
 
 
+def _end_unawaited() -> None:
+    """End the workers whose result only a scene that is gone was to have."""
+    for (_, kind), state in list(_states.items()):
+        if kind in TRANSIENT and state.folder is not None:
+            for effect in transition(state, states.CancelAsked())[1]:
+                _carry_out(None, state, effect)
+
+
 @persistent
 def _after_load(_: Any) -> None:
-    _loader.close()
-    _states.clear()  # of scenes of the file before
+    loader.close()
+    _end_unawaited()
+    for key in [key for key in _states if key[1] not in (Kind.VIDEO, Kind.ENVIRONMENT)]:
+        del _states[key]  # of scenes of the file before; its videos are still rendered
     for scene in bpy.data.scenes:
         if scene.library is None:
             _adopt(scene)
@@ -397,6 +368,11 @@ def unregister() -> None:
     for timer in (tick, _push_undo):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    _loader.close()
-    for known in (_states, _curves, _snapshots, _followers, _processes):
+    loader.close()
+    _end_unawaited()
+    for (_, kind), state in _states.items():
+        if kind == Kind.VIDEO and state.folder is not None:
+            with suppress(StgaError):  # its worker is running
+                _remove(kind, state.folder)
+    for known in (_states, _curves, _processes):
         known.clear()

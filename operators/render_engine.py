@@ -5,7 +5,7 @@ import bpy
 from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.render import engine
 from .common import preferences
-from .environment import training_python
+from .training_python import training_python
 
 
 def render_device() -> str:

@@ -1,9 +1,9 @@
 """Renders a video of the shown splats: Blender records what each image shows, a worker renders and encodes it."""
 
+import shutil
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from math import pi
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,46 +16,23 @@ from ..stga_addon.capture.camera_path import TURNTABLE_S, to_and_fro
 from ..stga_addon.errors import StgaError
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.recording import Recorder, check_output
-from ..stga_addon.requests.folder import FILES
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import RenderRecording
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
-from ..stga_addon.scene.render.engine import srgb_background
+from ..stga_addon.scene.render.composite import srgb_background
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.timeline import frames_per_second
-from ..stga_addon.worker.status import refuse_running_worker, remove_status_folder, request_cancel
+from ..stga_addon.worker.status import status_writer
 from . import ids, monitor
 from .common import file_path, is_head, reporting, scene_settings
-from .environment import has_training_python, training_python
 from .render_engine import render_device
-from .request import start, wait_for_result
+from .request import needs_idle, start
+from .training_python import has_training_python, training_python
 
 RECORDING = "recording.bin"
 RECORDING_INTERVAL_S = 0.001
 """Between two recorded images, so that Blender handles its events."""
-
-
-@dataclass
-class Video:
-    """A scene's video: `recorded` of its images are recorded; then a worker renders them in its status folder."""
-
-    output: Path
-    folder: Path
-    images: int
-    recorded: int = 0
-
-    @property
-    def is_recording(self) -> bool:
-        return self.recorded < self.images
-
-
-_videos: dict[int, Video] = {}
-"""Session id of a scene -> its last video."""
-
-
-def video_of(scene: Any) -> Video | None:
-    """The scene's video that is being made, or was made last; None where there is none, or it was dismissed."""
-    return _videos.get(scene.session_uid)
 
 
 class RenderVideo(bpy.types.Operator, ExportHelper):
@@ -110,8 +87,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         if scene_settings(context).splats is None:
             cls.poll_message_set("Show an avatar first")
             return False
-        if is_busy(context.scene):
-            cls.poll_message_set("A video is being made; wait, or cancel it")
+        if not needs_idle(cls, context, Kind.VIDEO):
             return False
         if not has_training_python(context):
             cls.poll_message_set("Needs a training environment, which is made in the add-on's preferences")
@@ -147,24 +123,24 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         try:
             while self._recording.record_next():
                 pass
-            return self._render(context, wait=True)
+            self._recording.render(self._python)
+            self.report({"INFO"}, f"Rendered {self._recording.output}")
+            return {"FINISHED"}
         finally:
             self._recording.discard()
 
     def modal(self, context: Any, event: Any) -> set[str]:
-        if event.type == "ESC" or not self._recording.is_wanted():
+        if event.type == "ESC" or self._recording.is_cancelled:
             self.cancel(context)
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         try:
-            more = self._recording.record_next()
-            monitor.redraw()
-            if more:
+            if self._recording.record_next():
                 return {"RUNNING_MODAL"}
-            result = self._render(context)
+            self._recording.render(self._python)
             context.window_manager.event_timer_remove(self._timer)
-            return result
+            return {"FINISHED"}
         except StgaError as error:
             self.cancel(context)
             self.report({"ERROR"}, str(error))
@@ -177,7 +153,6 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         """End the recording, also when Blender quits or loads another file meanwhile."""
         context.window_manager.event_timer_remove(self._timer)
         self._recording.discard()
-        monitor.redraw()
 
     def _frames(self, context: Any) -> list[int]:
         scene = context.scene
@@ -194,100 +169,35 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         subject = settings.head if is_head(settings.head) else settings.splats
         return turntable_cameras(subject, context.evaluated_depsgraph_get(), count, self.angle)
 
-    def _render(self, context: Any, wait: bool = False) -> set[str]:
-        """Start the worker; `wait`: until it ends. Raises StgaError where it failed then."""
-        video, request = self._recording.finish()
-        process = start(video.folder, request, self._python)
-        monitor.monitor_worker(video.folder, process)
-        if wait:
-            wait_for_result(video.folder, process)
-            self.report({"INFO"}, f"Rendered {video.output}")
-        return {"FINISHED"}
-
-
-class CancelVideo(bpy.types.Operator):
-    """Stop making the video; nothing is written, or the PNGs that are finished stay"""
-
-    bl_idname = ids.CANCEL_VIDEO
-    bl_label = "Cancel Video"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if is_busy(context.scene):
-            return True
-        cls.poll_message_set("No video is being made")
-        return False
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        video = _videos[context.scene.session_uid]
-        if video.is_recording:
-            _videos.pop(context.scene.session_uid)  # the recording sees it at its next image
-        else:
-            request_cancel(video.folder)
-            monitor.monitor_worker(video.folder)
-        return {"FINISHED"}
-
-
-class DismissVideo(bpy.types.Operator):
-    """Remove the message about the last video; the video stays"""
-
-    bl_idname = ids.DISMISS_VIDEO
-    bl_label = "Dismiss"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if video_of(context.scene) is not None and not is_busy(context.scene):
-            return True
-        cls.poll_message_set("No video was made yet, or one is being made")
-        return False
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        _remove(_videos.pop(context.scene.session_uid).folder)
-        return {"FINISHED"}
-
-
-def is_busy(scene: Any) -> bool:
-    """Whether a video of the scene is being recorded or rendered."""
-    video = video_of(scene)
-    return video is not None and (video.is_recording or monitor.snapshot(video.folder).state.is_alive)
-
 
 class _Recording:
-    """Records the images of a video, one scene frame at a time; the scene's frame is restored at the end."""
+    """Records the images of a video, one scene frame at a time; the scene's frame is restored at the end.
+
+    Until the worker takes over, this process is that of the request in the folder, and writes its status.
+    """
 
     def __init__(self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None) -> None:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
         self._view_layer = context.view_layer
         self._cache, self._posed = SplatCache(), (-1, list[PosedSplats]())
+        self._recorded, self.output, self.is_cancelled = 0, output, False
         check_output(output)
-        folder, self._recorder = _start_recording()
-        self._request = RenderRecording(
-            self._recorder.path,
-            output,
-            len(frames),
-            frames_per_second(context.scene),
-            srgb_background(context.scene),
-            render_device(),
-        )
-        self.video = Video(output, folder, len(frames))
-        last = _videos.get(context.scene.session_uid)
-        if last is not None:
-            _remove(last.folder)
-        _videos[context.scene.session_uid] = self.video
-
-    def is_wanted(self) -> bool:
-        """Whether it was not cancelled."""
-        return self.video in _videos.values()
+        self._files = ExitStack()
+        with ExitStack() as failed:
+            self.folder = _temporary_folder()
+            failed.callback(shutil.rmtree, self.folder, ignore_errors=True)
+            self._status = self._files.enter_context(status_writer(self.folder))
+            failed.callback(self._files.close)
+            self._recorder = Recorder(self.folder / RECORDING)
+            self._status.update(0.0, "Recording")
+            monitor.follow(context.scene, Kind.VIDEO, output, self.folder)
+            monitor.check_now(context.scene, Kind.VIDEO)
+            failed.pop_all()
 
     def record_next(self) -> bool:
         """Record an image; whether there are more. Raises StgaError, as where the head is gone."""
-        index = self.video.recorded
-        frame = self._frames[index]
+        frame = self._frames[self._recorded]
         # The recorded scene, which the window may no longer show.
         with bpy.context.temp_override(scene=self._scene, view_layer=self._view_layer):
             if frame != self._posed[0]:
@@ -295,26 +205,36 @@ class _Recording:
                 layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
                 self._posed = frame, [layer.posed() for layer in layers]
             own = self._cameras is None
-            camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[index]
+            camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[self._recorded]
         self._recorder.add(self._posed[1], camera)
-        self.video.recorded += 1
-        return self.video.is_recording
+        self._recorded += 1
+        self.is_cancelled = self._status.update(self._recorded / len(self._frames), "Recording")
+        return self._recorded < len(self._frames)
 
-    def finish(self) -> tuple[Video, RenderRecording]:
-        """End the recording; the request is ready for its worker. Raises StgaError on a full disk."""
+    def render(self, python: str) -> None:
+        """End the recording, and start its worker. Raises StgaError on a full disk, and as `request.start` does."""
         self._restore()
         self._recorder.close()
-        return self.video, self._request
+        self._files.close()
+        request = RenderRecording(
+            self._recorder.path,
+            self.output,
+            len(self._frames),
+            frames_per_second(self._scene),
+            srgb_background(self._scene),
+            render_device(),
+        )
+        start(self._scene, request, python, self.folder)
 
     def discard(self) -> None:
         """End the recording and remove its files."""
         self._restore()
         with suppress(StgaError):  # a full disk
             self._recorder.close()
-        _remove(self.video.folder)
-        for scene, video in list(_videos.items()):
-            if video is self.video:
-                del _videos[scene]
+        self._files.close()
+        with suppress(ReferenceError):  # another file was opened
+            monitor.dismiss(self._scene, Kind.VIDEO)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _restore(self) -> None:
         frame, subframe = self._shown
@@ -322,29 +242,8 @@ class _Recording:
             self._scene.frame_set(frame, subframe=subframe)
 
 
-def _start_recording() -> tuple[Path, Recorder]:
-    """A temporary folder for the request, and what records into it. Raises StgaError, and leaves no folder then."""
+def _temporary_folder() -> Path:
     try:
-        folder = Path(tempfile.mkdtemp(prefix="stga_video_"))
+        return Path(tempfile.mkdtemp(prefix="stga_video_"))
     except OSError as error:
         raise StgaError(f"{tempfile.gettempdir()}: cannot be written ({error.strerror or error})") from error
-    try:
-        return folder, Recorder(folder / RECORDING)
-    except StgaError:
-        _remove(folder)
-        raise
-
-
-def _remove(folder: Path) -> None:
-    """Remove a recording, its request and its status; the video stays. Raises StgaError while its worker works."""
-    refuse_running_worker(folder)
-    (folder / RECORDING).unlink(missing_ok=True)
-    remove_status_folder(folder, FILES)
-
-
-def unregister() -> None:
-    """Forget the videos, and remove the jobs of those that are finished; other workers go on."""
-    for video in _videos.values():
-        with suppress(StgaError):  # its worker is running
-            _remove(video.folder)
-    _videos.clear()

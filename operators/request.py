@@ -1,81 +1,77 @@
-"""Requests from Blender: starting a worker for one, waiting for it, or carrying it out here."""
+"""Requests from Blender: starting a worker for one, or carrying it out here; cancelling and dismissing it."""
 
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 from subprocess import Popen
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.folder import check_request, read_result, worker_arguments, write_request
-from ..stga_addon.requests.results import Result
+from ..stga_addon.requests.folder import check_request, request_folder, worker_arguments, write_request
+from ..stga_addon.requests.monitor_state import DISMISSIBLE, STORED, SUBJECTS, TRANSIENT, Kind
 from ..stga_addon.requests.values import Request
 from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
-from ..stga_addon.worker.status import WorkerState, failure_report, inspect_worker
-from .environment import training_python
+from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
+from . import ids, monitor
+from .common import reporting
+from .results import KINDS
+from .training_python import training_python
 
 
-def ask(folder: Path, request: Request) -> None:
-    """Write the request into the folder. Raises StgaError for what is known to fail, and while a worker is there."""
+def start(scene: Any, request: Request, python: str | None, folder: Path | None = None, wait: bool = False) -> bool:
+    """Start a worker for a request about the scene, whose result the monitor brings into the scene.
+
+    python: the worker's interpreter; None: Blender's own carries the request out, here and now.
+    folder: of the request; None: in the run or capture, or a temporary one. wait: for the end, as always without a
+    window. Returns whether it was waited for.
+    Raises StgaError for what is known to fail, while a worker is there, and where the interpreter cannot be started;
+    where it was waited for, also with the error of the worker or of its result.
+    """
+    kind, name = SUBJECTS[type(request)]
+    subject = getattr(request, name)
+    if folder is None:
+        folder = request_folder(subject) if kind in STORED else Path(tempfile.mkdtemp(prefix="stga_"))
+    try:
+        process = _write_and_start(folder, request, python)
+    except StgaError:
+        if kind in TRANSIENT:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    monitor.follow(scene, kind, subject, folder, process)
+    if process is None:
+        _perform_here(folder)
+    elif not wait and monitor.has_timer():
+        monitor.check_now(scene, kind)
+        return False
+    else:
+        process.wait()
+    last = final_snapshot(folder, process)
+    shown = monitor.finish(scene, kind)
+    if last.state.failed or shown.error:
+        raise StgaError(shown.error or last.status.error)
+    if last.state == WorkerState.CANCELLED and kind != Kind.TRAINING:  # which keeps the avatar so far
+        raise StgaError("The worker was cancelled")
+    return True
+
+
+def _write_and_start(folder: Path, request: Request, python: str | None) -> "Popen[bytes] | None":
     check_request(request)
     write_request(folder, request)
+    return None if python is None else start_worker(folder, python, worker_arguments(folder))
 
 
-def start(folder: Path, request: Request, python: str) -> "Popen[bytes]":
-    """Write the request into the folder and start a worker for it.
-
-    Raises StgaError as `ask` does, and where the interpreter cannot be started.
-    """
-    ask(folder, request)
-    return start_worker(folder, python, worker_arguments(folder))
-
-
-def wait(folder: Path, process: "Popen[bytes]") -> Result | None:
-    """Wait for the worker; returns its result, None where it was cancelled.
-
-    Raises StgaError with its error where it failed; the traceback goes to the console.
-    """
-    process.wait()
-    last = inspect_worker(folder, process)
-    if last.state.failed:
-        print(failure_report(folder, last), file=sys.stderr)
-        raise StgaError(last.status.error)
-    return None if last.state == WorkerState.CANCELLED else read_result(folder)
-
-
-def wait_for_result(folder: Path, process: "Popen[bytes]") -> Result:
-    """`wait` for work that leaves nothing when it is cancelled: raises StgaError then, too."""
-    result = wait(folder, process)
-    if result is None:
-        raise StgaError("The worker was cancelled")
-    return result
-
-
-def waits(operator: Any) -> bool:
-    """Whether an operator with `wait_property`, or any without a window, returns only when the work is done."""
-    return bool(operator.wait or bpy.app.background)
-
-
-def python_of(operator: Any, context: Any) -> str | None:
-    """The interpreter that is to carry out a request; None: that of Blender, where it waits and has the packages.
-
-    Raises StgaError where there is none.
-    """
-    if waits(operator) and not operator.python and not missing_packages():
-        return None
-    return training_python(context, operator.python)
-
-
-def perform_here(context: Any, folder: Path) -> Result | None:
+def _perform_here(folder: Path) -> None:
     """Carry out the request in the folder in Blender's own Python, with Blender's progress at the pointer.
 
-    Returns None where it was cancelled. Raises what the work raises.
+    Raises what the work raises.
     """
     from ..stga_addon.perform.perform import perform_in_folder
 
-    manager = context.window_manager
+    manager = bpy.context.window_manager
 
     def show(progress: Any) -> bool:
         manager.progress_update(100 * progress.share)
@@ -83,6 +79,94 @@ def perform_here(context: Any, folder: Path) -> Result | None:
 
     manager.progress_begin(0, 100)
     try:
-        return perform_in_folder(folder, also=show)
+        perform_in_folder(folder, also=show)
     finally:
         manager.progress_end()
+
+
+def final_snapshot(folder: Path, process: "Popen[bytes] | None") -> WorkerSnapshot:
+    """The status of a worker that has ended; where it failed, its report goes to the console."""
+    last = inspect_worker(folder, process)
+    if last.state.failed:
+        print(failure_report(folder, last), file=sys.stderr)
+    return last
+
+
+def python_of(operator: Any, context: Any) -> str | None:
+    """The interpreter that is to carry out a request; None: that of Blender, where it waits and has the packages.
+
+    Raises StgaError where there is none.
+    """
+    if (operator.wait or bpy.app.background) and not operator.python and not missing_packages():
+        return None
+    return training_python(context, operator.python)
+
+
+def needs_idle(operator: Any, context: Any, kind: Kind) -> bool:
+    """Poll: whether no request of the kind is running; says so where one is."""
+    if not monitor.state_of(context.scene, kind).is_running:
+        return True
+    operator.poll_message_set(f"{KINDS[kind].label} is running; wait, or cancel it")
+    return False
+
+
+def _kind_property(kinds: Any) -> Any:
+    return bpy.props.EnumProperty(
+        name="Request",
+        description="What was asked for",
+        items=[(kind.value, kind.value.capitalize(), KINDS[kind].label) for kind in Kind if kind in kinds],
+    )
+
+
+class Cancel(bpy.types.Operator):
+    """Stop a request that is running"""
+
+    bl_idname = ids.CANCEL
+    bl_label = "Cancel"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    request: _kind_property(Kind)
+
+    @classmethod
+    def description(cls, context: Any, properties: Any) -> str:
+        return KINDS[Kind(properties.request)].cancel
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if any(monitor.state_of(context.scene, kind).is_running for kind in Kind):
+            return True
+        cls.poll_message_set("Nothing is running")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        kind = Kind(self.request)
+        if not monitor.state_of(context.scene, kind).is_running:
+            raise StgaError(f"{KINDS[kind].label} is not running")
+        monitor.cancel(context.scene, kind)
+        return {"FINISHED"}
+
+
+class Dismiss(bpy.types.Operator):
+    """Remove status and log of a request that has ended; what it made stays, such as a run with its checkpoints"""
+
+    bl_idname = ids.DISMISS
+    bl_label = "Dismiss"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    request: _kind_property(DISMISSIBLE)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if any(monitor.state_of(context.scene, kind).can_be_dismissed for kind in DISMISSIBLE):
+            return True
+        cls.poll_message_set("Nothing has ended in this scene that could be dismissed")
+        return False
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        kind = Kind(self.request)
+        if not monitor.state_of(context.scene, kind).can_be_dismissed:
+            raise StgaError(f"{KINDS[kind].label} is running, or was never asked for in this scene")
+        monitor.dismiss(context.scene, kind)
+        return {"FINISHED"}

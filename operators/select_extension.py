@@ -3,18 +3,14 @@
 from typing import Any, ClassVar
 
 import bpy
-import numpy as np
 
-from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.results import Selected
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import SelectForTake
-from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.vertex_groups import write_selection
-from . import background, ids, monitor
-from .background import BackgroundRequest
-from .common import capture_source, file_path, head_of, is_head, needs_own_head, reporting
-from .select import count_selected
+from . import ids
+from .common import capture_source, file_path, head_of, needs_own_head, reporting
+from .request import needs_idle, start
+from .training_python import training_python
 
 
 class SelectExtension(bpy.types.Operator):
@@ -31,26 +27,11 @@ class SelectExtension(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return background.needs_idle(cls, context) and needs_own_head(cls, context)
+        return needs_idle(cls, context, Kind.SELECTION) and needs_own_head(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
         head, run = head_of(context), file_path(self.directory, "run folder")
         take, flame, _ = capture_source(head)
-
-        def show(scene: Any, found: Selected) -> None:
-            _show(scene, str(take), dict(found.selection))
-
-        request = SelectForTake(run, take, flame)
-        background.start(context, BackgroundRequest(request, show, "extension_error", changes_head=True))
+        start(context.scene, SelectForTake(run, take, flame), training_python(context))
         return {"FINISHED"}
-
-
-def _show(scene: Any, take: str, selection: dict[int, np.ndarray]) -> None:
-    head = getattr(scene, ids.SETTINGS).head
-    if not is_head(head) or head[tags.CAPTURE] != take:
-        raise StgaError(f"{take}: its head is no longer that of the scene")
-    write_selection(head, selection)
-    count_selected(scene, head)
-    if monitor.has_timer() and bpy.ops.ed.undo_push.poll():
-        bpy.ops.ed.undo_push(message=SelectExtension.bl_label)

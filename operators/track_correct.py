@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import SolveAgain as SolveAgainRequest
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import show_kind
@@ -17,8 +18,9 @@ from ..stga_addon.scene.rig.motion import sample_pose
 from ..stga_addon.tracking.posed_points import parameters_of
 from . import ids
 from .common import capture_of, flame_of, head_of, is_head, needs_head, needs_rig, reporting, scene_settings
-from .environment import training_python
-from .track import needs_idle_tracking, start_tracking
+from .request import needs_idle
+from .track import start_tracking
+from .training_python import training_python
 
 XRAY_ALPHA = 0.4
 
@@ -99,7 +101,7 @@ class SolveAgain(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if not needs_rig(cls, context) or not needs_idle_tracking(cls, context):
+        if not needs_rig(cls, context) or not needs_idle(cls, context, Kind.TRACKING):
             return False
         if scene_settings(context).head.get(tags.TRACKED):
             return True
@@ -111,7 +113,7 @@ class SolveAgain(bpy.types.Operator):
         head = head_of(context)
         capture = Path(head[tags.CAPTURE])
         request = SolveAgainRequest(capture, Path(head[tags.FLAME_MODEL]), tracking_keys(head))
-        return start_tracking(self, context, capture, request, training_python(context))
+        return start_tracking(self, context, request, training_python(context))
 
 
 def tracking_keys(head: Any) -> dict[int, np.ndarray]:

@@ -1,13 +1,11 @@
-"""Trains the avatar in a worker process beside Blender, and cancels or dismisses that training."""
+"""Trains the avatar in a worker process beside Blender."""
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.folder import remove_request, request_folder
-from ..stga_addon.requests.results import Written
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import Extend, Refine, Resume
 from ..stga_addon.requests.values import Train as TrainRequest
 from ..stga_addon.scene.compat import PATH_OPTIONS
@@ -16,28 +14,13 @@ from ..stga_addon.training.effects.decisions import parse_choices
 from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker.environment import stored_adapters
-from ..stga_addon.worker.status import request_cancel
-from . import ids, monitor
-from .common import capture_source, file_path, head_of, needs_head, reporting
-from .environment import environment_folder
-from .request import ask, perform_here, python_of, start, wait, waits
-
-
-def strategy_property() -> Any:
-    """Training strategy: of the operator, and of the panel that calls it."""
-    return bpy.props.EnumProperty(
-        name="Strategy",
-        description="Which splats each iteration trains",
-        items=(
-            ("global", "Global", "Every iteration trains all splats; most accurate on the captures measured so far"),
-            ("selective", "Selective", "Local iterations train the triangles selected in each frame; global ones, all"),
-            ("gaussian-avatars", "GaussianAvatars", "The binding, losses and learning rates of GaussianAvatars"),
-        ),
-    )
+from . import ids
+from .common import capture_source, environment_folder, file_path, head_of, needs_head, reporting
+from .request import needs_idle, python_of, start
 
 
 def preset_property(**more: Any) -> Any:
-    """Training preset: of the operator, and of the panel that calls it."""
+    """Training preset: of the operator, and of the panel, which also takes over its time."""
     purposes = [(name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()]
     return bpy.props.EnumProperty(
         name="Preset",
@@ -47,9 +30,15 @@ def preset_property(**more: Any) -> Any:
     )
 
 
-def device_property() -> Any:
-    """Training device: of the operator, and of the panel that calls it."""
-    return bpy.props.EnumProperty(
+def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
+    """The GPUs that the last test of the training environment found, in its order."""
+    return stored_adapters(environment_folder())
+
+
+class DeviceOptions:
+    """Where an operator trains: of the operators, and of the panel that calls them."""
+
+    device: bpy.props.EnumProperty(
         name="Device",
         description="Device that trains. Auto resumes a run on the device that it was trained on",
         items=(
@@ -58,16 +47,7 @@ def device_property() -> Any:
             ("gpu", "GPU", "A GPU; training fails if none works"),
         ),
     )
-
-
-def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
-    """The GPUs that the last test of the training environment found, in its order."""
-    return stored_adapters(environment_folder())
-
-
-def adapter_property() -> Any:
-    """GPU that trains where the device is one: of the operator, and of the panel that calls it."""
-    return bpy.props.StringProperty(
+    adapter: bpy.props.StringProperty(
         name="GPU",
         description="Name of the GPU; empty: the first. The list is that of the last test of the training environment",
         search=list_adapters,
@@ -75,37 +55,47 @@ def adapter_property() -> Any:
     )
 
 
-def python_property() -> Any:
-    """Interpreter of an operator that trains."""
-    return bpy.props.StringProperty(
+class TrainOptions(DeviceOptions):
+    """How an avatar is trained: of the operator, and of the panel that calls it."""
+
+    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
+    strategy: bpy.props.EnumProperty(
+        name="Strategy",
+        description="Which splats each iteration trains",
+        items=(
+            ("global", "Global", "Every iteration trains all splats; most accurate on the captures measured so far"),
+            ("selective", "Selective", "Local iterations train the triangles selected in each frame; global ones, all"),
+            ("gaussian-avatars", "GaussianAvatars", "The binding, losses and learning rates of GaussianAvatars"),
+        ),
+    )
+    preset: preset_property()
+
+
+class TrainingOperator:
+    """Options of an operator that trains which no panel has."""
+
+    iterations: bpy.props.IntProperty(
+        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
+    )
+    python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that trains; empty: the training environment of the preferences",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
-
-
-def wait_property() -> Any:
-    """Whether an operator that trains waits for the end."""
-    return bpy.props.BoolProperty(
+    wait: bpy.props.BoolProperty(
         name="Wait",
         description="Return when training has ended, as always without a window; "
         "Blender's own Python trains then, if it has the packages",
         options={"SKIP_SAVE"},
     )
 
-
-def may_train(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head and nothing is training; says what to do where not."""
-    if not needs_head(operator, context):
-        return False
-    if monitor.training_of(context.scene).snapshot.state.is_alive:
-        operator.poll_message_set("Training is running; cancel it first")
-        return False
-    return True
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_head(cls, context) and needs_idle(cls, context, Kind.TRAINING)
 
 
-class Train(bpy.types.Operator):
+class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     """Train the avatar on the capture's images, in a process that continues when Blender is closed"""
 
     bl_idname = ids.TRAIN
@@ -118,17 +108,6 @@ class Train(bpy.types.Operator):
         subtype="DIR_PATH",
         options=PATH_OPTIONS,
     )
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
-    iterations: bpy.props.IntProperty(
-        name="Iterations",
-        description="Number of iterations, instead of a time; 0: train for Minutes",
-        min=0,
-        options={"SKIP_SAVE"},
-    )
-    strategy: strategy_property()
-    preset: preset_property()
-    device: device_property()
-    adapter: adapter_property()
     seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
@@ -140,17 +119,10 @@ class Train(bpy.types.Operator):
         description="Continue the run in the folder with the settings and budget that it was started with",
         options={"SKIP_SAVE"},
     )
-    python: python_property()
-    wait: wait_property()
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return may_train(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        request = self._request(head_of(context))
-        return start_training(self, context, request, python_of(self, context))
+        return start_training(self, context, self._request(head_of(context)))
 
     def _request(self, head: Any) -> TrainRequest | Resume:
         run = file_path(self.directory, "run folder").resolve()
@@ -171,78 +143,12 @@ class Train(bpy.types.Operator):
 
 
 def device_of(operator: Any) -> str:
-    """What `choose_device` takes, of an operator with `device_property` and `adapter_property`."""
+    """What `choose_device` takes, of an operator with `DeviceOptions`."""
     return f"gpu:{operator.adapter}" if operator.device == "gpu" and operator.adapter else str(operator.device)
 
 
-def start_training(
-    operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend, python: str | None
-) -> set[str]:
-    """Start a worker for a training and monitor it, or wait for it; python: as of `python_of`. Raises StgaError."""
-    folder, run = request_folder(request.run), request.run
-    if python is None:
-        ask(folder, request)
-        monitor.start_training(context.scene, run, None)
-        result = perform_here(context, folder)
-    else:
-        process = start(folder, request, python)
-        monitor.start_training(context.scene, run, process)
-        if not waits(operator):
-            return {"FINISHED"}
-        result = wait(folder, process)
-    monitor.finish_training(context.scene)
-    operator.report({"INFO"}, f"Trained {result.path if isinstance(result, Written) else run}")
+def start_training(operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend) -> set[str]:
+    """Start a training, or wait for it. Raises StgaError."""
+    if start(context.scene, request, python_of(operator, context), wait=operator.wait):
+        operator.report({"INFO"}, f"Trained {request.run}")
     return {"FINISHED"}
-
-
-class CancelTraining(bpy.types.Operator):
-    """Stop training and keep the avatar trained so far; Resume continues from there"""
-
-    bl_idname = ids.CANCEL_TRAINING
-    bl_label = "Cancel Training"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if monitor.training_of(context.scene).snapshot.state.is_alive:
-            return True
-        cls.poll_message_set("No training is running")
-        return False
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        request_cancel(request_folder(_folder(context.scene)))
-        monitor.check_now(context.scene)
-        return {"FINISHED"}
-
-
-class DismissTraining(bpy.types.Operator):
-    """Remove the status and log of the last training; the run, its avatar and checkpoints stay"""
-
-    bl_idname = ids.DISMISS_TRAINING
-    bl_label = "Dismiss"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if monitor.training_of(context.scene).run is None:
-            cls.poll_message_set("Nothing was trained in this scene yet")
-            return False
-        if monitor.training_of(context.scene).snapshot.state.is_alive:
-            cls.poll_message_set("Training is running; cancel it first")
-            return False
-        return True
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        remove_request(request_folder(_folder(context.scene)))
-        monitor.dismiss_training(context.scene)
-        return {"FINISHED"}
-
-
-def _folder(scene: Any) -> Path:
-    """The run folder of the scene's training."""
-    folder = monitor.training_of(scene).folder
-    if folder is None:
-        raise StgaError("Nothing was trained in this scene yet")
-    return folder

@@ -6,10 +6,13 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, scene_settings
+from ..operators.continue_run import ExtendOptions, RefineOptions
+from ..operators.train import DeviceOptions
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.display.heat_map import shows_residuals
-from .effects import draw_running
+from .options import set_options
+from .request import draw_running
 from .sidebar import SidebarPanel
-from .text import draw_text
 from .train_panel import TrainPanel
 
 
@@ -30,7 +33,7 @@ class ContinuePanel(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_refine(layout: Any, settings: Any) -> None:
-    column, head = layout.column(), settings.head
+    column, head, options = layout.column(), settings.head, settings.refine
     shown = shows_residuals(head)
     residuals = column.operator(
         ids.HEAT_MAP, text="Hide Residuals" if shown else "Show Residuals", icon="BRUSHES_ALL", depress=shown
@@ -38,34 +41,33 @@ def _draw_refine(layout: Any, settings: Any) -> None:
     residuals.show, residuals.of, residuals.directory = not shown, "RESIDUAL", settings.run_folder
     editing = head.mode == "EDIT"
     if not editing:
-        column.prop_search(settings, "refine_group", head, "vertex_groups", text="Region")
+        column.prop_search(options, "group", head, "vertex_groups", text="Region")
     row = column.row(align=True)
-    row.prop(settings, "refine_all_frames", text="All Frames", toggle=True)
+    row.prop(options, "all_frames", toggle=True)
     frames = row.row(align=True)
-    frames.active = not settings.refine_all_frames
-    frames.prop(settings, "refine_first", text="")
-    frames.prop(settings, "refine_last", text="")
+    frames.active = not options.all_frames
+    frames.prop(options, "first", text="")
+    frames.prop(options, "last", text="")
     row = column.row(align=True)
-    row.prop(settings, "refine_seconds", text="Seconds")
-    row.prop(settings, "refine_growth", text="More Splats")
+    row.prop(options, "seconds")
+    row.prop(options, "growth")
     refine = column.operator(
         ids.REFINE, text="Refine Selected Faces" if editing else "Refine Vertex Group", icon="SCULPTMODE_HLT"
     )
-    refine.directory, refine.device, refine.group = settings.run_folder, settings.device, settings.refine_group
-    refine.adapter = settings.adapter
-    refine.seconds, refine.growth = settings.refine_seconds, settings.refine_growth
-    if not settings.refine_all_frames:
-        refine.first, refine.last = settings.refine_first, max(settings.refine_first, settings.refine_last)
+    set_options(refine, settings, DeviceOptions)
+    set_options(refine, options, RefineOptions)
+    refine.directory = settings.run_folder
+    if not options.all_frames:
+        refine.first, refine.last = options.first, max(options.first, options.last)
 
 
 def _draw_extend(layout: Any, context: Any, settings: Any) -> None:
     column = layout.column()
-    column.prop(settings, "take", text="Take")
-    column.prop(settings, "extend_seconds", text="Seconds")
+    column.prop(settings.extend, "take")
+    column.prop(settings.extend, "seconds")
     extend = column.operator(ids.EXTEND, icon="ADD")
-    extend.directory, extend.device, extend.take = settings.run_folder, settings.device, settings.take
-    extend.adapter, extend.seconds = settings.adapter, settings.extend_seconds
-    if not draw_running(column, context):
+    set_options(extend, settings, DeviceOptions)
+    set_options(extend, settings.extend, ExtendOptions)
+    extend.directory = settings.run_folder
+    if not draw_running(column, context, Kind.SELECTION):
         column.operator(ids.SELECT_EXTENSION, icon="GROUP_VERTEX").directory = settings.run_folder
-    if settings.extension_error:
-        draw_text(column, context, settings.extension_error, "ERROR")

@@ -4,21 +4,12 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..operators import background, ids
+from ..operators import ids
 from ..operators.common import scene_settings
+from ..stga_addon.requests.monitor_state import Kind
+from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
-
-
-def draw_running(layout: Any, context: Any) -> bool:
-    """Draw the command that runs for the scene, with its cancel button; returns False where none runs."""
-    if not background.running(context.scene):
-        return False
-    row = layout.row(align=True)
-    waits = background.is_waiting(context.scene)
-    row.label(text="Done: leave Edit Mode" if waits else "Analyzing…", icon="INFO" if waits else "VIEWZOOM")
-    row.operator(ids.CANCEL_ANALYSIS, text="", icon="CANCEL")
-    return True
 
 
 class EffectsPanel(SidebarPanel, bpy.types.Panel):
@@ -29,10 +20,8 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
-        if not draw_running(layout, context):
+        if not draw_running(layout, context, Kind.ANALYSIS):
             layout.operator(ids.ANALYZE_CAPTURE, icon="VIEWZOOM")
-        if settings.analysis_error:
-            draw_text(layout, context, settings.analysis_error, "ERROR")
         for row in settings.effects:
             self._draw_effect(context, row)
 

@@ -6,10 +6,10 @@ import bpy
 
 from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
-from ..operators.environment import has_training_python
 from ..operators.pose import is_posing
-from ..operators.track import tracking_snapshot
+from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
@@ -27,10 +27,9 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
-        training = monitor.training_of(context.scene).snapshot.state.is_alive
-        tracking = tracking_snapshot(context.scene)
-        if tracking.state.is_alive:
-            done = f"Tracking, {100 * tracking.status.progress:.0f} %"
+        training, tracking = (monitor.state_of(context.scene, kind) for kind in (Kind.TRAINING, Kind.TRACKING))
+        if tracking.is_running:
+            done = f"Tracking, {100 * tracking.snapshot.status.progress:.0f} %"
             draw_text(
                 layout, context, f"{done}: the head is imported when it is done. Go on working, save, or quit Blender"
             )
@@ -43,7 +42,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)
-        elif training:
+        elif training.is_running:
             draw_text(layout, context, "Training: splats appear on the head soon. Go on working, save, or quit Blender")
         elif settings.avatar:
             draw_text(layout, context, "Show the trained avatar on the head")

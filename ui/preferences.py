@@ -6,11 +6,12 @@ import bpy
 
 from ..operators import ids, monitor
 from ..operators.common import register_classes, unregister_classes
-from ..operators.environment import environment_folder, has_training_python
+from ..operators.training_python import has_training_python
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.worker.environment import PYTHON_VARIABLE, status_folder
+from ..stga_addon.worker.environment import PYTHON_VARIABLE
 from ..stga_addon.worker.status import WorkerState
-from .failure import draw_failure
+from .request import draw_failure, draw_running
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -48,23 +49,19 @@ class Preferences(bpy.types.AddonPreferences):
 
 
 def _draw_environment(box: Any, context: Any, stored: Any) -> None:
-    folder = status_folder(environment_folder())
-    now = monitor.snapshot(folder)
     box.label(text="Training Environment")
     row = box.split(factor=0.8, align=True)
     row.prop(stored, "training_python")
     row.operator(ids.TEST_ENVIRONMENT)
-    if now.state.is_alive:
-        row = box.row(align=True)
-        row.progress(factor=now.status.progress, text=now.status.message)
-        row.operator(ids.CANCEL_ENVIRONMENT, text="", icon="CANCEL")
-        box.label(text=now.status.detail)
+    if draw_running(box, context, Kind.ENVIRONMENT):
         return
-    if now.state.failed:
+    environment = monitor.state_of(context.scene, Kind.ENVIRONMENT)
+    state = environment.snapshot.state
+    if state.failed:
         box.label(text="Failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.log_tail, folder)
-    elif now.state == WorkerState.FINISHED:
-        box.label(text=now.status.message, icon="CHECKMARK")
+        draw_failure(box, context, environment)
+    elif state == WorkerState.FINISHED:
+        box.label(text=environment.snapshot.status.message, icon="CHECKMARK")
     elif not has_training_python(context):
         box.label(text="No training environment yet", icon="INFO")
     box.operator(ids.MAKE_ENVIRONMENT, text="Make Training Environment…", icon="IMPORT")

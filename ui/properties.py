@@ -5,9 +5,11 @@ from typing import Any
 
 import bpy
 
-from ..operators import ids, track
+from ..operators import ids
 from ..operators.common import register_classes, unregister_classes
-from ..operators.train import adapter_property, device_property, preset_property, strategy_property
+from ..operators.continue_run import ExtendOptions, RefineOptions
+from ..operators.track import TrackOptions, path_property
+from ..operators.train import TrainOptions, preset_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
@@ -53,7 +55,27 @@ class EffectRow(bpy.types.PropertyGroup):
     cost: bpy.props.StringProperty(name="Cost")
 
 
-class SceneSettings(bpy.types.PropertyGroup):
+class TrackSettings(TrackOptions, bpy.types.PropertyGroup):
+    """The panel's options of Track Footage."""
+
+    directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH", default="//stga_capture")
+
+
+class RefineSettings(RefineOptions, bpy.types.PropertyGroup):
+    """The panel's options of Refine."""
+
+    all_frames: bpy.props.BoolProperty(
+        name="All Frames", description="Train the region on all frames of the capture", default=True
+    )
+    first: bpy.props.IntProperty(name="First Frame", description="First frame to train on", min=0)
+    last: bpy.props.IntProperty(name="Last Frame", description="Last frame to train on", min=0)
+
+
+class ExtendSettings(ExtendOptions, bpy.types.PropertyGroup):
+    """The panel's options of Extend with Take."""
+
+
+class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     """Settings of the panel, one group for each scene; passed to operators as arguments, but for head and splats."""
 
     # The module bpy 4.2 crashes when its Python ends where a property has a poll or update function; Blender does not.
@@ -64,21 +86,9 @@ class SceneSettings(bpy.types.PropertyGroup):
         type=bpy.types.Object,
         update=_forget_rows,
     )
-    footage: track.footage_property()
-    footage_cameras: track.cameras_property()
-    head_model: track.model_property()
-    capture_folder: track.path_property(
-        "Capture", "Folder for the tracked capture", "DIR_PATH", default="//stga_capture"
-    )
-    detector: track.detector_property()
-    focal: track.focal_property()
-    footage_start: track.start_property()
-    footage_stop: track.stop_property()
-    footage_step: track.step_property()
+    track: bpy.props.PointerProperty(type=TrackSettings)
     tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last tracking
-    tracking_model: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of its head model
-    tracking_pending: bpy.props.BoolProperty(options={"HIDDEN"})  # it is to be imported when it is done
-    tracking_error: bpy.props.StringProperty(options={"HIDDEN"})  # why it could not be imported
+    tracking_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it was imported
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: bpy.props.IntProperty(options={"HIDDEN"})
     motion_source: bpy.props.PointerProperty(
@@ -94,38 +104,11 @@ class SceneSettings(bpy.types.PropertyGroup):
         options=PATH_OPTIONS,
         default="//stga_run",
     )
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
-    refine_group: bpy.props.StringProperty(
-        name="Region", description="Vertex group whose triangles are refined; empty: the active one"
-    )
-    refine_all_frames: bpy.props.BoolProperty(
-        name="All Frames", description="Train the region on all frames of the capture", default=True
-    )
-    refine_first: bpy.props.IntProperty(name="First Frame", description="First frame to train on", min=0)
-    refine_last: bpy.props.IntProperty(name="Last Frame", description="Last frame to train on", min=0)
-    refine_seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=20.0, min=0.1)
-    refine_growth: bpy.props.FloatProperty(
-        name="More Splats",
-        description="Splats that may be added, as a share of those in the region",
-        min=0.0,
-        soft_max=2.0,
-        subtype="FACTOR",
-    )
-    take: bpy.props.StringProperty(
-        name="Take",
-        description="Folder of a further capture of the same head",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
-    )
-    extend_seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
-    strategy: strategy_property()
+    refine: bpy.props.PointerProperty(type=RefineSettings)
+    extend: bpy.props.PointerProperty(type=ExtendSettings)
     preset: preset_property(update=_take_minutes)
-    device: device_property()
-    adapter: adapter_property()
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
-    extension_error: bpy.props.StringProperty(options={"HIDDEN"})  # why it could not be selected what Extend trains
-    analysis_error: bpy.props.StringProperty(options={"HIDDEN"})  # why the analysis failed
     live_preview: bpy.props.BoolProperty(
         name="Live Preview", description="Update the splats every few seconds during training", default=True
     )
@@ -139,11 +122,14 @@ class SceneSettings(bpy.types.PropertyGroup):
     )
 
 
+CLASSES = (SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, SceneSettings)
+
+
 def register() -> None:
-    register_classes((SelectedFrame, EffectRow, SceneSettings))
+    register_classes(CLASSES)
     setattr(bpy.types.Scene, ids.SETTINGS, bpy.props.PointerProperty(type=SceneSettings))
 
 
 def unregister() -> None:
     delattr(bpy.types.Scene, ids.SETTINGS)
-    unregister_classes((SelectedFrame, EffectRow, SceneSettings))
+    unregister_classes(CLASSES)

@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..operators.environment import has_training_python
+from ..operators.training_python import has_training_python
 from ..stga_addon.render.client import missing_packages
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.render.engine import ENGINE

@@ -5,20 +5,20 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..operators import ids
+from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
-from ..operators.environment import has_training_python
-from ..operators.track import tracked_folder, tracking_snapshot
+from ..operators.track import TrackOptions
 from ..operators.track_correct import tracking_keys
-from ..stga_addon.requests.folder import request_folder
+from ..operators.training_python import has_training_python
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.shape_keys import has_shape_keys
 from ..stga_addon.tracking.folder import SHEET_FILE
-from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
-from .failure import draw_failure
+from .options import set_options
+from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_environment_setup, draw_worker_progress
+from .train_panel import draw_environment_setup
 
 
 class TrackPanel(SidebarPanel, bpy.types.Panel):
@@ -27,18 +27,17 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        layout, settings, now = self.layout, scene_settings(context), tracking_snapshot(context.scene)
-        if settings.tracking_error:
-            draw_text(layout, context, settings.tracking_error, "ERROR")
-        if now.state.is_alive:
-            _draw_progress(layout, context, now)
+        layout, settings = self.layout, scene_settings(context)
+        if draw_running(layout, context, Kind.TRACKING):
             return
-        if now.state != WorkerState.NONE:
-            _draw_end(layout, context, now)
-        for name in ("footage", "footage_cameras", "head_model", "capture_folder"):
-            layout.prop(settings, name)
+        tracking = monitor.state_of(context.scene, Kind.TRACKING)
+        if tracking.subject is not None:
+            box = draw_end(layout, context, tracking)
+            draw_text(box, context, tracking.snapshot.status.detail)
+        for name in ("footage", "cameras", "model", "directory"):
+            layout.prop(settings.track, name)
         thing = context.view_layer.objects.active
-        if not settings.head_model:
+        if not settings.track.model:
             name = thing.name if has_shape_keys(thing) else "none"
             layout.label(text=f"Shape keys of the active object: {name}", icon="SHAPEKEY_DATA")
         _draw_button(layout, settings)
@@ -54,8 +53,8 @@ class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        for name in ("footage_start", "footage_stop", "footage_step", "focal", "detector"):
-            self.layout.prop(scene_settings(context), name)
+        for name in ("start", "stop", "step", "focal", "detector"):
+            self.layout.prop(scene_settings(context).track, name)
 
 
 class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
@@ -98,29 +97,4 @@ def _draw_keys(layout: Any, context: Any, head: Any) -> None:
 
 def _draw_button(layout: Any, settings: Any) -> None:
     track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
-    track.footage, track.model, track.directory = settings.footage, settings.head_model, settings.capture_folder
-    track.cameras, track.detector, track.focal = settings.footage_cameras, settings.detector, settings.focal
-    track.start, track.stop, track.step = settings.footage_start, settings.footage_stop, settings.footage_step
-
-
-def _draw_progress(layout: Any, context: Any, now: WorkerSnapshot) -> None:
-    """Draw what the worker is doing, and Cancel."""
-    draw_worker_progress(layout, now)
-    if now.status.detail:
-        draw_text(layout, context, now.status.detail)
-    layout.operator(ids.CANCEL_TRACKING, text="Cancel", icon="CANCEL")
-
-
-def _draw_end(layout: Any, context: Any, now: WorkerSnapshot) -> None:
-    box = layout.box()
-    row = box.row()
-    if now.state.failed:
-        row.label(text="Tracking failed", icon="ERROR")
-        draw_failure(box, context, now.status.error, now.log_tail, request_folder(tracked_folder(context.scene)))
-    elif now.state == WorkerState.CANCELLED:
-        row.label(text="Cancelled; Track continues", icon="INFO")
-    else:
-        row.label(text="Tracked", icon="CHECKMARK")
-        if now.status.detail:
-            draw_text(box, context, now.status.detail)
-    row.operator(ids.DISMISS_TRACKING, text="", icon="X", emboss=False)
+    set_options(track, settings.track, TrackOptions)

@@ -8,17 +8,18 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.analyze import chosen_effects
 from ..operators.common import is_head, package, scene_settings
-from ..operators.environment import has_training_python
+from ..operators.train import TrainOptions
+from ..operators.training_python import has_training_python
 from ..stga_addon.format import format_duration
-from ..stga_addon.requests.folder import request_folder
-from ..stga_addon.requests.monitor_state import MonitorState
+from ..stga_addon.requests.monitor_state import Kind, RequestState
 from ..stga_addon.scene import tags
 from ..stga_addon.training.effects.decisions import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
-from ..stga_addon.worker.status import WorkerSnapshot, WorkerState
+from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
-from .failure import draw_failure
+from .options import set_options
 from .properties import preset_times
+from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
 
@@ -28,13 +29,10 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "3 Train"
 
     def draw(self, context: Any) -> None:
-        training = monitor.training_of(context.scene)
-        if training.error:
-            draw_text(self.layout, context, training.error, "ERROR")
-        if training.snapshot.state.is_alive:
-            _draw_progress(self.layout, context, training)
+        if draw_running(self.layout, context, Kind.TRAINING):
             return
-        if training.run is not None:
+        training = monitor.state_of(context.scene, Kind.TRAINING)
+        if training.subject is not None:
             _draw_end(self.layout, context, training)
         _draw_choices(self.layout, context)
 
@@ -60,9 +58,8 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     train = layout.operator(
         ids.TRAIN, text="Resume" if resume else "Train", icon="FRAME_NEXT" if resume else "MOD_PARTICLES"
     )
-    train.directory, train.minutes, train.resume = settings.run_folder, settings.minutes, resume
-    train.strategy, train.preset, train.device = settings.strategy, settings.preset, settings.device
-    train.adapter = settings.adapter
+    set_options(train, settings, TrainOptions)
+    train.directory, train.resume = settings.run_folder, resume
     train.effects = " ".join(chosen_effects(settings))
 
 
@@ -86,41 +83,16 @@ class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):
             self.layout.prop(settings, name)
 
 
-def draw_worker_progress(layout: Any, now: WorkerSnapshot) -> None:
-    """Draw the bar that says what a worker is doing."""
-    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
-    layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")
-
-
-def _draw_progress(layout: Any, context: Any, training: MonitorState) -> None:
-    status = training.snapshot.status
-    draw_worker_progress(layout, training.snapshot)
-    column = layout.column(align=True)
-    for line in (*describe_figures(status.figures), status.detail):
-        draw_text(column, context, line)
-    draw_curve(layout, training.folder)
-    layout.operator(ids.CANCEL_TRAINING, text="Cancel", icon="CANCEL")
-
-
-def _draw_end(layout: Any, context: Any, training: MonitorState) -> None:
-    state, status, folder = training.snapshot.state, training.snapshot.status, training.folder
-    box = layout.box()
-    row = box.row()
+def _draw_end(layout: Any, context: Any, training: RequestState) -> None:
+    box, state = draw_end(layout, context, training), training.snapshot.state
     if state == WorkerState.NONE:
-        row.label(text="Run not found", icon="ERROR")
-        draw_failure(box, context, f"{folder}: does not exist; choose its new folder and press Resume", (), None)
-    elif state.failed:
-        row.label(text="Training failed", icon="ERROR")
-        draw_failure(box, context, status.error, training.snapshot.log_tail, request_folder(folder))
-    else:
-        done = {WorkerState.FINISHED: "Trained", WorkerState.CANCELLED: "Cancelled, avatar kept"}[state]
-        row.label(text=done, icon="CHECKMARK")
-        for line in describe_figures(status.figures)[1:]:
+        draw_text(box, context, f"{training.place}: does not exist; choose its new folder and press Resume")
+    elif not state.failed:
+        for line in describe_figures(training.snapshot.status.figures)[1:]:
             draw_text(box, context, line)
-        draw_curve(box, folder)
+        draw_curve(box, training.place)
         if training.files.tracking is not None:
-            _draw_refined(box, context, folder / TRACKING)
-    row.operator(ids.DISMISS_TRAINING, text="", icon="X", emboss=False)
+            _draw_refined(box, context, training.place / TRACKING)
 
 
 def _draw_refined(layout: Any, context: Any, path: Path) -> None:

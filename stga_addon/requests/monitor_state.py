@@ -1,15 +1,56 @@
-"""State of the training that a Blender scene shows, and its transitions, without Blender."""
+"""State of a request that Blender follows, and its transitions, without Blender."""
 
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 
 from ..training.run.folder import AVATAR
 from ..worker.status import WorkerSnapshot, WorkerState
-from .folder import PREVIEW, request_folder
+from .folder import PREVIEW
+from .values import Analyze, Extend, Refine, RenderRecording, Request, Resume, SelectForTake, SolveAgain, Track, Train
 
 CHECK_INTERVAL_S = 0.5
 SLICE_INTERVAL_S = 0.02
 """While splats are built in slices, so that Blender never blocks for long."""
+
+
+class Kind(StrEnum):
+    """What is asked for; a scene has at most one request of each kind, the environment belongs to no scene."""
+
+    TRAINING = "training"
+    TRACKING = "tracking"
+    ANALYSIS = "analysis"
+    SELECTION = "selection"
+    VIDEO = "video"
+    ENVIRONMENT = "environment"
+
+
+SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
+    Train: (Kind.TRAINING, "run"),
+    Resume: (Kind.TRAINING, "run"),
+    Refine: (Kind.TRAINING, "run"),
+    Extend: (Kind.TRAINING, "run"),
+    Track: (Kind.TRACKING, "out"),
+    SolveAgain: (Kind.TRACKING, "capture"),
+    Analyze: (Kind.ANALYSIS, "capture"),
+    SelectForTake: (Kind.SELECTION, "capture"),
+    RenderRecording: (Kind.VIDEO, "output"),
+}
+"""Request -> its kind, and the field that names what it is about."""
+STORED = {Kind.TRAINING, Kind.TRACKING}
+"""Requests that the .blend file remembers; their folder is in that of the run or capture, others' are temporary."""
+TRANSIENT = {Kind.ANALYSIS, Kind.SELECTION}
+"""Requests that leave nothing but their result in the scene: killed when they are cancelled, gone when they ended."""
+DISMISSIBLE = {*STORED, Kind.VIDEO}
+SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
+    Kind.TRAINING: (WorkerState.FINISHED, WorkerState.CANCELLED),
+    Kind.TRACKING: (WorkerState.FINISHED,),
+    Kind.ANALYSIS: (WorkerState.FINISHED,),
+    Kind.SELECTION: (WorkerState.FINISHED,),
+    Kind.VIDEO: (),
+    Kind.ENVIRONMENT: (),
+}
+"""Final states of a worker whose result changes the scene."""
 
 Stamp = tuple[int, int]
 """Modification time in nanoseconds and size in bytes of a file."""
@@ -25,22 +66,23 @@ class RunFiles:
 
 
 @dataclass(frozen=True)
-class MonitorState:
-    """What is known of the training of one scene.
+class RequestState:
+    """What is known of a scene's request of one kind.
 
-    run             the folder that the scene and its splats name; None: the scene has no training
-    folder          where that folder is now: it may have moved along with the .blend file
+    subject         run, capture, video or environment that the request is about, as the scene names it; None: none
+    folder          of the request, as found now: a run may have moved along with the .blend file
     snapshot        the worker's status as last read
-    files           of the folder, as last seen
-    result_shown    the final avatar has reached the scene, or never will
+    files           of a run, as last seen
+    result_shown    the result has reached the scene, or never will
     shown_preview   stamp of the preview that was loaded last
-    loading         avatar file that is being read, or built in slices
-    building        it is being built
-    error           one sentence: an avatar that could not be shown, or why monitoring stopped
+    loading         what is being read, or put into the scene: an avatar file, or the folder of the request
+    building        it is being built in slices
+    error           one sentence: a result that could not be shown, or why monitoring stopped
     stopped         monitoring stopped after an unexpected error
     """
 
-    run: Path | None = None
+    kind: Kind
+    subject: Path | None = None
     folder: Path | None = None
     snapshot: WorkerSnapshot = field(default_factory=WorkerSnapshot)
     files: RunFiles = field(default_factory=RunFiles)
@@ -52,9 +94,15 @@ class MonitorState:
     stopped: bool = False
 
     @property
+    def place(self) -> Path:
+        """Where the run or capture is now."""
+        assert self.folder is not None
+        return self.folder.parent
+
+    @property
     def interval_s(self) -> float | None:
         """Seconds until the next check; None: nothing is expected any more, the timer can stop."""
-        if self.run is None or self.stopped:
+        if self.folder is None or self.stopped:
             return None
         if self.building:
             return SLICE_INTERVAL_S
@@ -63,44 +111,51 @@ class MonitorState:
 
     @property
     def has_result(self) -> bool:
-        """Whether training has ended with an avatar that is still to be shown."""
-        return self.snapshot.state in (WorkerState.FINISHED, WorkerState.CANCELLED) and not self.result_shown
+        """Whether the worker has ended with a result that is still to be shown."""
+        return self.snapshot.state in SHOWN_STATES[self.kind] and not self.result_shown
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it can be cancelled, and another request of the kind has to wait."""
+        return self.snapshot.state.is_alive or (self.kind in TRANSIENT and self.folder is not None)
+
+    @property
+    def can_be_dismissed(self) -> bool:
+        return self.kind in DISMISSIBLE and self.subject is not None and not self.is_running
 
 
 # Events
 
 
 @dataclass(frozen=True)
-class FileLoaded:
-    """The scene is seen for the first time, with what is stored in it."""
+class Started:
+    """A worker was started for a request in this folder."""
 
-    run: Path | None
-    result_shown: bool
+    subject: Path
+    folder: Path
 
 
 @dataclass(frozen=True)
-class Started:
-    """A worker was started for a run."""
-
-    run: Path
+class CancelAsked:
+    """The user cancels the request."""
 
 
 @dataclass(frozen=True)
 class Dismissed:
-    """The user dismissed the result of a training."""
+    """The user dismisses what is said about the request's end."""
 
 
 @dataclass(frozen=True)
 class SceneRead:
     """What is stored in the scene now: an undo step may have taken it back."""
 
-    run: Path | None
+    subject: Path | None
     result_shown: bool
 
 
 @dataclass(frozen=True)
 class StatusRead:
-    """The run's folder was read. live_preview, show_result: what the user wants to see."""
+    """The request's folder was read. live_preview, show_result: what the user wants to see."""
 
     folder: Path
     snapshot: WorkerSnapshot
@@ -110,44 +165,41 @@ class StatusRead:
 
 
 @dataclass(frozen=True)
+class SceneFree:
+    """What the result changes can be changed now: Blender does not render, and nothing of it is in Edit Mode."""
+
+
+@dataclass(frozen=True)
 class SliceBuilt:
-    """A slice of the avatar was built, others remain."""
+    """A slice of what is shown was built, others remain."""
 
 
 @dataclass(frozen=True)
-class AvatarShown:
-    """The avatar that was loaded is in the scene. created: in a new object."""
+class Shown:
+    """What was loaded is in the scene. undoable: with a change that deserves an undo step."""
 
-    created: bool
+    undoable: bool = False
 
 
 @dataclass(frozen=True)
-class AvatarFailed:
-    """The avatar cannot be shown."""
+class Failed:
+    """What was loaded cannot be shown; stops: nor can the request be monitored any more."""
 
     sentence: str
+    stops: bool = False
 
 
-@dataclass(frozen=True)
-class MonitorFailed:
-    """An unexpected error occurred."""
-
-    sentence: str
-
-
-Event = (
-    FileLoaded | Started | Dismissed | SceneRead | StatusRead | SliceBuilt | AvatarShown | AvatarFailed | MonitorFailed
-)
+Event = Started | CancelAsked | Dismissed | SceneRead | StatusRead | SceneFree | SliceBuilt | Shown | Failed
 
 
 # Effects
 
 
 @dataclass(frozen=True)
-class StoreTraining:
-    """Store the run, and whether its result was shown, in the scene."""
+class Store:
+    """Store the subject, and whether its result was shown, in the scene."""
 
-    run: Path | None
+    subject: Path | None
     result_shown: bool
 
 
@@ -160,14 +212,42 @@ class StoreAvatar:
 
 @dataclass(frozen=True)
 class LoadAvatar:
-    """Read an avatar file in a thread, then show it on the scene's head."""
+    """Read an avatar file in a thread."""
+
+    path: Path
+
+
+@dataclass(frozen=True)
+class Show:
+    """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or Failed."""
 
     path: Path
 
 
 @dataclass(frozen=True)
 class ReadCurve:
-    """Read the evaluations in the folder for the panel's curve."""
+    """Read the evaluations in the run for the panel's curve."""
+
+    run: Path
+
+
+@dataclass(frozen=True)
+class StopWorker:
+    """Ask the worker to stop and to keep what it has."""
+
+    folder: Path
+
+
+@dataclass(frozen=True)
+class KillWorker:
+    """End the worker at once."""
+
+    folder: Path
+
+
+@dataclass(frozen=True)
+class RemoveFiles:
+    """Remove the request's folder; what the request has made stays."""
 
     folder: Path
 
@@ -182,64 +262,103 @@ class Redraw:
     """Redraw the panels."""
 
 
-Effect = StoreTraining | StoreAvatar | LoadAvatar | ReadCurve | PushUndo | Redraw
-Outcome = tuple[MonitorState, tuple[Effect, ...]]
+Effect = Store | StoreAvatar | LoadAvatar | Show | ReadCurve | StopWorker | KillWorker | RemoveFiles | PushUndo | Redraw
+Outcome = tuple[RequestState, tuple[Effect, ...]]
 
 
-def transition(state: MonitorState, event: Event) -> Outcome:
+def transition(state: RequestState, event: Event) -> Outcome:
     """The state after an event, and the effects to carry out in this order."""
     match event:
-        case FileLoaded(run, result_shown):
-            return MonitorState(run, run, result_shown=result_shown), ()
-        case Started(run):
-            return MonitorState(run, run), (StoreTraining(run, False), ReadCurve(run), Redraw())
+        case Started(subject, folder):
+            return _started(state, subject, folder)
+        case CancelAsked() if state.kind in TRANSIENT:
+            return _forgotten(state, KillWorker(state.folder) if state.folder else None)
+        case CancelAsked():
+            return state, (StopWorker(state.folder),) if state.folder else ()
         case Dismissed():
-            return MonitorState(), (StoreTraining(None, False), Redraw())
-        case SceneRead(run, result_shown):
-            in_step = (run, result_shown) == (state.run, state.result_shown)
-            return state, () if in_step else (StoreTraining(state.run, state.result_shown),)
+            return _forgotten(state)
+        case SceneRead(subject, result_shown):
+            in_step = (subject, result_shown) == (state.subject, state.result_shown)
+            return state, () if in_step else _stored(state)
         case StatusRead():
             return _status_read(state, event)
+        case SceneFree():
+            return state, () if state.loading is None else (Show(state.loading),)
         case SliceBuilt():
             return replace(state, building=True), ()
-        case AvatarShown(created):
-            return _loading_ended(state, "", (PushUndo(),) if created else ())
-        case AvatarFailed(sentence):
-            return _loading_ended(state, sentence, ())
-        case MonitorFailed(sentence):
+        case Shown(undoable):
+            return _loading_ended(state, undoable)
+        case Failed(sentence, stops=True):
             return replace(state, error=sentence, stopped=True, loading=None, building=False), (Redraw(),)
+        case Failed(sentence):
+            return _loading_ended(state, error=sentence)
 
 
-def _status_read(state: MonitorState, event: StatusRead) -> Outcome:
+def _stored(state: RequestState) -> tuple[Effect, ...]:
+    return (Store(state.subject, state.result_shown),) if state.kind in STORED else ()
+
+
+def _started(before: RequestState, subject: Path, folder: Path) -> Outcome:
+    state = RequestState(before.kind, subject, folder)
+    is_stale = before.kind == Kind.VIDEO and before.folder not in (None, folder)
+    stale = (RemoveFiles(before.folder),) if is_stale and before.folder else ()
+    curve = (ReadCurve(state.place),) if state.kind == Kind.TRAINING else ()
+    return state, (*stale, *_stored(state), *curve, Redraw())
+
+
+def _forgotten(state: RequestState, first: Effect | None = None, error: str = "") -> Outcome:
+    """The state without its request, whose folder is removed."""
+    empty = RequestState(state.kind, error=error)
+    removed = (RemoveFiles(state.folder),) if state.folder is not None else ()
+    return empty, (*((first,) if first else ()), *removed, *_stored(empty), Redraw())
+
+
+def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     effects: list[Effect] = []
-    folder, files, worker = event.folder, event.files, event.snapshot.state
-    if (folder, files.metrics) != (state.folder, state.files.metrics):
-        effects.append(ReadCurve(folder))
-    if (folder, files, event.snapshot) != (state.folder, state.files, state.snapshot):
-        effects.append(Redraw())
+    before, worker = state, event.snapshot.state
     error = "" if state.stopped else state.error
-    state = replace(state, folder=folder, files=files, snapshot=event.snapshot, error=error, stopped=False)
+    state = replace(state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error, stopped=False)
+    is_new = (state.folder, state.files.metrics) != (before.folder, before.files.metrics)
+    if state.kind == Kind.TRAINING and is_new:
+        effects.append(ReadCurve(state.place))
+    if (state.folder, state.files, state.snapshot) != (before.folder, before.files, before.snapshot):
+        effects.append(Redraw())
     if state.loading is not None:
         return state, tuple(effects)
-    has_preview = worker.is_alive and files.preview not in (None, state.shown_preview)
+    if state.kind == Kind.TRAINING:
+        return _load_avatar(state, event, effects)
     if state.has_result:
-        effects.append(StoreAvatar(folder / AVATAR))
+        state = replace(state, loading=state.folder)
+    elif state.kind in TRANSIENT and not worker.is_alive:
+        # The panel has no options of the command line.
+        return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
+    return state, tuple(effects)
+
+
+def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) -> Outcome:
+    """Load the trained avatar, or a preview of it, once each."""
+    preview = state.files.preview
+    if state.has_result:
+        effects.append(StoreAvatar(state.place / AVATAR))
         if event.show_result:
-            state = replace(state, loading=folder / AVATAR)
+            state = replace(state, loading=state.place / AVATAR)
         else:
             state = replace(state, result_shown=True)
-            effects.append(StoreTraining(state.run, True))
-    elif has_preview and event.live_preview:
-        state = replace(state, loading=request_folder(folder) / PREVIEW, shown_preview=files.preview)
+            effects.extend(_stored(state))
+    elif state.snapshot.state.is_alive and event.live_preview and preview not in (None, state.shown_preview):
+        state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
     if state.loading is not None:
         effects.append(LoadAvatar(state.loading))
     return state, tuple(effects)
 
 
-def _loading_ended(state: MonitorState, error: str, effects: tuple[Effect, ...]) -> Outcome:
-    was_result = state.loading is not None and state.loading.name == AVATAR
+def _loading_ended(state: RequestState, undoable: bool = False, error: str = "") -> Outcome:
+    was_result = state.loading is not None and state.loading.name != PREVIEW
+    # Undo brings back what was shown before the training.
+    undoable = undoable or (state.kind == Kind.TRAINING and was_result and not error)
+    undo = (PushUndo(),) if undoable else ()
+    if state.kind in TRANSIENT:
+        forgotten, removed = _forgotten(state, error=error)
+        return forgotten, (*undo, *removed)
     state = replace(state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result)
-    stored = (StoreTraining(state.run, True),) if was_result else ()
-    if was_result and not error and PushUndo() not in effects:
-        effects = (*effects, PushUndo())  # undo brings back what was shown before the training
-    return state, (*stored, *effects, Redraw())
+    return state, (*(_stored(state) if was_result else ()), *undo, Redraw())

@@ -12,6 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from capture.factory import write_mesh_capture  # noqa: E402
 
+from stga_addon.requests.monitor_state import Kind  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 from stga_addon.training.settings import PRESETS  # noqa: E402
 
@@ -60,14 +61,14 @@ def test_another_head_clears_the_analysis(chosen):
     assert not chosen.preset_timing
 
 
-def test_impossible_choice_is_a_sentence(chosen):
+def test_impossible_choice_is_a_sentence(chosen, extension):
     """Catches a mistake that shows nowhere, or as a traceback."""
     row = chosen.effects.add()
     row.name, row.choice = "jaw", "on"
     with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
         bpy.ops.stga.analyze_capture()
-    assert chosen.analysis_error.startswith("jaw=on: ")
-    assert "Traceback" not in chosen.analysis_error
+    assert error_of(extension, Kind.ANALYSIS).startswith("jaw=on: ")
+    assert "Traceback" not in error_of(extension, Kind.ANALYSIS)
 
 
 WORKER = """
@@ -95,18 +96,22 @@ def analyze(extension, monkeypatch, tmp_path):
 
     def start(body: str) -> None:
         python = write_interpreter(tmp_path / "python", body)
-        monkeypatch.setattr(extension.operators.background, "training_python", lambda context: python)
+        monkeypatch.setattr(extension.operators.analyze, "training_python", lambda context: python)
         assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
 
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     yield start
-    extension.operators.background.stop()
+    extension.operators.monitor._end_unawaited()
 
 
-def tick_until_done(extension) -> None:
+def error_of(extension, kind: Kind) -> str:
+    return extension.operators.monitor.state_of(bpy.context.scene, kind).error
+
+
+def tick_until_done(extension, kind: Kind = Kind.ANALYSIS) -> None:
     for _ in range(300):
         extension.operators.monitor.tick()
-        if not extension.operators.background.running(bpy.context.scene):
+        if not extension.operators.monitor.state_of(bpy.context.scene, kind).is_running:
             return
         time.sleep(0.02)
     raise AssertionError("the analysis did not end")
@@ -137,26 +142,26 @@ def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentenc
     chosen.effects.add().name = "jaw"
     analyze(body)
     tick_until_done(extension)
-    assert re.match(sentence, chosen.analysis_error)
-    assert not extension.operators.background.running(bpy.context.scene)
+    assert re.match(sentence, error_of(extension, Kind.ANALYSIS))
+    assert extension.operators.monitor.tick() is None
 
 
 def test_analysis_can_be_cancelled(chosen, extension, analyze):
     """Catches an analysis that nobody can stop, and one that goes on after it was cancelled."""
-    assert not bpy.ops.stga.cancel_analysis.poll()
+    assert not bpy.ops.stga.cancel.poll()
     analyze("time.sleep(600)")
     begin = time.monotonic()
-    assert bpy.ops.stga.cancel_analysis() == {"FINISHED"}
+    assert bpy.ops.stga.cancel(request="analysis") == {"FINISHED"}
     assert time.monotonic() - begin < 60
     assert bpy.ops.stga.analyze_capture.poll()
     assert extension.operators.monitor.tick() is None
-    assert chosen.analysis_error == ""
+    assert error_of(extension, Kind.ANALYSIS) == ""
 
 
 def test_a_worker_that_cannot_be_started_leaves_nothing(chosen, extension, monkeypatch, tmp_path):
     """Catches a temporary folder that is left behind for each attempt."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(extension.operators.background, "training_python", lambda context: str(tmp_path / "none"))
+    monkeypatch.setattr(extension.operators.analyze, "training_python", lambda context: str(tmp_path / "none"))
     before = set(tmp_path.iterdir())
     with pytest.raises(RuntimeError, match="cannot be started as a Python interpreter"):
         bpy.ops.stga.analyze_capture()

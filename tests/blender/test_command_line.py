@@ -172,7 +172,7 @@ def test_training_is_the_panels(stga, bare, folder, tmp_path):
 
 def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_path, monkeypatch, capsys):
     """Catches a training environment that can be chosen in the preferences' dialog alone, or is not used afterwards."""
-    operators, worker = extension.operators.environment, extension.stga_addon.worker.environment
+    operators, worker = extension.operators.training_python, extension.stga_addon.worker.environment
     command = import_module(f"{extension.__name__}.stga_addon.cli.environment")
     monkeypatch.setenv(command.FOLDER_VARIABLE, "")  # restored after the test
     monkeypatch.delenv(worker.PYTHON_VARIABLE, raising=False)

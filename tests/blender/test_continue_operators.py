@@ -11,9 +11,10 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
+from stga_addon.requests.monitor_state import Kind, RequestState  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 
-from .test_analyze_operator import tick_until_done, write_interpreter  # noqa: E402
+from .test_analyze_operator import error_of, tick_until_done, write_interpreter  # noqa: E402
 from .test_operators import write_ball_avatar  # noqa: E402
 from .test_train_operators import ask_only  # noqa: E402
 
@@ -126,7 +127,7 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, monkeyp
     selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
     selection[3] = ~selection[3]
     program = write_interpreter(tmp_path / "python", answer(extension, tmp_path, selection))
-    monkeypatch.setattr(extension.operators.background, "training_python", lambda context: program)
+    monkeypatch.setattr(extension.operators.select_extension, "training_python", lambda context: program)
     settings = bpy.context.scene.stga
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     shown = extension.stga_addon.scene.vertex_groups.read_selection(head)
@@ -138,7 +139,7 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, monkeyp
     program = write_interpreter(tmp_path / "python", "end('failed', 'no such run')")
     with pytest.raises(RuntimeError, match="no such run"):
         bpy.ops.stga.select_extension(directory=str(run))
-    assert settings.extension_error == "no such run"
+    assert error_of(extension, Kind.SELECTION) == "no such run"
 
 
 def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, extension, monkeypatch, tmp_path):
@@ -149,19 +150,19 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
     given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
     wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
     program = write_interpreter(tmp_path / "python", wait + given)
-    background, settings = extension.operators.background, bpy.context.scene.stga
-    monkeypatch.setattr(background, "training_python", lambda context: program)
+    settings = bpy.context.scene.stga
+    monkeypatch.setattr(extension.operators.select_extension, "training_python", lambda context: program)
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     assert any(temporary.iterdir())
     assert not bpy.ops.stga.select_extension.poll()
-    assert bpy.ops.stga.cancel_analysis() == {"FINISHED"}
+    assert bpy.ops.stga.cancel(request="selection") == {"FINISHED"}
     assert not any(temporary.iterdir())
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "other")))
     (tmp_path / "go").touch()
-    tick_until_done(extension)
-    assert settings.extension_error.endswith("its head is no longer that of the scene")
+    tick_until_done(extension, Kind.SELECTION)
+    assert error_of(extension, Kind.SELECTION).endswith("its head is no longer that of the scene")
     assert "stga_0" not in head.vertex_groups
     assert "stga_0" not in settings.head.vertex_groups
     assert not any(temporary.iterdir())
@@ -171,27 +172,28 @@ def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypa
     """Catches a result lost because the head is edited, a failure held back, and an old error beside a new command."""
     given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
     program = write_interpreter(tmp_path / "python", given)
-    background, settings = extension.operators.background, bpy.context.scene.stga
-    monkeypatch.setattr(background, "training_python", lambda context: program)
+    monitor = extension.operators.monitor
+    monkeypatch.setattr(extension.operators.select_extension, "training_python", lambda context: program)
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    settings.extension_error = "of last time"
+    monitor._states[bpy.context.scene.session_uid, Kind.SELECTION] = RequestState(Kind.SELECTION, error="of last time")
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
-    assert settings.extension_error == ""
-    background._running[bpy.context.scene.session_uid].process.wait(60)
-    assert extension.operators.monitor.tick() is not None
-    assert background.is_waiting(bpy.context.scene)
+    assert error_of(extension, Kind.SELECTION) == ""
+    state = monitor.state_of(bpy.context.scene, Kind.SELECTION)
+    monitor._processes[state.folder].wait(60)
+    assert monitor.tick() is not None
+    assert monitor.state_of(bpy.context.scene, Kind.SELECTION).loading is not None
     assert "stga_0" not in head.vertex_groups
     bpy.ops.object.mode_set(mode="OBJECT")
-    tick_until_done(extension)
-    assert settings.extension_error == ""
+    tick_until_done(extension, Kind.SELECTION)
+    assert error_of(extension, Kind.SELECTION) == ""
     assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
     bpy.ops.object.mode_set(mode="EDIT")
     write_interpreter(tmp_path / "python", "end('failed', 'no such run')")
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
-    tick_until_done(extension)
-    assert settings.extension_error == "no such run"
+    tick_until_done(extension, Kind.SELECTION)
+    assert error_of(extension, Kind.SELECTION) == "no such run"
     bpy.ops.object.mode_set(mode="OBJECT")
 
 

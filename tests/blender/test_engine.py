@@ -23,7 +23,7 @@ from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.compat import choose_image_file, enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
-from stga_addon.scene.render import engine, view_transform  # noqa: E402
+from stga_addon.scene.render import engine, rasterizer, view_transform  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
@@ -565,7 +565,7 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     on_cpu = render(tmp_path)
     wanted[0] = f"gpu:{gpu_device.device().name}"
     passes = render(tmp_path)
-    assert engine._client._composer.device == wanted[0]
+    assert engine._rasterizer.client._composer.device == wanted[0]
     for channel in "RGBA":
         np.testing.assert_allclose(passes[channel], on_cpu[channel], atol=1e-4)
     seen = on_cpu["A"] > 0.05
@@ -594,7 +594,7 @@ def test_panels_drop_the_engine_on_unregister():
 
 def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
     """Catches preferences, which belong to the main thread, read from a render thread, and an error that is lost."""
-    monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
+    monkeypatch.setattr(rasterizer, "missing_packages", lambda: ["numba"])
     answers, callers = [StgaError("no environment"), "python"], []
 
     def find() -> str:
@@ -604,13 +604,13 @@ def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
             raise answer
         return answer
 
-    environment = engine.RenderEnvironment(find, lambda: "cpu")
+    environment = rasterizer.Rasterizer(find, lambda: "cpu")
     environment.update()
     with pytest.raises(StgaError, match="no environment"):
-        environment.path()
+        environment.python()
     environment.update()
     found: list[str] = []
-    thread = threading.Thread(target=lambda: found.append(environment.path()))
+    thread = threading.Thread(target=lambda: found.append(environment.python()))
     thread.start()
     thread.join()
     assert found == ["python"]

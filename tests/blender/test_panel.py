@@ -12,6 +12,8 @@ bpy = pytest.importorskip("bpy")
 
 from capture.factory import write_mesh_capture  # noqa: E402
 
+from stga_addon.requests.monitor_state import Kind  # noqa: E402
+
 from .test_curve import lines  # noqa: E402
 from .test_operators import write_ball_avatar  # noqa: E402
 
@@ -68,7 +70,7 @@ def trained(extension, tmp_path, monkeypatch):
     settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
     requests.folder.write_request(folder, requests.values.Train(run, tmp_path / "capture", settings))
     with extension.stga_addon.worker.status.status_writer(folder) as writer:
-        monitor.start_training(bpy.context.scene, run, None)
+        monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer.update(0.5, "Training")
         (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines()))
         (run / "tracking.npz").write_bytes(b"")
@@ -106,7 +108,7 @@ def draw(extension) -> list[str]:
 
 def test_drawing_reads_no_file(extension, trained, monkeypatch):
     """Catches panels that open, stat or list files: on a network drive, each redraw would block Blender."""
-    extension.operators.environment.has_training_python(bpy.context)
+    extension.operators.training_python.has_training_python(bpy.context)
 
     def refuse(*arguments, **_):
         raise AssertionError(f"file access while drawing: {arguments}")
@@ -128,7 +130,7 @@ def test_drawing_reads_no_file(extension, trained, monkeypatch):
 def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch, capsys):
     """Catches a timer that ends at an unexpected error without a trace, and one that repeats it at every call."""
     monitor = extension.operators.monitor
-    monkeypatch.setattr(monitor, "_read_status", lambda scene: 1 / 0)
+    monkeypatch.setattr(monitor, "_read_status", lambda scene, state: 1 / 0)
     assert monitor.tick() is None
     assert capsys.readouterr().err.count("ZeroDivisionError") == 1
     assert monitor.tick() is None
@@ -139,9 +141,13 @@ def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch,
 def test_unreadable_worker_does_not_end_the_timer_silently(extension, tmp_path, monkeypatch, capsys):
     """Catches an error about the training environment's worker that ends the monitoring of every training, unseen."""
     monitor = extension.operators.monitor
-    running = extension.stga_addon.worker.status.WorkerState.WORKING
-    monkeypatch.setitem(monitor._snapshots, tmp_path, monitor.WorkerSnapshot(running))
+    status = extension.stga_addon.worker.status
+    running = status.WorkerSnapshot(status.WorkerState.WORKING)
+    state = monitor.RequestState(Kind.ENVIRONMENT, tmp_path, tmp_path / "status", running)
+    monkeypatch.setitem(monitor._states, (monitor.NO_SCENE, Kind.ENVIRONMENT), state)
     monkeypatch.setattr(monitor, "inspect_status", lambda folder: 1 / 0)
     assert monitor.tick() is None
     assert "ZeroDivisionError" in capsys.readouterr().err
-    assert not monitor._snapshots[tmp_path].state.is_alive
+    assert "ZeroDivisionError" in monitor._states[monitor.NO_SCENE, Kind.ENVIRONMENT].error
+    assert monitor.tick() is None
+    assert "ZeroDivisionError" not in capsys.readouterr().err

@@ -20,6 +20,7 @@ from capture.factory import write_mesh_capture  # noqa: E402
 from stga_addon.avatar.file import write_avatar  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.export.ply import write_ply  # noqa: E402
+from stga_addon.requests.monitor_state import Kind  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
 
@@ -112,7 +113,7 @@ def test_a_head_that_is_gone(shown):
     bpy.data.objects.remove(bpy.context.scene.stga.head)
     with pytest.raises(RuntimeError, match="has no head to follow"):
         bpy.ops.stga.render_video(filepath=str(shown / "turn"), path="scene")
-    assert not bpy.ops.stga.cancel_video.poll()
+    assert not bpy.ops.stga.cancel.poll()
 
 
 def test_an_output_that_cannot_be_written(shown):
@@ -120,7 +121,7 @@ def test_an_output_that_cannot_be_written(shown):
     (shown / "file").write_text("")
     with pytest.raises(RuntimeError, match="cannot be written"):
         bpy.ops.stga.render_video(filepath=str(shown / "file/turn.mp4"))
-    assert not bpy.ops.stga.dismiss_video.poll()
+    assert not bpy.ops.stga.dismiss.poll()
 
 
 def test_a_full_disk(shown, monkeypatch):
@@ -134,7 +135,7 @@ def test_a_full_disk(shown, monkeypatch):
     with pytest.raises(RuntimeError, match="No space left on device"):
         bpy.ops.stga.render_video(filepath=str(shown / "turn"))
     assert bpy.context.scene.frame_current == 1
-    assert not bpy.ops.stga.dismiss_video.poll()
+    assert not bpy.ops.stga.dismiss.poll()
 
 
 def test_an_interpreter_that_does_not_start(shown, monkeypatch):
@@ -145,14 +146,16 @@ def test_an_interpreter_that_does_not_start(shown, monkeypatch):
         bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=0.1)
 
 
-def test_finished_jobs_end_with_the_add_on(shown, temporary):
+def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
     """Catches temporary folders of videos that nobody dismissed."""
     operator = sys.modules["stga_checkout.operators.render_video"]
     folder = temporary / "stga_video_kept"
     folder.mkdir()
     operator.Recorder(folder / operator.RECORDING).close()
-    operator._videos[bpy.context.scene.session_uid] = operator.Video(shown / "turn.mp4", folder, 1, 1)
-    operator.unregister()
+    monitor = extension.operators.monitor
+    monitor.follow(bpy.context.scene, Kind.VIDEO, shown / "turn.mp4", folder)
+    monitor.unregister()
+    monitor.register()
     assert not folder.exists()
 
 

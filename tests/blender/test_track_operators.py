@@ -64,7 +64,7 @@ def test_the_whole_way_of_the_panel(tracked, extension):
     head = settings.head
     assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert settings.tracking_capture == str(tracked)
-    assert not settings.tracking_pending
+    assert settings.tracking_shown
     cameras = extension.operators.track_correct.capture_cameras(head)
     assert [len(camera.data.background_images) for camera in cameras] == [5] * 5
     before = {frame: mesh_at(frame) for frame in range(5)}
@@ -94,7 +94,7 @@ def test_the_whole_way_of_the_panel(tracked, extension):
     for frame in range(5):
         np.testing.assert_allclose(mesh_at(frame), before[frame], atol=2e-6)
 
-    assert bpy.ops.stga.dismiss_tracking() == {"FINISHED"}
+    assert bpy.ops.stga.dismiss(request="tracking") == {"FINISHED"}
     assert not (tracked / "job").exists()
     assert settings.tracking_capture == ""
 
@@ -144,7 +144,7 @@ def test_mistakes_are_one_sentence(extension, take, tmp_path, more, expected):
     with pytest.raises(RuntimeError, match=expected):
         track(take, tmp_path / "capture", **more)
     assert bpy.context.scene.stga.head is None
-    assert not bpy.ops.stga.cancel_tracking.poll()
+    assert not bpy.ops.stga.cancel.poll()
     assert bpy.ops.stga.track_footage.poll()
 
 
@@ -162,15 +162,14 @@ def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monke
     """Catches a result that never arrives where Blender was closed, or its file saved, while the worker ran."""
     out, settings = tmp_path / "capture", bpy.context.scene.stga
     asked(extension, take, out)
-    settings.tracking_capture, settings.tracking_model = str(out), str(take / "head.npz")
-    settings.tracking_pending = True
+    settings.tracking_capture = str(out)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     perform_in_folder(out / "job")
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     assert extension.operators.monitor.tick() is None
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
-    assert not bpy.context.scene.stga.tracking_pending
+    assert bpy.context.scene.stga.tracking_shown
 
 
 def test_cancelled_tracking_writes_no_capture(extension, take, tmp_path):

@@ -15,6 +15,7 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.files import read_npz, write_json  # noqa: E402
+from stga_addon.requests.monitor_state import Kind  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
@@ -39,7 +40,7 @@ def worker(extension, head, tmp_path):
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
         folder = requests.folder.request_folder(run)
         requests.folder.write_request(folder, requests.values.Train(run, tmp_path / "capture", settings))
-        monitor.start_training(bpy.context.scene, run, None)
+        monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
         writer.update(0.25, "Training")
         writer.run, writer.leave = run, stack.close
@@ -50,8 +51,7 @@ def ask_only(monkeypatch, extension) -> list:
     """Let the operators that train do nothing but ask; what they ask."""
     asked = []
     monkeypatch.setattr(extension.operators.request, "missing_packages", list)
-    monkeypatch.setattr(extension.operators.train, "ask", lambda folder, wanted: asked.append(wanted))
-    monkeypatch.setattr(extension.operators.train, "perform_here", lambda context, folder: None)
+    monkeypatch.setattr(extension.operators.train, "start", lambda scene, wanted, *_, **__: asked.append(wanted))
     return asked
 
 
@@ -203,23 +203,23 @@ def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
 def test_running_worker_cannot_be_replaced_or_dismissed(worker):
     """Catches a second worker in the same folder, and a dismissed training whose worker continues."""
     assert not bpy.ops.stga.train.poll()
-    assert not bpy.ops.stga.dismiss_training.poll()
-    assert bpy.ops.stga.cancel_training() == {"FINISHED"}
+    assert not bpy.ops.stga.dismiss.poll()
+    assert bpy.ops.stga.cancel(request="training") == {"FINISHED"}
     assert worker.update(0.5, "Training")
     worker.leave()
-    assert not bpy.ops.stga.cancel_training.poll()
+    assert not bpy.ops.stga.cancel.poll()
     assert bpy.ops.stga.train.poll()
-    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert bpy.ops.stga.dismiss(request="training") == {"FINISHED"}
     assert not (worker.run / "job").exists()
     assert bpy.context.scene.stga.training_run == ""
-    assert not bpy.ops.stga.dismiss_training.poll()
+    assert not bpy.ops.stga.dismiss.poll()
 
 
 def test_dismiss_removes_a_requests_files_only(worker):
     """Catches a Dismiss that deletes what a user put into the request's folder."""
     (worker.folder / "notes.txt").write_text("mine")
     worker.leave()
-    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert bpy.ops.stga.dismiss(request="training") == {"FINISHED"}
     assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
 
 
@@ -232,7 +232,7 @@ def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
         (folder / name).write_text("[]")
     bpy.context.scene.stga.training_run = str(tmp_path / "documents")
     extension.operators.monitor.tick()
-    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert bpy.ops.stga.dismiss(request="training") == {"FINISHED"}
     assert sorted(path.name for path in folder.iterdir()) == names
     assert bpy.context.scene.stga.training_run == ""
 
@@ -305,7 +305,7 @@ def test_cancel_right_after_reopening(extension, worker, tmp_path):
     """Catches a script that cannot cancel a training of the file it opened: without a window no timer has read it."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
-    assert bpy.ops.stga.cancel_training() == {"FINISHED"}
+    assert bpy.ops.stga.cancel(request="training") == {"FINISHED"}
     assert worker.update(0.5, "Training")
 
 
@@ -319,12 +319,12 @@ def test_moved_blend_file(extension, worker, tmp_path):
     moved.mkdir()
     (tmp_path / "run").rename(moved / "run")
     bpy.ops.wm.save_as_mainfile(filepath=str(moved / "head.blend"))
-    assert monitor.training_of(bpy.context.scene).folder == moved / "run"
+    assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == moved / "run"
     tick_until(monitor, lambda: bpy.context.scene.stga.result_shown)
     (moved / "run").rename(moved / "gone")
-    assert monitor.training_of(bpy.context.scene).snapshot.state == "none"
-    assert monitor.training_of(bpy.context.scene).folder == tmp_path / "run"
-    assert bpy.ops.stga.dismiss_training() == {"FINISHED"}
+    assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == "none"
+    assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == tmp_path / "run"
+    assert bpy.ops.stga.dismiss(request="training") == {"FINISHED"}
 
 
 def test_undo_does_not_lose_the_worker(extension, worker):
@@ -341,7 +341,7 @@ def test_failed_worker_ends_the_timer(extension, worker):
     monitor = extension.operators.monitor
     (worker.folder / "worker.log").write_text("Killed\n")
     write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
-    last = monitor.training_of(bpy.context.scene).snapshot
+    last = monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot
     assert last.state.failed
     assert last.log_tail == ("Killed",)
     assert monitor.tick() is None
@@ -379,4 +379,4 @@ def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch
     (tmp_path / "wheels").mkdir()
     with pytest.raises(RuntimeError, match=r"Installing from the folder of wheels failed: .*No matching distribution"):
         bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), python=sys.executable)
-    assert not bpy.ops.stga.cancel_environment.poll()
+    assert not bpy.ops.stga.cancel.poll()

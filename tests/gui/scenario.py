@@ -25,8 +25,7 @@ seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 monitor = sys.modules[f"{extension}.operators.monitor"]
-render_video = sys.modules[f"{extension}.operators.render_video"]
-environment_folder = sys.modules[f"{extension}.operators.environment"].environment_folder
+environment_folder = sys.modules[f"{extension}.operators.common"].environment_folder
 status_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].status_folder
 lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
 
@@ -49,12 +48,16 @@ def chosen() -> Any:
     return bpy.context.scene.stga
 
 
+def request(kind: str) -> Any:
+    return monitor.state_of(bpy.context.scene, monitor.Kind(kind))
+
+
 def state() -> str:
-    return str(monitor.training_of(bpy.context.scene).snapshot.state)
+    return str(request("training").snapshot.state)
 
 
 def figures() -> dict[str, float]:
-    return dict(monitor.training_of(bpy.context.scene).snapshot.status.figures)
+    return dict(request("training").snapshot.status.figures)
 
 
 def is_training() -> bool:
@@ -63,9 +66,9 @@ def is_training() -> bool:
 
 def has_worker() -> bool:
     """Whether a run, the test of the environment or a video has a worker that is alive."""
-    video = render_video.video_of(bpy.context.scene)
+    video = request("video").folder
     folders = [*Path(BLEND).parent.glob("*/job"), status_folder(environment_folder())]
-    folders += [] if video is None else [video.folder]
+    folders += [] if video is None else [video]
     return any(monitor.inspect_status(folder).state.is_alive for folder in folders)
 
 
@@ -74,7 +77,7 @@ def splats() -> int:
 
 
 def job_folder() -> Path:
-    return monitor.request_folder(monitor.training_of(bpy.context.scene).folder)
+    return Path(request("training").folder)
 
 
 def first() -> Iterator[Callable[[], bool]]:
@@ -82,9 +85,9 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_environment()
-    environment = status_folder(environment_folder())
-    yield lambda: not monitor.snapshot(environment).state.is_alive
-    seen["environment"] = monitor.snapshot(environment).status.message or monitor.snapshot(environment).status.error
+    yield lambda: not request("environment").is_running
+    tested = request("environment").snapshot.status
+    seen["environment"] = tested.message or tested.error
     with in_window():
         bpy.ops.stga.import_capture(directory=CAPTURE)
     yield looks_at_head
@@ -97,7 +100,7 @@ def first() -> Iterator[Callable[[], bool]]:
     yield lambda: splats_at_work() != before
     seen["refreshed"] = True
 
-    bpy.ops.stga.cancel_training()
+    bpy.ops.stga.cancel(request="training")
     yield lambda: state() == "cancelled" and chosen().result_shown
     seen["cancelled"] = {"avatar": Path(chosen().avatar).exists(), "splats": splats()}
 
@@ -106,7 +109,7 @@ def first() -> Iterator[Callable[[], bool]]:
     seen["resumed at"] = figures()["iteration"]
     os.kill(lock_owner(job_folder() / "worker.lock"), signal.SIGKILL)
     yield lambda: state() == "lost"
-    seen["lost"] = monitor.training_of(bpy.context.scene).snapshot.status.error
+    seen["lost"] = request("training").snapshot.status.error
     bpy.ops.stga.copy_report()
     seen["clipboard"] = bpy.context.window_manager.clipboard
 
@@ -136,7 +139,7 @@ def second() -> Iterator[Callable[[], bool]]:
     """Find the worker that went on while Blender was closed; then a short run that ends by itself."""
     seen["found"] = lock_owner(job_folder() / "worker.lock")
     yield is_training
-    bpy.ops.stga.cancel_training()
+    bpy.ops.stga.cancel(request="training")
     yield lambda: state() == "cancelled" and chosen().result_shown
     try:
         bpy.ops.stga.train(directory="//run", minutes=1)
@@ -146,7 +149,7 @@ def second() -> Iterator[Callable[[], bool]]:
     yield lambda: state() == "finished" and chosen().result_shown
     seen["finished"] = {"avatar": chosen().avatar, "splats": splats()}
     yield from videos()
-    bpy.ops.stga.dismiss_training()
+    bpy.ops.stga.dismiss(request="training")
     seen["dismissed"] = chosen().training_run == ""
 
 
@@ -157,16 +160,16 @@ def videos() -> Iterator[Callable[[], bool]]:
     for name in ("recording", "rendering", "finished"):
         with in_window():
             bpy.ops.stga.render_video(filepath=str(folder / name), seconds=0.5)
-        video = render_video.video_of(scene)
+        video = request("video").folder
         if name != "recording":
-            yield lambda video=video: not video.is_recording and monitor.snapshot(video.folder).state.is_alive
+            yield lambda: request("video").is_running and request("video").snapshot.status.message != "Recording"
         if name != "finished":
-            bpy.ops.stga.cancel_video()
-        yield lambda: not render_video.is_busy(scene)
+            bpy.ops.stga.cancel(request="video")
+        yield lambda: not request("video").is_running
         if name != "recording":
-            seen[f"video {name}"] = str(monitor.snapshot(video.folder).state)
-            bpy.ops.stga.dismiss_video()
-        yield lambda video=video: not video.folder.exists()
+            seen[f"video {name}"] = str(request("video").snapshot.state)
+            bpy.ops.stga.dismiss(request="video")
+        yield lambda video=video: not video.exists()
         seen[f"{name} written"] = (folder / f"{name}.mp4").exists()
     seen["frame after videos"] = scene.frame_current
 

@@ -1,0 +1,194 @@
+"""What Blender does with each kind of request: what the scene stores of it, and how its result reaches the scene."""
+
+import json
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..stga_addon.avatar.file import Avatar, read_avatar
+from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.folder import read_request, read_result
+from ..stga_addon.requests.monitor_state import Kind, RequestState, Shown, SliceBuilt
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
+from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
+from ..stga_addon.scene.vertex_groups import write_selection
+from ..stga_addon.tracking.folder import is_flame
+from . import ids
+from .common import is_head
+from .select import count_selected
+from .show import show
+
+Answer = SliceBuilt | Shown | None
+
+
+@dataclass(frozen=True)
+class RequestKind:
+    """What Blender does with requests of one kind.
+
+    label    what is running, for messages
+    cancel   what Cancel does
+    stored   properties of the scene's settings: the subject's path, and whether its result was shown
+    show     puts what was loaded into the scene; None: it is still being read. Raises StgaError or RuntimeError
+    changed  the object that `show` changes, which has to leave Edit Mode before
+    """
+
+    label: str
+    cancel: str
+    stored: tuple[str, str] | None = None
+    show: Callable[[Any, RequestState], Answer] = lambda scene, state: Shown()
+    changed: Callable[[Any, RequestState], Any] = lambda scene, state: None
+
+
+def _head(scene: Any, state: RequestState) -> Any:
+    return getattr(scene, ids.SETTINGS).head
+
+
+# Training
+
+
+def _run_object(scene: Any, state: RequestState) -> Any:
+    """The object that shows the run, or None."""
+    return next((thing for thing in scene.objects if thing.get(tags.RUN) == str(state.subject)), None)
+
+
+def _show_avatar(scene: Any, state: RequestState) -> Answer:
+    """Show the avatar that was loaded, in the object that shows this run or in a new one, a slice at a time."""
+    loaded = loader.result(scene)
+    if loaded is None:
+        return None
+    with ExitStack() as ended:
+        ended.callback(loader.discard, scene)
+        answer = _present(scene, state, *loaded)
+        if isinstance(answer, SliceBuilt):
+            ended.pop_all()
+    return answer
+
+
+def _present(scene: Any, state: RequestState, avatar: Avatar, attributes: SplatAttributes) -> Answer:
+    head, shown = _head(scene, state), _run_object(scene, state)
+    if not is_head(head):
+        raise StgaError("No head in the scene to show the avatar on; import the capture")
+    check_head(avatar, head)
+    if shown is not None and can_update(shown, avatar):
+        update_splats(shown, attributes)
+        return Shown()
+    if build_next_node_group(avatar):
+        return SliceBuilt()
+    if shown is not None:
+        bpy.data.objects.remove(shown)
+    assert state.subject is not None
+    shown = show(scene, avatar, head, f"{head.name} {state.subject.name}", attributes=attributes)
+    shown[tags.RUN] = str(state.subject)
+    return Shown(undoable=True)
+
+
+class _Loader:
+    """Reads avatar files in a thread, one for each scene."""
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
+
+    def load(self, scene: Any, path: Path) -> None:
+        self._pool = self._pool or ThreadPoolExecutor(1, "stga")
+        self._loading[scene.session_uid] = self._pool.submit(_load, path)
+
+    def result(self, scene: Any) -> tuple[Avatar, SplatAttributes] | None:
+        """The file's content; None while it is being read. Raises StgaError where it cannot be read."""
+        future = self._loading[scene.session_uid]
+        return future.result() if future.done() else None
+
+    def discard(self, scene: Any) -> None:
+        self._loading.pop(scene.session_uid, None)
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool, self._loading = None, {}
+
+
+loader = _Loader()
+
+
+def _load(path: Path) -> tuple[Avatar, SplatAttributes]:
+    avatar = read_avatar(path)
+    return avatar, avatar_attributes(avatar)
+
+
+# Tracking
+
+
+def _import_tracked(scene: Any, state: RequestState) -> Answer:
+    """Import the tracked capture with the operator, which reports in the window that shows the scene."""
+    assert state.folder is not None
+    model = getattr(read_request(state.folder), "model", "") if is_flame(state.place) else ""
+    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
+    with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
+        undoable = window is not None
+        bpy.ops.stga.import_capture("EXEC_DEFAULT", undoable, directory=str(state.place), flame=str(model))
+    return Shown()
+
+
+# Analysis and selection
+
+
+def _fill_effects(scene: Any, state: RequestState) -> Answer:
+    """Fill the scene's table of effects."""
+    assert state.folder is not None
+    settings = getattr(scene, ids.SETTINGS)
+    found: Any = read_result(state.folder)
+    settings.preset_timing = json.dumps(dict(found.seconds))
+    settings.effects.clear()
+    for decision in found.plan:
+        row = settings.effects.add()
+        row.name = decision.effect
+        for name in ("choice", "on", "reason", "cost"):
+            setattr(row, name, getattr(decision, name))
+    return Shown()
+
+
+def _select_for_take(scene: Any, state: RequestState) -> Answer:
+    """Select what extending the run by the head's take would train."""
+    assert state.folder is not None
+    head = _head(scene, state)
+    found: Any = read_result(state.folder)
+    if not is_head(head) or Path(head[tags.CAPTURE]) != state.subject:
+        raise StgaError(f"{state.subject}: its head is no longer that of the scene")
+    write_selection(head, dict(found.selection))
+    count_selected(scene, head)
+    return Shown(undoable=True)
+
+
+KINDS = {
+    Kind.TRAINING: RequestKind(
+        "Training",
+        "Stop training and keep the avatar trained so far; Resume continues from there",
+        ("training_run", "result_shown"),
+        _show_avatar,
+        _run_object,
+    ),
+    Kind.TRACKING: RequestKind(
+        "Tracking",
+        "Stop tracking; the landmarks of whole cameras are kept, and Track continues with the others",
+        ("tracking_capture", "tracking_shown"),
+        _import_tracked,
+        _head,
+    ),
+    Kind.ANALYSIS: RequestKind("The analysis", "Stop the analysis; earlier results stay", show=_fill_effects),
+    Kind.SELECTION: RequestKind(
+        "The selection", "Stop selecting; the groups stay as they are", show=_select_for_take, changed=_head
+    ),
+    Kind.VIDEO: RequestKind(
+        "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay"
+    ),
+    Kind.ENVIRONMENT: RequestKind(
+        "Set-up of the training environment", "Stop making the training environment, and remove the incomplete one"
+    ),
+}
+"""The only table of what depends on the kind of a request in Blender."""
