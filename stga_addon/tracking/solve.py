@@ -53,16 +53,22 @@ class Identity:
 
 
 def solve_identity(
-    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], rigid: np.ndarray
+    head: HeadModel,
+    places: SurfacePoints,
+    observations: Sequence[Observation],
+    rigid: np.ndarray,
+    metric: bool = False,
 ) -> Identity:
     """Identity common to some timesteps, with their expressions and poses; rigid (T, 18) is where poses start.
 
-    The scale of the world is solved as a component: a head `scale` times as large as the model's fits best.
+    The scale of the world is solved as a component: a head `scale` times as large as the model's fits best. Where the
+    world is `metric`, it is 1, and the size of the head is the person's.
     """
     model = head.model
     known, expressions = model.n_identity, model.n_expression
     columns = np.split(model.shapedirs, [known], axis=2)
-    sized = np.concatenate([columns[0], SCALE_SIGMA * model.v_template[..., None], columns[1]], axis=2)
+    scale_sigma = 0.0 if metric else SCALE_SIGMA
+    sized = np.concatenate([columns[0], scale_sigma * model.v_template[..., None], columns[1]], axis=2)
     points = PosedPoints(replace(model, shapedirs=sized), places)
     shared, own = known + 1, expressions + RIGID_SIZE
     prior = np.concatenate([np.ones(shared), np.tile(_precision(head), len(observations))])
@@ -82,7 +88,7 @@ def solve_identity(
         state += step
         if np.abs(step).max() < CONVERGED_STEP:
             break
-    scale = 1 + SCALE_SIGMA * state[known]
+    scale = 1 + scale_sigma * state[known]
     frames = state[shared:].reshape(len(observations), own)
     frames[:, :expressions] /= scale
     frames[:, -TRANSLATION_SIZE:] /= scale
