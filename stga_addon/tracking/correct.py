@@ -45,8 +45,8 @@ def correct_capture(
     """Solve a tracked FLAME capture again around timesteps whose parameters (E + 18,) are given: `keys`.
 
     Always from what was tracked: a key that is no longer given leaves no trace. The timesteps' parameter files, the
-    report's errors and the contact sheet are replaced. Raises StgaError where `out` was not tracked here, or a file that
-    the correction starts from is damaged; nothing is written then.
+    report's errors and the contact sheet are replaced. Raises StgaError where `out` was not tracked here, or a file
+    that the correction starts from is damaged; nothing is written then.
     """
     capture = open_capture(out, model)
     if capture.flame is None:
@@ -184,9 +184,7 @@ def _sorted_footage(out: Path) -> Footage:
     return replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
 
 
-def _landmarks(
-    out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray
-) -> dict[str, CameraLandmarks]:
+def _landmarks(out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray) -> dict[str, CameraLandmarks]:
     """What the capture was tracked from. Raises StgaError where it fits neither the head model's file nor a face."""
     found = read_landmarks(footage, out / LANDMARKS_FOLDER)
     check_count(found, places)
