@@ -175,7 +175,8 @@ def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
     interpolated = report.get("interpolated") if isinstance(report, dict) else None
     if not isinstance(interpolated, list) or not all(type(timestep) is int for timestep in interpolated):
         raise StgaError(f"{out / REPORT_FILE}: interpolated: expected timesteps, got {shorten(interpolated)}")
-    return ~np.isin(timesteps, interpolated)
+    without = set(interpolated)
+    return np.array([timestep not in without for timestep in timesteps])
 
 
 def _sorted_footage(out: Path) -> Footage:
