@@ -1,5 +1,6 @@
 """Correction of a tracked take by heads that were posed by hand at some timesteps."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,15 +9,17 @@ from typing import Any
 import numpy as np
 
 from ..capture.flame_capture import PARAMETERS
+from ..capture.model import Capture
 from ..capture.open import open_capture
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.model import FlameModel
-from ..flame.sequence import FlameSequence, with_identity
+from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
 from .contact_sheet import write_contact_sheet
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
+from .footage.model import Footage
 from .footage.open import open_footage
-from .landmarks import Report, read_landmarks, read_places
+from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
 from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, parameters_of
 from .solve import (
     EXPRESSION_ACCELERATION,
@@ -42,28 +45,29 @@ def correct_capture(
     """Solve a tracked FLAME capture again around timesteps whose parameters (E + 18,) are given: `keys`.
 
     Always from what was tracked: a key that is no longer given leaves no trace. The timesteps' parameter files, the
-    report's errors and the contact sheet are replaced. Raises StgaError where `out` was not tracked here.
+    report's errors and the contact sheet are replaced. Raises StgaError where `out` was not tracked here, or a file
+    that the correction starts from is damaged; nothing is written then.
     """
     capture = open_capture(out, model)
     if capture.flame is None:
         raise StgaError(f"{out}: was not tracked with FLAME; only FLAME's pose can be corrected")
-    landmarks = out / LANDMARKS_FOLDER
-    places, used = read_places(landmarks / PLACES_FILE, len(capture.flame.model.faces))
+    places, used = read_places(out / LANDMARKS_FOLDER / PLACES_FILE, len(capture.flame.model.faces))
     timesteps, solved = _solved(out, capture.flame)
-    unknown = sorted(set(keys) - set(timesteps))
-    if unknown:
-        raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
-    rows = {timesteps.index(timestep): values for timestep, values in keys.items()}
+    rows = _rows(out, timesteps, keys, solved.shape[1])
+    seen = _with_landmarks(out, timesteps)
+    footage = _sorted_footage(out)
+    found = _landmarks(out, footage, places, used)
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
     chosen = SurfacePoints(places.face[used], places.barycentric[used])
-    found = corrected(person, chosen, solved, _with_landmarks(out, timesteps), rows, span)
-    for number, (timestep, values) in enumerate(zip(timesteps, found, strict=True)):
+    heads = corrected(person, chosen, solved, seen, rows, span)
+    write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
+    for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
         path = out / PARAMETERS / f"{timestep:05d}.npz"
         write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
         report("Heads", number + 1, len(timesteps))
     report("Contact sheet", 0, 1)
-    _report_errors(out, model, places, used)
+    _report_errors(out, open_capture(out, model), footage, found, places, used)
 
 
 def corrected(
@@ -133,30 +137,73 @@ def _acceleration_precision(size: int) -> np.ndarray:
 
 
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
-    """Timesteps and parameters (T, E + 18) as they were tracked; kept in a file before the first correction."""
+    """Timesteps and parameters (T, E + 18) as they were tracked: those of the file that the first correction writes,
+    or of the capture where there is none. Raises StgaError where the file is not of the capture's timesteps."""
     path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
-    if path.exists():
-        arrays = read_npz(path)
-        expected = (len(timesteps), sequence.model.n_expression + RIGID_SIZE)
-        if arrays.get("parameters", np.zeros(0)).shape != expected:
-            raise StgaError(f"{path}: parameters: expected shape {expected}")
-        return timesteps, arrays["parameters"].astype(np.float64)
-    solved = np.stack([parameters_of(sequence.frame(timestep)) for timestep in timesteps])
-    write_npz(path, {"timesteps": np.array(timesteps), "parameters": solved})
-    return timesteps, solved
+    if not os.path.lexists(path):
+        return timesteps, np.stack([parameters_of(sequence.frame(timestep)) for timestep in timesteps])
+    arrays = read_npz(path)
+    shape = len(timesteps), sequence.model.n_expression + RIGID_SIZE
+    if not _are_parameters(arrays.get("parameters"), shape):
+        raise StgaError(f"{path}: parameters: expected {shape} finite numbers")
+    if arrays.get("timesteps", np.zeros(0)).tolist() != timesteps:
+        raise StgaError(f"{path}: timesteps: expected those of the capture")
+    return timesteps, arrays["parameters"].astype(np.float64)
+
+
+def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
+    """Whether these are parameters that FLAME can be posed with."""
+    if values is None or values.shape != shape or values.dtype.kind not in "fiu":
+        return False
+    return bool((np.abs(values.astype(np.float64)) <= MAX_PARAMETER).all())  # not where one is NaN
+
+
+def _rows(out: Path, timesteps: list[int], keys: Mapping[int, np.ndarray], size: int) -> dict[int, np.ndarray]:
+    """The keys by row instead of timestep. Raises StgaError for one of no timestep, or that poses no head."""
+    unknown = sorted(set(keys) - set(timesteps))
+    if unknown:
+        raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
+    for timestep, values in keys.items():
+        if not _are_parameters(values, (size,)):
+            raise StgaError(f"key at timestep {timestep}: expected {(size,)} finite numbers")
+    return {timesteps.index(timestep): values.astype(np.float64) for timestep, values in keys.items()}
 
 
 def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
-    interpolated = set(read_json(out / REPORT_FILE)["interpolated"])
-    return np.array([timestep not in interpolated for timestep in timesteps])
+    """(T,) bool. Raises StgaError where the report does not list the timesteps without."""
+    report = read_json(out / REPORT_FILE)
+    interpolated = report.get("interpolated") if isinstance(report, dict) else None
+    if not isinstance(interpolated, list) or not all(type(timestep) is int for timestep in interpolated):
+        raise StgaError(f"{out / REPORT_FILE}: interpolated: expected timesteps, got {shorten(interpolated)}")
+    without = set(interpolated)
+    return np.array([timestep not in without for timestep in timesteps])
 
 
-def _report_errors(out: Path, model: Path, places: SurfacePoints, used: np.ndarray) -> None:
-    """Measure the reprojection errors of the corrected capture, and draw its contact sheet."""
-    capture, footage = open_capture(out, model), open_footage(out)
-    footage = replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
-    errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
+def _sorted_footage(out: Path) -> Footage:
+    """The capture's own images, its cameras in the order of their names."""
+    footage = open_footage(out)
+    return replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
+
+
+def _landmarks(out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray) -> dict[str, CameraLandmarks]:
+    """What the capture was tracked from. Raises StgaError where it fits neither the head model's file nor a face."""
     found = read_landmarks(footage, out / LANDMARKS_FOLDER)
+    check_count(found, places)
+    if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
+        raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
+    return found
+
+
+def _report_errors(
+    out: Path,
+    capture: Capture,
+    footage: Footage,
+    found: Mapping[str, CameraLandmarks],
+    places: SurfacePoints,
+    used: np.ndarray,
+) -> None:
+    """Measure the reprojection errors of the corrected capture, and draw its contact sheet."""
+    errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     for name, own in found.items():
         for timestep, pixels, confidence in zip(own.timesteps.tolist(), own.points, own.confidence, strict=True):

@@ -148,7 +148,8 @@ def fit_head(
         found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
         observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
         starts = np.stack([rigid_start(at, observed[t]) for t in spread])
-        identity = solve_identity(head, places, [observed[t] for t in spread], starts, metric)
+        # Of one camera's rays, a head shrunk into the camera itself misses all by the least.
+        identity = solve_identity(head, places, [observed[t] for t in spread], starts, metric or not several)
         world = replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale)
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)

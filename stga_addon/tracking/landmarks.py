@@ -149,6 +149,14 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
     return SurfacePoints(np.maximum(face, 0).astype(np.int64), _barycentric(path, barycentric, used)), used
 
 
+def check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:
+    """Raise StgaError for a camera that sees a face and has another number of landmarks than the head model's file."""
+    for name, camera in found.items():
+        count = camera.points.shape[1]
+        if camera.confidence.any() and count != len(places):
+            raise StgaError(f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}")
+
+
 def _barycentric(path: Path, barycentric: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(N, 3) float64; thirds where a landmark is not used."""
     if barycentric.shape != (len(used), 3):

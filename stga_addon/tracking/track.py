@@ -34,6 +34,7 @@ from .head_model import read_head_model
 from .landmarks import (
     CameraLandmarks,
     Report,
+    check_count,
     detect_landmarks,
     read_landmarks,
     read_places,
@@ -110,7 +111,7 @@ def track(
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
     if not any(camera.confidence.any() for camera in found.values()):
         raise StgaError(f"{footage.root}: shows no face in any of {len(list(footage.views()))} frames")
-    _check_count(found, places)
+    check_count(found, places)
     neutral = places.on(head.model.v_template, head.model.faces)
     if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
         raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
@@ -205,13 +206,6 @@ def _recording(camera: FootageCamera) -> list[Any]:
     if camera.undistortion is None:
         return [first]
     return [first, repr(camera.undistortion.lens), pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy]
-
-
-def _check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:
-    for name, camera in found.items():
-        count = camera.points.shape[1]
-        if camera.confidence.any() and count != len(places):
-            raise StgaError(f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}")
 
 
 def _reliable(found: Mapping[str, CameraLandmarks], reliable: np.ndarray) -> dict[str, CameraLandmarks]:

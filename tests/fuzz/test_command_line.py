@@ -18,17 +18,32 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from capture import factory
 from PIL import Image
+from tracking.test_track import record
 
 from stga_addon.cli.main import main
+from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.report import preset_timing
 from stga_addon.requests.folder import write_request
-from stga_addon.requests.values import Train
+from stga_addon.requests.values import (
+    Analyze,
+    Evaluate,
+    Extend,
+    Refine,
+    RenderRecording,
+    Request,
+    Resume,
+    SelectForTake,
+    SolveAgain,
+    Track,
+    Train,
+)
+from stga_addon.tracking.head_model import HeadModel
 from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")
@@ -39,6 +54,7 @@ MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
 REPORTED_FAILURES = 20
 
+REQUESTS = tuple(kind.__name__ for kind in get_args(Request))
 NUMBERS = [
     "0",
     "1",
@@ -128,8 +144,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert call(["train", *options, *strategy, "--out", case / name])[0] == 0
     shutil.copytree(case / "run", case / "unfinished")
     (case / "unfinished/avatar.npz").unlink()
-    settings = read_run(case / "run").settings
-    write_request(case / "job", Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}))
+    splats = ["--iterations", 2, "--device", "cpu", "--effect", "hull-points=off", "--out", case / "splats"]
+    assert call(["train", capture, *splats])[0] == 0
+    factory.write_mesh_capture(case / "take", (0, 1), range(2))
+    record(case / "footage", HeadModel(synthetic_flame(0), "flame"))
+    assert call(["track", *tracked_footage(case), "--out", case / "footage/out"])[0] == 0
+    requests = requests_about(case)
+    assert set(requests) == set(REQUESTS)
+    for name, request in requests.items():
+        write_request(case / "jobs" / name, request)
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
     (case / "head").mkdir()
     head = {
@@ -144,6 +167,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     case.rename(folder / "template")
     (folder / "start").mkdir()
     return folder
+
+
+def tracked_footage(case: Path) -> list[str]:
+    """What `stga track` is given to track the footage of the case from its landmark files."""
+    footage = case / "footage"
+    return [str(footage / "footage"), "--model", str(footage / "head.npz"), "--landmarks", str(footage / "points")]
+
+
+def requests_about(case: Path) -> dict[str, Request]:
+    """A request of each kind, by its name, about the files of the case."""
+    capture, run, footage, once = case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"}
+    settings = read_run(case / "run").settings
+    key = np.zeros(synthetic_flame(0).n_expression + 18)
+    requests: tuple[Request, ...] = (
+        Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
+        Resume(run, capture, device="cpu"),
+        Refine(case / "refined", run, weights=np.linspace(0, 1, 320, dtype=np.float32), **once),
+        Extend(case / "extended", run, (case / "take",), **once),
+        SelectForTake(run, case / "take"),
+        Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"),
+        SolveAgain(footage / "out", footage / "head.npz", {1: key}),
+        RenderRecording(case / "none.bin", case / "asked.mp4", 1, 25.0),
+        Analyze(capture),
+        Evaluate(run),
+    )
+    return {type(request).__name__: request for request in requests}
 
 
 @pytest.fixture(autouse=True)
@@ -372,7 +421,29 @@ def demo(rng: random.Random, case: Path) -> list[str]:
     return [*option(rng, 0.5, "--budget", *NUMBERS), *option(rng, 0.5, "--out", some_path(rng, case))]
 
 
+def refine(rng: random.Random, case: Path) -> list[str]:
+    region = option(rng, 0.9, "--region", "mouth", some_path(rng, case, "mesh/regions.json", "motion.npz"), *TEXTS)
+    frames = option(rng, 0.2, "--frames", "0-1", "1-0", "7-9", *NUMBERS)
+    return [some_path(rng, case, "splats", "run"), *region, *frames, *continuing(rng, case)]
+
+
+def extend(rng: random.Random, case: Path) -> list[str]:
+    takes = [some_path(rng, case, "take", "mesh", "flame") for _ in range(rng.choice([1, 1, 1, 2, 0]))]
+    only = option(rng, 0.3, "--select-only", some_path(rng, case, "new.npz"))
+    return [some_path(rng, case, "splats", "run"), *takes, *only, *([] if only else continuing(rng, case))]
+
+
+def continuing(rng: random.Random, case: Path) -> list[str]:
+    """Options that `refine` and `extend` share; each training has an iteration or two."""
+    arguments = ["--iterations", rng.choice(["1", "1", "2", "0", "x"]), *output(rng, case, "new")]
+    arguments += [*option(rng, 0.2, "--growth", "0.5", *NUMBERS), *option(rng, 0.2, "--seed", "5", *NUMBERS)]
+    arguments += ["--resume"] if rng.random() < 0.05 else []
+    return [*arguments, *option(rng, 0.2, "--device", "cpu", "auto", "tpu")]
+
+
 def track(rng: random.Random, case: Path) -> list[str]:
+    if rng.random() < 0.4:
+        return [*tracked_footage(case), *output(rng, case, "new"), *option(rng, 0.2, "--focal", "900", *NUMBERS)]
     arguments = [
         some_path(rng, case, "mesh", "flame", "mesh/images"),
         "--model",
@@ -407,9 +478,11 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "render": (3, render),
     "eval": (2, evaluate),
     "train": (1, train),
+    "refine": (0.5, refine),
+    "extend": (0.5, extend),
     "track": (1, track),
     "avatar": (0.5, avatar),
-    "perform": (0.5, lambda rng, case: [some_path(rng, case, "job", "run")]),
+    "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{name}" for name in REQUESTS))]),
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
     "demo": (0.2, demo),

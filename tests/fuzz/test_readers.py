@@ -332,7 +332,7 @@ def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) ->
     def once(data: st.DataObject) -> None:
         wrapped = path.suffix == ".npz" and data.draw(st.booleans())
         broken.write_bytes(rewrap(data.draw, path) if wrapped else damaged(data.draw, whole))
-        begin = time.monotonic()
+        begin = time.process_time()  # of this process: other programs may keep it waiting
         tracemalloc.start()
         try:
             with suppress(StgaError), warnings.catch_warnings():
@@ -341,7 +341,7 @@ def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) ->
             peak = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
-        assert time.monotonic() - begin < MAX_READ_S
+        assert time.process_time() - begin < MAX_READ_S
         assert peak < MAX_READ_BYTES
         assert [entry.name for entry in broken.parent.iterdir()] == [broken.name]
 

@@ -1,16 +1,21 @@
 """Corrections by hand: the key is kept, its neighbors follow, all others stay."""
 
+import re
 import shutil
 
 import numpy as np
 import pytest
 
 from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.errors import StgaError
-from stga_addon.files import read_json
+from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
+from stga_addon.requests.folder import write_request
+from stga_addon.requests.values import SolveAgain
 from stga_addon.tracking.correct import SOLVED_FILE, correct_capture, corrected
+from stga_addon.tracking.folder import LANDMARKS_FOLDER, REPORT_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.posed_points import RIGID_SIZE, parameters_of
@@ -118,3 +123,86 @@ def test_what_cannot_be_corrected_is_named(tracked, tmp_path):
     with pytest.raises(StgaError, match=r"head_model\.npz"):
         correct_capture(other, model, {1: before[1]})
     assert not (other / SOLVED_FILE).exists()
+
+
+def changed(name, **values):
+    """Damage that sets fields of a JSON or npz file; None removes one."""
+
+    def damage(out):
+        read, write = (read_json, write_json) if name.endswith(".json") else (read_npz, write_npz)
+        fields = {**read(out / name), **values}
+        write(out / name, {key: value for key, value in fields.items() if value is not None})
+
+    return damage
+
+
+def replaced(name, content):
+    return lambda out: (out / name).write_bytes(content)
+
+
+def unconfident(out):
+    """No landmark that counts in any file of a camera."""
+    for path in (out / LANDMARKS_FOLDER).glob("cam*.npz"):
+        arrays = read_npz(path)
+        write_npz(path, {**arrays, "confidence": np.zeros_like(arrays["confidence"])})
+
+
+SIZE = TAKE.shape[1]
+INTERPOLATED = r"interpolated: expected timesteps"
+PARAMETERS = rf"parameters: expected \(5, {SIZE}\) finite numbers"
+DAMAGES = {
+    "report missing": (lambda out: (out / REPORT_FILE).unlink(), REPORT_FILE, "cannot be read"),
+    "report cut": (replaced(REPORT_FILE, b'{"interpolated": ['), REPORT_FILE, "is not valid JSON"),
+    "report of another kind": (replaced(REPORT_FILE, b"[1]"), REPORT_FILE, INTERPOLATED),
+    "report of null": (replaced(REPORT_FILE, b"null"), REPORT_FILE, INTERPOLATED),
+    "no interpolated": (changed(REPORT_FILE, interpolated=None), REPORT_FILE, INTERPOLATED),
+    "interpolated number": (changed(REPORT_FILE, interpolated=3), REPORT_FILE, INTERPOLATED),
+    "interpolated lists": (changed(REPORT_FILE, interpolated=[[1]]), REPORT_FILE, INTERPOLATED),
+    "interpolated texts": (changed(REPORT_FILE, interpolated=["2"]), REPORT_FILE, INTERPOLATED),
+    "interpolated not a number": (changed(REPORT_FILE, interpolated=[float("nan")]), REPORT_FILE, INTERPOLATED),
+    "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
+    "solved folder": (lambda out: (out / SOLVED_FILE).mkdir(), SOLVED_FILE, "is not a regular file"),
+    **{
+        f"solved {name}": (lambda out, arrays=arrays: write_npz(out / SOLVED_FILE, arrays), SOLVED_FILE, message)
+        for name, arrays, message in (
+            ("without parameters", {"timesteps": np.arange(5)}, PARAMETERS),
+            ("of fewer timesteps", {"timesteps": np.arange(5), "parameters": TAKE[:4]}, PARAMETERS),
+            ("flat", {"timesteps": np.arange(5), "parameters": TAKE[:5].ravel()}, PARAMETERS),
+            ("as text", {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(str)}, PARAMETERS),
+            ("as complex", {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(complex)}, PARAMETERS),
+            ("not a number", {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.nan)}, PARAMETERS),
+            ("infinite", {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.inf, "f4")}, PARAMETERS),
+            ("astronomic", {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), 1e300)}, PARAMETERS),
+            ("without timesteps", {"parameters": TAKE[:5]}, "timesteps: expected those of the capture"),
+            ("of others", {"timesteps": np.arange(5) + 7, "parameters": TAKE[:5]}, "timesteps: expected those"),
+            ("of names", {"timesteps": np.array(list("01234")), "parameters": TAKE[:5]}, "timesteps: expected those"),
+        )
+    },
+    "no landmark counts": (unconfident, LANDMARKS_FOLDER, "has no landmarks of a face"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
+    """Catches a traceback, a warning of NumPy's, or heads that are overwritten from damaged files."""
+    out, model, before = tracked
+    damage, file, message = DAMAGES[name]
+    shutil.copytree(out, tmp_path / "out")
+    (tmp_path / "out" / SOLVED_FILE).unlink(missing_ok=True)
+    write_request(tmp_path / "job", SolveAgain(tmp_path / "out", model, {1: before[1]}))
+    damage(tmp_path / "out")
+    assert main(["perform", str(tmp_path / "job")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(tmp_path / "out" / file) in line
+    assert re.search(message, line)
+    np.testing.assert_array_equal(parameters_in(tmp_path / "out", model), before)
+
+
+@pytest.mark.parametrize("key", [np.zeros(3), np.full(SIZE, np.nan), np.full(SIZE, 1e300), np.full(SIZE, "x")])
+def test_a_key_that_is_none_is_named(tracked, tmp_path, capsys, key):
+    """Catches heads that are written from a request whose arrays are damaged."""
+    out, model, before = tracked
+    write_request(tmp_path / "job", SolveAgain(out, model, {1: key}))
+    assert main(["perform", str(tmp_path / "job")]) == 2
+    assert re.search(rf"key at timestep 1: expected \({SIZE},\) finite numbers", capsys.readouterr().err)
+    np.testing.assert_array_equal(parameters_in(out, model), before)

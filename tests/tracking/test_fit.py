@@ -180,6 +180,21 @@ def test_one_camera_follows_a_head(head):
         assert np.median(error) < 2  # of a face of 300 pixels
 
 
+def test_one_camera_keeps_the_size_of_the_head(head):
+    """Catches a world that is scaled up without end: the smaller the head, the nearer it passes to rays that no head
+    meets all of, as those of a real person's landmarks."""
+    places, rig = places_on(head, 100), cameras(1)
+    wrong = places.on(head.model.v_template, head.model.faces) * [1.25, 0.8, 1.0]  # a face that the model has not
+    take = {t: seen(rig, wrong, noise=4.0, seed=t) for t in range(8)}
+    fit = fit_head(head, places, np.ones(100, bool), take)
+    assert fit.to_capture.scale == pytest.approx(1, abs=0.1)
+    for timestep in take:
+        mesh = posed_mesh(fit, fit.parameters[timestep])
+        pixels, _ = fit.to_capture.camera(rig[0]).project(places.on(mesh, head.model.faces))
+        error = np.linalg.norm(pixels - take[timestep].points[0], axis=1)
+        assert np.median(error) < 12  # of a face of 300 pixels
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_landmarks_of_no_weight_stay_unknown(head, count):
     """Catches 0 / 0 and NaN from landmarks that no camera sees, in a world whose origin is a camera.

@@ -1,5 +1,6 @@
 """Statistics of sampled colors: how much of their variation an effect could explain."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,33 +122,61 @@ def _scatter(color: np.ndarray) -> np.ndarray:
     return np.asarray(away[~np.isnan(away)])
 
 
+Fold = tuple[np.ndarray, np.ndarray]
+"""Views (S,) bool that are held out, and views (S,) bool that the model is fitted to meanwhile."""
+
+
+def scattered_folds(group: np.ndarray) -> list[Fold]:
+    """FOLDS folds of the groups (S,), of which each takes every fourth: for groups without an order, as cameras are."""
+    groups = np.unique(group)
+    number = np.searchsorted(groups, group) % FOLDS
+    return [(number == fold, number != fold) for fold in range(min(FOLDS, len(groups)))]
+
+
+def consecutive_folds(timestep: np.ndarray) -> list[Fold]:
+    """FOLDS folds of consecutive timesteps (S,); a model is not fitted to the timesteps directly beside them either.
+
+    What changes slowly is alike in neighboring timesteps, so that they say nothing of unseen ones. A fold that leaves
+    nothing to fit is left out.
+    """
+    timesteps = np.unique(timestep)
+    order = np.searchsorted(timesteps, timestep)
+    count = min(FOLDS, len(timesteps))
+    folds = []
+    for fold in range(count):
+        held = order * count // len(timesteps) == fold
+        fitted = (order < order[held].min() - 1) | (order > order[held].max() + 1)
+        if fitted.any():
+            folds.append((held, fitted))
+    return folds
+
+
 def linear_evidence(
     color: np.ndarray,
     features: np.ndarray,
-    group: np.ndarray,
+    folds: Sequence[Fold],
     max_error: float = np.inf,
     rest: np.ndarray | None = None,
 ) -> Evidence:
-    """Whether each triangle's color follows its features linearly, by cross-validation over groups of views.
+    """Whether each triangle's color follows its features linearly, by cross-validation.
 
-    color (S, K, 3), NaN where not seen; features (S, K, D); group (S,): views that are held out together; errors of
-    more than `max_error` times the median are clipped to that; rest (K, D): features of views that are held out are
-    clipped to the range, with its margin, of those that the model was fitted to, as an avatar's strain is.
+    color (S, K, 3), NaN where not seen; features (S, K, D); folds: views that are held out, and those that the model
+    is fitted to meanwhile; errors of more than `max_error` times the median are clipped to that; rest (K, D): features
+    of views that are held out are clipped to the range, with its margin, of those that the model was fitted to, as an
+    avatar's strain is.
     """
     before, after = [], []
-    fold = np.searchsorted(np.unique(group), group) % min(FOLDS, len(np.unique(group)))
-    for number in np.unique(fold):
-        held = fold == number
-        mean, center, slope = _ridge(color[~held], features[~held])
+    for held, fitted in folds:
+        mean, center, slope = _ridge(color[fitted], features[fitted])
         error, given = color[held] - mean, features[held]
         if rest is not None:
-            lowest, highest = range_with_margin(rest, features[~held]).swapaxes(0, 1)
+            lowest, highest = range_with_margin(rest, features[fitted]).swapaxes(0, 1)
             given = np.clip(given, lowest, highest)
         predicted = np.einsum("skd,kdc->skc", given - center, slope)
         known = ~np.isnan(error)
         before.append(error[known])
         after.append((error - predicted)[known])
-    errors = np.abs(np.concatenate(before)), np.abs(np.concatenate(after))
+    errors = np.abs(np.concatenate([[], *before])), np.abs(np.concatenate([[], *after]))
     limit = max_error * float(np.median(errors[0])) if np.isfinite(max_error) and errors[0].size else np.inf
     return compare(np.minimum(errors[0], limit), np.minimum(errors[1], limit))
 

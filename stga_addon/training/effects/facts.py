@@ -1,5 +1,6 @@
 """Measurements of a capture that the rules of effects ask for, each made once and only if asked."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, cached_property
 
@@ -12,7 +13,17 @@ from ...flame.sequence import joint_angles
 from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, lip_pairs
 from ...selection import select_capture
 from ..settings import TrainingSettings
-from .evidence import CameraColors, Evidence, camera_evidence, fit_cameras, linear_evidence, stable_colors
+from .evidence import (
+    CameraColors,
+    Evidence,
+    Fold,
+    camera_evidence,
+    consecutive_folds,
+    fit_cameras,
+    linear_evidence,
+    scattered_folds,
+    stable_colors,
+)
 from .samples import Samples, take_samples
 
 MAX_TIMESTEPS = 64
@@ -64,37 +75,37 @@ class CaptureFacts:
     @cached_property
     def view_dependence(self) -> Evidence:
         """Errors are clipped, so that motion that the mesh does not follow counts little."""
-        each = np.arange(len(self.samples.camera))
-        return linear_evidence(self.matched_colors, self.samples.direction, each, MAX_VIEW_ERROR_RATIO)
+        folds = scattered_folds(np.arange(len(self.samples.camera)))
+        return linear_evidence(self.matched_colors, self.samples.direction, folds, MAX_VIEW_ERROR_RATIO)
 
     @cached_property
     def strain_dependence(self) -> Evidence:
         """In timesteps that are left out, as in unseen expressions."""
-        return self._strain_evidence(self.samples.timestep)
+        return self._strain_evidence(consecutive_folds(self.samples.timestep))
 
     @cached_property
     def strain_dependence_known(self) -> Evidence | None:
         """In cameras that are left out, as in other views of known expressions; None with a single one."""
-        return self._strain_evidence(self.samples.camera) if self.cameras > 1 else None
+        return self._strain_evidence(scattered_folds(self.samples.camera)) if self.cameras > 1 else None
 
     @cached_property
     def smoothed_strain_dependence(self) -> Evidence:
         """As `strain_dependence`, on the strain around a triangle: what moves over it changes its color as well."""
-        return self._smoothed_strain_evidence(self.samples.timestep)
+        return self._smoothed_strain_evidence(consecutive_folds(self.samples.timestep))
 
     @cached_property
     def smoothed_strain_dependence_known(self) -> Evidence | None:
         """As `strain_dependence_known`, on the strain around a triangle."""
-        return self._smoothed_strain_evidence(self.samples.camera) if self.cameras > 1 else None
+        return self._smoothed_strain_evidence(scattered_folds(self.samples.camera)) if self.cameras > 1 else None
 
-    def _strain_evidence(self, group: np.ndarray) -> Evidence:
+    def _strain_evidence(self, folds: Sequence[Fold]) -> Evidence:
         """Within the range of strain that a training on the views that are not left out would write."""
         rest = rest_strain(color_range(len(self.samples.faces)))
-        return linear_evidence(self.matched_colors, self.samples.strain, group, rest=rest)
+        return linear_evidence(self.matched_colors, self.samples.strain, folds, rest=rest)
 
-    def _smoothed_strain_evidence(self, group: np.ndarray) -> Evidence:
+    def _smoothed_strain_evidence(self, folds: Sequence[Fold]) -> Evidence:
         smoothed = self.samples.smoothed_strain
-        return linear_evidence(self.matched_colors, smoothed, group, rest=np.zeros_like(smoothed[0]))
+        return linear_evidence(self.matched_colors, smoothed, folds, rest=np.zeros_like(smoothed[0]))
 
     @cached_property
     def pixel_range(self) -> float:

@@ -19,6 +19,8 @@ MIN_CAMERA_DIFFERENCE_LEVELS = 1.5
 """Gain in levels of 255 from which differences between cameras are corrected."""
 MIN_STRAIN_DEPENDENCE_LEVELS = 1.0
 """Gain in levels of 255, in frames and in cameras that are left out, from which splats follow deformation."""
+MIN_TIMESTEPS_FOR_STRAIN = 4
+"""With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
 MIN_STRETCH = 1e-6
 """Share of a triangle's size; less is rounding."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
@@ -158,7 +160,7 @@ def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
     """The verdict where nothing can be learned from how the mesh deforms."""
     if facts.strain < MIN_STRETCH:
         return Verdict(False, "the mesh has the same shape in every training frame", only=True)
-    if facts.timesteps < 3:
+    if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
         return Verdict(False, f"{facts.timesteps} frames are too few to tell how {follows} deformation")
     return None
 

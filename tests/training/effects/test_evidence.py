@@ -1,12 +1,14 @@
 """Cross-validated evidence against colors whose dependence is known."""
 
 import numpy as np
+import pytest
 
-from stga_addon.training.effects.evidence import linear_evidence
+from stga_addon.training.effects.evidence import consecutive_folds, linear_evidence, scattered_folds
 
 VIEWS, TRIANGLES = 48, 60
 GROUP = np.arange(VIEWS) // 6
 """Eight timesteps of six cameras each."""
+FOLDS = consecutive_folds(GROUP)
 
 
 def test_a_linear_dependence_is_found_and_noise_is_not() -> None:
@@ -15,9 +17,9 @@ def test_a_linear_dependence_is_found_and_noise_is_not() -> None:
     features = rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     noise = rng.normal(100, 2, (VIEWS, TRIANGLES, 3))
     slope = rng.normal(0, 5, (TRIANGLES, 3, 3))
-    follows = linear_evidence(noise + np.einsum("skd,kdc->skc", features, slope), features, GROUP)
+    follows = linear_evidence(noise + np.einsum("skd,kdc->skc", features, slope), features, FOLDS)
     assert 7.5 < follows.gain < 10  # 5 · √3 is 8.7
-    assert linear_evidence(noise, features, GROUP).gain < 0.5
+    assert linear_evidence(noise, features, FOLDS).gain < 0.5
 
 
 def test_features_beyond_the_fitted_range_are_clipped() -> None:
@@ -28,10 +30,10 @@ def test_features_beyond_the_fitted_range_are_clipped() -> None:
     features = np.zeros((VIEWS, TRIANGLES, 3))
     features[..., 0] = strength[GROUP][:, None]
     color = 100 + 20 * np.clip(features[..., :1], -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
-    assert linear_evidence(color, features, GROUP).gain == 0
+    assert linear_evidence(color, features, FOLDS).gain == 0
     rest = np.zeros((TRIANGLES, 3))
-    assert linear_evidence(color, features, GROUP, rest=rest).gain > 5
-    inside = features[GROUP != 7], GROUP[GROUP != 7]
+    assert linear_evidence(color, features, FOLDS, rest=rest).gain > 5
+    inside = features[GROUP != 7], consecutive_folds(GROUP[GROUP != 7])
     free, limited = (linear_evidence(color[GROUP != 7], *inside, rest=given) for given in (None, rest))
     assert abs(free.gain - limited.gain) < 0.5
 
@@ -41,6 +43,56 @@ def test_the_range_is_counted_from_rest() -> None:
     rng = np.random.default_rng(2)
     rest, features = np.zeros((TRIANGLES, 3)), rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     color = 100 + 20 * np.clip(features, -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
-    plain, shifted = (linear_evidence(color, features + by, GROUP, rest=rest + by) for by in (0.0, -0.2))
+    plain, shifted = (linear_evidence(color, features + by, FOLDS, rest=rest + by) for by in (0.0, -0.2))
     assert plain.gain > 5
     np.testing.assert_allclose(shifted.gain, plain.gain, rtol=1e-9)
+
+
+def slowly(rng, timesteps, *shape):
+    """(timesteps, *shape) noise of standard deviation 1 that is like itself for three timesteps or so."""
+    weights = np.hanning(8)[1:-1]
+    noise = rng.normal(size=(timesteps + len(weights) - 1, *shape))
+    windows = np.lib.stride_tricks.sliding_window_view(noise, len(weights), 0)
+    return windows @ weights / np.linalg.norm(weights)
+
+
+@pytest.mark.parametrize("timesteps", [8, 12])
+def test_what_only_neighboring_timesteps_know(timesteps):
+    """Catches timesteps that are predicted from their neighbors: colors and features that change slowly, each by
+    itself, say nothing of an unseen expression. Folds that take every fourth timestep find two levels and more."""
+    timestep = np.repeat(np.arange(timesteps), 6)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        features = slowly(rng, timesteps, TRIANGLES, 3)[timestep]
+        noise = rng.normal(100, 1, (len(timestep), TRIANGLES, 3))
+        color = noise + 6 * slowly(rng, timesteps, TRIANGLES, 3)[timestep]
+        assert linear_evidence(color, features, consecutive_folds(timestep)).gain < 0.5
+        assert linear_evidence(color, features, scattered_folds(timestep)).gain > 2
+
+
+def test_slow_expressions_that_colors_follow():
+    """Catches evidence that is lost with the timesteps that are not fitted to."""
+    timestep, rng = np.repeat(np.arange(12), 4), np.random.default_rng(0)
+    features = slowly(rng, 12, TRIANGLES, 3)[timestep]
+    slope = rng.normal(0, 8, (TRIANGLES, 3, 3))
+    color = rng.normal(100, 1.5, (48, TRIANGLES, 3)) + np.einsum("skd,kdc->skc", features, slope)
+    assert linear_evidence(color, features, consecutive_folds(timestep)).gain > 6
+
+
+@pytest.mark.parametrize(("timesteps", "folds"), [(1, 0), (2, 0), (3, 2), (5, 4), (12, 4)])
+def test_each_timestep_is_held_out_once(timesteps, folds):
+    """Catches timesteps beside the fold that the model is fitted to, and folds without anything to fit."""
+    timestep = np.repeat(7 * np.arange(timesteps), 2)
+    found = consecutive_folds(timestep)
+    assert len(found) == folds
+    assert all(fitted.any() and not (held & fitted).any() for held, fitted in found)
+    if timesteps > 3:
+        np.testing.assert_array_equal(sum(held.astype(int) for held, _ in found), 1)
+    for held, fitted in found:
+        distance = np.abs(timestep[held][:, None] - timestep[fitted])
+        assert distance.min() == 14
+
+
+def test_nothing_to_fit_is_no_evidence():
+    """Catches an average of nothing where two timesteps leave no fold."""
+    assert linear_evidence(np.ones((4, 5, 3)), np.ones((4, 5, 3)), []).gain == 0

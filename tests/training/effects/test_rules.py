@@ -55,6 +55,14 @@ def test_color_that_follows_strain(painted):
     assert unseen_cameras > 4
 
 
+@pytest.mark.parametrize("rule", [rules.strain_color, rules.strain_position])
+def test_few_frames_tell_nothing_of_unseen_ones(rule):
+    """Catches a figure of 0 levels given as the reason, where no timestep could be left out with its neighbors."""
+    verdict = rule(SimpleNamespace(strain=0.1, timesteps=3))
+    assert (verdict.on, verdict.only) == (False, False)
+    assert verdict.reason.startswith("3 frames are too few to tell how")
+
+
 def test_what_moves_over_triangles_with_strain(painted):
     """Catches positions that follow the mesh alone where its surface slides, and that choice where it is refused."""
     plan, settings = planned(painted(paint=sliding))
