@@ -269,7 +269,7 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         assert lock_owner(target / "run.lock") == os.getpid()
 
 
-@pytest.mark.parametrize("content", ["", "hello", "0", "1", str(os.getpid())])
+@pytest.mark.parametrize("content", ["", "hello", "0", "1", pytest.param(str(os.getpid()), id="own process")])
 def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path, content: str) -> None:
     """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number lives on in
     another process (1 always does)."""
