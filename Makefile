@@ -1,7 +1,8 @@
 # Everything runs in .venv, which the first target that needs it makes from pyproject.toml.
 PYTHON ?= python3.11
 BIN := .venv/bin
-# As many processes as cores, of up to 2 GB each. `worksteal` gives each a run of neighboring tests, so that few fixtures are made twice.
+# As many processes as cores, each of up to 2 GB. `worksteal` gives each of them neighboring tests, so that few fixtures
+# are made twice.
 PARALLEL := -n auto --maxprocesses 8 --dist worksteal
 
 .PHONY: demo demo-footage test test-fast test-gui lint lint-web fuzz extension clean
