@@ -1,6 +1,9 @@
 # Everything runs in .venv, which the first target that needs it makes from pyproject.toml.
 PYTHON ?= python3.11
 BIN := .venv/bin
+# As many processes as cores, each of up to 2 GB. `worksteal` gives each of them neighboring tests, so that few fixtures
+# are made twice.
+PARALLEL := -n auto --maxprocesses 8 --dist worksteal
 
 .PHONY: demo demo-footage test test-fast test-gui lint lint-web fuzz extension clean
 
@@ -12,10 +15,10 @@ demo-footage: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo --footage
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 test-fast: .venv/ready
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 # STGA_BLENDER: the command that starts a Blender with a window (docs/blender.md)
 test-gui: .venv/ready

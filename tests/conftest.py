@@ -3,16 +3,30 @@
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
+
+# Before OpenMP is loaded: its threads wait in a loop, and in tests, which run one per core, they would take the time of
+# another test. Kernels have threads of their own (`raster/cpu/threads.py`), which sleep.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from capture import factory
+from filelock import FileLock
 
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 
 # A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]:
+    """Name -> a lock that one at a time of the processes which run the tests holds, for what they have in common."""
+    folder = tmp_path_factory.getbasetemp()
+    common = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    return lambda name: FileLock(common / f"{name}.lock")
 
 
 @pytest.fixture(scope="session")

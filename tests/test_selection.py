@@ -7,7 +7,8 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.selection import SelectionOptions, select_capture, select_faces
+from stga_addon.flame.masks import KEY_MASKS
+from stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture, select_faces
 
 THRESHOLD = 0.01
 COUNT = 8
@@ -129,6 +130,13 @@ def test_threshold_is_a_distance(threshold: object) -> None:
     """Catches a threshold that selects nothing, or everything, without saying so."""
     with pytest.raises(StgaError, match="selection threshold must be a distance"):
         SelectionOptions(threshold=threshold)  # type: ignore[arg-type]
+
+
+def test_defaults_select_flames_regions_and_any_motion() -> None:
+    """Catches a key region under another name than captures give it, which is then never selected as a whole, and a
+    threshold of zero that is refused."""
+    assert set(KEY_REGIONS) == set(KEY_MASKS)
+    assert SelectionOptions(threshold=0.0).threshold == 0
 
 
 def test_zero_pose_is_known() -> None:

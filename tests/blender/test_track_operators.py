@@ -52,10 +52,26 @@ def mesh_at(frame):
 
 @pytest.fixture
 def tracked(extension, take, tmp_path, monkeypatch):
-    """A scene with the tracked head."""
+    """A scene with the tracked head, by a worker."""
     monkeypatch.setenv("STGA_PYTHON", sys.executable)
     assert track(take, tmp_path / "capture") == {"FINISHED"}
     return tmp_path / "capture"
+
+
+def look_through(cameras):
+    """Catches a view without the image that it is compared with, or of another size."""
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
+        bpy.context.scene.camera = cameras[4]
+        assert bpy.ops.stga.view_footage(step=1) == {"FINISHED"}
+        assert bpy.context.scene.camera == cameras[0]
+        space = area.spaces.active
+        assert (space.region_3d.view_perspective, space.shading.show_xray) == ("CAMERA", True)
+        assert cameras[0].data.show_background_images
+        assert cameras[0].visible_get()  # else Blender draws no background
+        assert bpy.ops.stga.view_footage() == {"FINISHED"}
+        assert (space.region_3d.view_perspective, space.shading.show_xray) == ("PERSP", False)
 
 
 def test_the_whole_way_of_the_panel(tracked, extension):
@@ -67,6 +83,7 @@ def test_the_whole_way_of_the_panel(tracked, extension):
     assert settings.tracking_shown
     cameras = extension.operators.track_correct.capture_cameras(head)
     assert [len(camera.data.background_images) for camera in cameras] == [5] * 5
+    look_through(cameras)
     before = {frame: mesh_at(frame) for frame in range(5)}
 
     scene.frame_set(1)
@@ -97,25 +114,6 @@ def test_the_whole_way_of_the_panel(tracked, extension):
     assert bpy.ops.stga.dismiss(request="tracking") == {"FINISHED"}
     assert not (tracked / "job").exists()
     assert settings.tracking_capture == ""
-
-
-def test_looking_through_the_cameras(tracked, extension):
-    """Catches a view without the image that it is compared with, or of another size."""
-    window = bpy.context.window_manager.windows[0]
-    area = next((area for area in window.screen.areas if area.type == "VIEW_3D"), None)
-    if area is None:
-        pytest.skip("no 3D viewport in this Blender's empty file")
-    cameras = extension.operators.track_correct.capture_cameras(bpy.context.scene.stga.head)
-    with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
-        bpy.context.scene.camera = cameras[4]
-        assert bpy.ops.stga.view_footage(step=1) == {"FINISHED"}
-        assert bpy.context.scene.camera == cameras[0]
-        space = area.spaces.active
-        assert (space.region_3d.view_perspective, space.shading.show_xray) == ("CAMERA", True)
-        assert cameras[0].data.show_background_images
-        assert cameras[0].visible_get()  # else Blender draws no background
-        assert bpy.ops.stga.view_footage() == {"FINISHED"}
-        assert (space.region_3d.view_perspective, space.shading.show_xray) == ("PERSP", False)
 
 
 def test_the_active_objects_shape_keys_as_head_model(extension, take, tmp_path):

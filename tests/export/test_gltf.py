@@ -58,6 +58,7 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
     document, attributes = parsed(path)
     assert document["asset"]["version"] == "2.0"
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert document["scenes"][document["scene"]] == {"nodes": [0]}  # viewers show nothing where no scene is named
     primitive = document["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0
     extension = primitive["extensions"]["KHR_gaussian_splatting"]

@@ -13,6 +13,18 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply, write_ply
 
+NAMES = {
+    "i1": ("char", "int8"),
+    "u1": ("uchar", "uint8"),
+    "i2": ("short", "int16"),
+    "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"),
+    "u4": ("uint", "uint32"),
+    "f4": ("float", "float32"),
+    "f8": ("double", "float64"),
+}
+CODES = {name: code for code, names in NAMES.items() for name in names}
+"""Scalar types of PLY by both of their names: Turk's description of the format, and those of newer writers."""
 ARRAYS = ("xyz", "rotation", "log_scale", "opacity", "sh")
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -26,13 +38,12 @@ def by_hand(kind: str, properties: dict[str, str], rows: list[dict[str, float]],
     """A PLY file put together without the code under test; `before` is header text of an earlier element."""
     lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë"] + ([before] if before else [])
     lines += [f"element vertex {len(rows)}", *(f"property {t} {name}" for name, t in properties.items()), "end_header"]
-    codes = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
     if kind == "ascii":
         body = "".join(" ".join(repr(float(row[name])) for name in properties) + "\n" for row in rows).encode()
     else:
         order = "<" if "little" in kind else ">"
         body = b"".join(
-            np.array(row[name], order + codes[t]).tobytes() for row in rows for name, t in properties.items()
+            np.array(row[name], order + CODES[t]).tobytes() for row in rows for name, t in properties.items()
         )
     return "\n".join([*lines, ""]).encode() + body
 
@@ -130,6 +141,16 @@ def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
                 row[f"f_rest_{channel * per_channel + k}"] for k in range(per_channel)
             ]
             assert splats.sh[i, :, channel].tolist() == expected
+
+
+@pytest.mark.parametrize("type_", CODES)
+def test_numbers_of_every_type(tmp_path, type_):
+    """Catches a type by one of its names that is unknown, or taken for another: what follows it is then shifted."""
+    names = layout(0)
+    kinds = {"more": type_, **dict.fromkeys(names, "float"), "x": type_}
+    content = by_hand("binary_big_endian", kinds, [row | {"more": 1} for row in numbered_rows(names)])
+    (tmp_path / "a.ply").write_bytes(content)
+    assert read_ply(tmp_path / "a.ply").xyz.tolist() == [[0, 1, 2], [100, 101, 102]]
 
 
 def test_elements_before_and_after_the_vertices_are_skipped(tmp_path):

@@ -1,6 +1,7 @@
 """`stga track` from footage to a capture that opens, with landmark files and with the real detector."""
 
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -81,10 +82,18 @@ def record(folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), 
     return meshes
 
 
-@pytest.fixture
-def recorded(tmp_path, head):
+@pytest.fixture(scope="module")
+def take(tmp_path_factory, head):
     """The folder of a take with blank images, and its meshes."""
-    return tmp_path, record(tmp_path, head)
+    folder = tmp_path_factory.mktemp("take")
+    return folder, record(folder, head)
+
+
+@pytest.fixture
+def recorded(tmp_path, take):
+    """A copy of the take that a test may change, and its meshes."""
+    folder, meshes = take
+    return shutil.copytree(folder, tmp_path, dirs_exist_ok=True), meshes
 
 
 def command(folder, *more):

@@ -139,50 +139,95 @@ def test_truncated_checkpoints(tmp_path: Path, kept: float) -> None:
         checkpoint_files.read_checkpoint(tmp_path)
 
 
-def changed(arrays: dict[str, np.ndarray], name: str, value: np.ndarray | None) -> dict[str, np.ndarray]:
-    return {k: v for k, v in {**arrays, name: value}.items() if v is not None}
-
-
 def meta(**changes: Any) -> np.ndarray:
     values = {
-        "version": 2,
+        "version": checkpoint_files.VERSION,
         **{k: v for k, v in vars(make_checkpoint()).items() if k not in ("state", "tracking")},
         **changes,
     }
     return np.frombuffer(json.dumps(values).encode(), np.uint8)
 
 
-DAMAGES: dict[str, tuple[str, np.ndarray | None]] = {
-    "no moments": ("second/sh", None),
-    "no rows": ("steps", None),
-    "no meta": ("meta", None),
-    "shorter array": ("first/xyz", np.zeros((11, 3), np.float32)),
-    "scalar": ("opacity", np.zeros((), np.float32)),
-    "meta is no JSON": ("meta", np.frombuffer(b"hello", np.uint8)),
-    "another version": ("meta", meta(version=1)),
-    "unknown count": ("meta", meta(color=3)),
-    "negative iteration": ("meta", meta(iteration=-1)),
-    "endless time": ("meta", meta(elapsed_s=math.inf)),
-    "quality that is no number": ("meta", meta(best_difference=math.nan)),
-    "negative timestep": ("meta", meta(last_timestep=-1)),
-    "losses that are no list": ("meta", meta(losses=5)),
-    "identity that is no text": ("meta", meta(identity=None)),
-    "wrong width": ("parameters/rotation", np.zeros((12, 3), np.float32)),
-    "wrong kind": ("parameters/xyz", np.zeros((12, 3), np.float64)),
-    "moment of another shape": ("first/sh", np.zeros((12, 1, 3), np.float32)),
+def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    """The moments of positions that follow strain, of FACES triangles, and what is changed of them."""
+    rows = np.zeros((FACES, 3, 3), np.float32)
+    arrays = {
+        "value": rows,
+        "average": rows,
+        "first": rows,
+        "second": rows,
+        "steps": np.zeros(FACES, np.int32),
+        **changes,
+    }
+    return {f"strain_position/{name}": array for name, array in arrays.items()}
+
+
+NOT_FINITE = np.full((12, 3), np.nan, np.float32)
+DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
+    "no moments": ({"second/sh": None}, "a field is missing"),
+    "no rows": ({"steps": None}, "a field is missing"),
+    "no meta": ({"meta": None}, "a field is missing"),
+    "shorter array": ({"first/xyz": np.zeros((11, 3), np.float32)}, r"/xyz is .* \(11, 3\), expected .* \(12, 3\)"),
+    "scalar": ({"opacity": np.zeros((), np.float32)}, "an array has no rows"),
+    "meta is no JSON": ({"meta": np.frombuffer(b"hello", np.uint8)}, "malformed"),
+    "meta is a list": ({"meta": np.frombuffer(b"[]", np.uint8)}, "meta is no object"),
+    "another version": ({"meta": meta(version=1)}, "was written by another version"),
+    "unknown count": ({"meta": meta(color=3)}, "malformed .*color"),
+    "negative iteration": ({"meta": meta(iteration=-1)}, "iteration is -1, expected a whole number from 0 up"),
+    "half an iteration": ({"meta": meta(iteration=1.5)}, "iteration is 1.5"),
+    "an iteration that is true": ({"meta": meta(iteration=True)}, "iteration is True"),
+    "iteration beyond what is exact": ({"meta": meta(iteration=1 << 53)}, "iteration is 9007199254740992"),
+    "visit before the first": ({"meta": meta(visit=-2)}, "visit is -2, expected a whole number from -1 up"),
+    "negative splats": ({"meta": meta(initial_count=-1)}, "initial_count is -1"),
+    "negative evaluations": ({"meta": meta(evaluations=-1)}, "evaluations is -1"),
+    "endless time": ({"meta": meta(elapsed_s=math.inf)}, "elapsed_s is inf"),
+    "time before the start": ({"meta": meta(elapsed_s=-1.0)}, "elapsed_s is -1.0"),
+    "time that is a text": ({"meta": meta(elapsed_s="1")}, "elapsed_s is '1'"),
+    "quality that is no number": ({"meta": meta(best_difference=math.nan)}, "best_difference is nan"),
+    "negative timestep": ({"meta": meta(last_timestep=-1)}, "last_timestep is -1"),
+    "timestep beyond what is exact": ({"meta": meta(last_timestep=1 << 53)}, "last_timestep is 9007199254740992"),
+    "losses that are no list": ({"meta": meta(losses=5)}, "losses is no list of numbers"),
+    "a loss that is no number": ({"meta": meta(losses=[0.5, math.nan])}, "losses is no list of numbers"),
+    "identity that is no text": ({"meta": meta(identity=None)}, "identity is no text"),
+    "wrong width": ({"parameters/rotation": np.zeros((12, 3), np.float32)}, "parameters/rotation is .*, expected"),
+    "wrong kind": ({"parameters/xyz": np.zeros((12, 3), np.float64)}, "parameters/xyz is torch.float64"),
+    "not finite": ({"parameters/xyz": NOT_FINITE}, "parameters/xyz holds a value that is not finite"),
+    "moment of another shape": ({"first/sh": np.zeros((12, 1, 3), np.float32)}, r"/sh is .* \(12, 1, 3\), expected"),
+    "coefficients of no degree": ({"parameters/sh": np.zeros((12, 2, 3), np.float32)}, "has 2 coefficients"),
+    "strain of doubles": (strain_position(value=np.zeros((FACES, 3, 3))), "strain_position/value is float64"),
+    "strain of other triangles": (
+        strain_position(first=np.zeros((4, 3, 3), np.float32)),
+        r"strain_position/first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)",
+    ),
+    "steps that are no int32": (strain_position(steps=np.zeros(FACES, np.int64)), "strain_position/steps is int64"),
+    "strain that is not finite": (
+        strain_position(second=np.full((FACES, 3, 3), np.inf, np.float32)),
+        "strain_position/second holds a value that is not finite",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
-    """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check."""
+    """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check, and one that is
+    refused for another reason than what is wrong with it."""
     checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as data:
-        arrays = dict(data)
-    np.savez(path, **changed(arrays, *DAMAGES[name]))
-    with pytest.raises(StgaError, match=r"checkpoint\.npz: "):
+        arrays: dict[str, np.ndarray | None] = dict(data)
+    changes, message = DAMAGES[name]
+    np.savez(path, **{k: v for k, v in {**arrays, **changes}.items() if v is not None})
+    with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{message}"):
         checkpoint_files.read_checkpoint(tmp_path)
+
+
+def test_checkpoint_at_its_limits(tmp_path: Path) -> None:
+    """Catches a run that cannot be resumed because its first or last possible value counts as damaged."""
+    for iteration, visit, timestep in ((0, -1, 0), ((1 << 53) - 1, (1 << 53) - 1, (1 << 53) - 1)):
+        checkpoint = Checkpoint(random_state(3, FACES), iteration, visit, timestep, 0, 0.0, 1.0, 0, [0.0])
+        checkpoint_files.write_checkpoint(tmp_path, checkpoint)
+        again = checkpoint_files.read_checkpoint(tmp_path)
+        assert (again.iteration, again.visit, again.last_timestep) == (iteration, visit, timestep)
 
 
 def test_missing_checkpoint(tmp_path: Path) -> None:
@@ -269,7 +314,7 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         assert lock_owner(target / "run.lock") == os.getpid()
 
 
-@pytest.mark.parametrize("content", ["", "hello", "0", "1", str(os.getpid())])
+@pytest.mark.parametrize("content", ["", "hello", "0", "1", pytest.param(str(os.getpid()), id="own process")])
 def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path, content: str) -> None:
     """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number lives on in
     another process (1 always does)."""

@@ -39,10 +39,12 @@ def gains(decision):
 
 
 def test_plain(painted):
-    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there."""
+    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there; and
+    an effect of FLAME's that is planned for a capture without its parameters."""
     plan, settings = planned(painted())
     assert on(plan) == {"antialiasing", "background", "density"}
     assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
+    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}  # there is no FLAME
 
 
 def test_color_that_follows_strain(painted):
@@ -269,9 +271,7 @@ def test_a_capture_that_was_tracked_here(painted, tmp_path):
 
 
 def test_what_a_mesh_sequence_has_not(painted):
-    """Catches an effect of FLAME's that is planned for, or forced on, a capture without its parameters."""
-    plan, _ = planned(painted())
-    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}
+    """Catches an effect of FLAME's that is forced on a capture without its parameters."""
     with pytest.raises(StgaError, match=r"--effect teeth=on: .* has none"):
         planned(painted(), teeth="on")
     with pytest.raises(StgaError, match=r"--effect jaw=on: .* no parameters of FLAME"):
