@@ -12,13 +12,11 @@ from ..avatar.file import read_avatar
 from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import TURNTABLE_S, covered_angles, to_and_fro, turntable
 from ..capture.model import View
-from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.ply import read_ply
 from ..files import replacing
-from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
 from ..requests.open_head import OpenHead
 from .arguments import (
@@ -31,7 +29,8 @@ from .arguments import (
     usable_path,
     whole_number,
 )
-from .inputs import avatar_path, check_topology, open_avatar
+from .inputs import avatar_path, open_avatar
+from .motion import MOTION_HELP, add_motion_options, check_motion_options, open_avatar_motion
 
 NAME, HELP = "render", "render an avatar as pictures, video or turntable"
 AUTO = -1.0
@@ -70,8 +69,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--motion",
         type=usable_path,
         metavar="FILE",
-        help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
+        help=f"{MOTION_HELP}; at every timestep of it from each camera",
     )
+    add_motion_options(parser)
     add_device(parser)
     parser.add_argument("--background", type=color, default="white", help="white (default), black or R,G,B in 0…1")
     add_principal_point(parser, "what cy means in the file of --cameras (default: as in training; of a PLY vhap)")
@@ -121,7 +121,9 @@ def _check_film_options(options: Namespace) -> None:
 
 def _check_mesh_options(options: Namespace) -> None:
     """Raise StgaError for an option on meshes or cameras that would have no effect."""
-    if options.motion is not None and options.capture is not None:
+    if options.motion is None:
+        check_motion_options(options)
+    elif options.capture is not None:
         raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
     if options.principal_point is not None and options.cameras is None:
         raise StgaError("--principal-point: has no effect without --cameras")
@@ -257,19 +259,14 @@ def _subject(options: Namespace) -> _Subject:
 
 
 def _reenacted(options: Namespace) -> _Subject:
-    """An avatar moved by another person's FLAME motion."""
+    """An avatar moved by another person's motion."""
     from ..render.render import render_avatar
-    from ..training.run.folder import read_run
 
     if _is_ply(options.source):
         raise StgaError(f"{options.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
-    flame = options.flame or (read_run(options.source).flame if options.source.is_dir() else None)
     avatar = read_avatar(avatar_path(options.source))
-    motion = open_capture(options.motion, flame)
-    if motion.flame is None:
-        raise StgaError(f"{options.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
-    check_topology(motion, avatar)
-    sequence = transferred_motion(motion.flame, avatar.neutral)
+    motion = open_avatar_motion(options, options.source, avatar)
+    sequence = motion.sequence
 
     def mesh(timestep: int) -> np.ndarray:
         return sequence_mesh(sequence, timestep)
@@ -278,7 +275,7 @@ def _reenacted(options: Namespace) -> _Subject:
         lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, options.background, options.composer),
         tuple(sequence.timesteps),
         lambda: _middle(mesh(sequence.timesteps[0])),
-        playback_fps(motion, options.fps),
+        options.fps or motion.fps or DEFAULT_FPS,
     )
 
 

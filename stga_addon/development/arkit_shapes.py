@@ -18,7 +18,7 @@ from ..tracking.head_model import linear_model
 
 METERS_PER_UNIT = 0.01
 BOTH_SIDES = ("browInnerUp", "cheekPuff")
-"""Shapes that ICT-FaceKit splits in left and right; cheekRaiser, which it has beside cheekSquint, is none of ARKit's."""
+"""Shapes that ICT-FaceKit splits in left and right. Its cheekRaiser, beside cheekSquint, is none of ARKit's."""
 
 
 def main(source: Path) -> None:
