@@ -88,10 +88,8 @@ def mean_distance(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def combinations(heads: list[Head], poses: int) -> None:
-    print(
-        "## Combinations\n\n"
-        "| identity | motion mm | map mm | free fit mm | map / free fit | max coefficient |\n|---|---|---|---|---|---|"
-    )
+    print("## Combinations\n\n| identity | motion mm | map mm | free fit mm | map / free fit | max coefficient |")
+    print("|---|---|---|---|---|---|")
     for number, head in enumerate(heads):
         weights = random_poses(poses // len(heads), np.random.default_rng(100 + number))
         found = head.map.parameters(weights)
@@ -128,9 +126,11 @@ def leaks(driver: Head, driven: Head) -> None:
         values = [np.concatenate([frame.expr, frame.jaw_pose]) for frame in frames]
         apart = [mean_distance(driven.points(v), driven.true_points(w)) for v, w in zip(values, weights, strict=True)]
         results.append(np.mean(apart[QUIET_FRAMES:]))
+    less = 100 * (1 - results[1] / results[0])
     print("\n## Another person's motion\n")
-    print(f"copied: {results[0]:.3f} mm; relative to the quiet face: {results[1]:.3f} mm, "
-          f"{100 * (1 - results[1] / results[0]):.0f} % less", flush=True)  # fmt: skip
+    print(
+        f"copied: {results[0]:.3f} mm; relative to the quiet face: {results[1]:.3f} mm, {less:.0f} % less", flush=True
+    )
 
 
 def there_and_back(head: Head) -> np.ndarray:
@@ -149,10 +149,8 @@ def main() -> None:
     options = parser.parse_args()
     model = generated_flame(options.data, options.components)
     heads = [Head(model, seed) for seed in range(IDENTITIES)]
-    print(
-        f"{heads[0].map.used.sum()} face points, {model.n_expression} expressions; "
-        f"the map took {heads[0].seconds:.1f} s\n"
-    )
+    used, seconds = heads[0].map.used.sum(), heads[0].seconds
+    print(f"{used} face points, {model.n_expression} expressions; the map took {seconds:.1f} s\n")
     combinations(heads, options.poses)
     leaks(heads[1], heads[2])
     errors = there_and_back(heads[0])

@@ -7,9 +7,10 @@ import bpy
 from . import background, ids, monitor, render_video, track
 from .analyze import AnalyzeCapture, CancelAnalysis
 from .apply_motion import ApplyMotion
+from .arkit_controls import AddArkitControls, RemoveArkitControls
 from .common import register_classes, unregister_classes
 from .continue_run import Extend, Refine
-from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
+from .drop import AvatarDrop, CaptureDrop, OpenNpz, PerformanceDrop, PlyDrop
 from .environment import CancelEnvironment, MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .export_cameras import ExportCameras
@@ -65,11 +66,14 @@ CLASSES = (
     CancelVideo,
     DismissVideo,
     ApplyMotion,
+    AddArkitControls,
+    RemoveArkitControls,
     ImportPly,
     ExportAvatar,
     ExportCameras,
     OpenNpz,
     CaptureDrop,
+    PerformanceDrop,
     AvatarDrop,
     PlyDrop,
 )

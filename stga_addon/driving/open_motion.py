@@ -94,11 +94,7 @@ def open_motion(
         raise StgaError(f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose")
     _check_faces(path, capture.flame.model, faces)
     sequence = transferred_motion(capture.flame, neutral)
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    if options.neutral != "none":
-        theirs = quiet_neutral(frames if options.neutral == "quiet" else frames[:1])
-        frames = exchanged_neutral(frames, theirs, None if trained is None else trained.neutral)
-    frames, beyond = _finished(frames, options, trained)
+    frames, beyond = adapted([sequence.frame(timestep) for timestep in sequence.timesteps], options, trained)
     return Motion(_with_frames(sequence, sequence.timesteps, frames), playback_fps(capture), 0, beyond)
 
 
@@ -115,6 +111,17 @@ def performed(
     frames, beyond = _finished(head_map(person, name).frames(prepared), options, trained)
     timesteps = tuple(range(len(frames)))
     return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
+
+
+def adapted(
+    frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None = None
+) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
+    """Frames of another person's FLAME motion with the options' neutral, strength and range; and part -> (T,) how far
+    they were outside the trained range before they were led back (`transfer.outside`)."""
+    if options.neutral != "none":
+        theirs = quiet_neutral(frames if options.neutral == "quiet" else frames[:1])
+        frames = exchanged_neutral(frames, theirs, None if trained is None else trained.neutral)
+    return _finished(frames, options, trained)
 
 
 def prepared_performance(performance: Performance, options: MotionOptions, fps: float | None = None) -> Performance:
