@@ -7,9 +7,10 @@ import bpy
 from . import ids, monitor
 from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
+from .arkit_controls import AddArkitControls, RemoveArkitControls
 from .common import register_classes, unregister_classes
 from .continue_run import Extend, Refine
-from .drop import AvatarDrop, CaptureDrop, OpenNpz, PlyDrop
+from .drop import AvatarDrop, CaptureDrop, OpenNpz, PerformanceDrop, PlyDrop
 from .environment import MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
 from .export_cameras import ExportCameras
@@ -60,11 +61,14 @@ CLASSES = (
     PreviewImages,
     RenderVideo,
     ApplyMotion,
+    AddArkitControls,
+    RemoveArkitControls,
     ImportPly,
     ExportAvatar,
     ExportCameras,
     OpenNpz,
     CaptureDrop,
+    PerformanceDrop,
     AvatarDrop,
     PlyDrop,
 )

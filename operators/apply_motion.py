@@ -1,16 +1,23 @@
-"""Applies a FLAME motion to the head as keyframes."""
+"""Applies a FLAME motion or a face performance to the head as keyframes."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
+import numpy as np
 
 from ..stga_addon.capture.open import open_capture
+from ..stga_addon.driving.open_motion import MotionOptions, adapted, performed, prepared_performance
+from ..stga_addon.driving.performance import parts_kept
+from ..stga_addon.driving.read_performance import is_performance, read_performance
+from ..stga_addon.driving.transfer import TrainedRange, trained_range
 from ..stga_addon.errors import StgaError
-from ..stga_addon.flame.motion import PARTS, retimed, strengthened
+from ..stga_addon.flame.motion import PARTS, retimed
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
 from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
 from . import ids
 from .common import (
@@ -21,8 +28,9 @@ from .common import (
     flame_of,
     head_of,
     is_head,
-    needs_rig,
+    needs_rig_or_shapes,
     reporting,
+    rig_or_none,
 )
 
 LAST_FRAME = 1_048_574
@@ -31,6 +39,18 @@ LAST_FRAME = 1_048_574
 
 def _part_property(name: str, description: str) -> Any:
     return bpy.props.BoolProperty(name=name, description=description, default=True, options={"SKIP_SAVE"})
+
+
+def _gain_property(name: str, what: str) -> Any:
+    return bpy.props.FloatProperty(
+        name=name,
+        description=f"Of a face performance: factor of {what}",
+        default=1.0,
+        min=0.0,
+        soft_max=2.0,
+        max=10.0,
+        options={"SKIP_SAVE"},
+    )
 
 
 class ApplyMotion(bpy.types.Operator, FileImport):
@@ -42,7 +62,8 @@ class ApplyMotion(bpy.types.Operator, FileImport):
 
     filepath: bpy.props.StringProperty(
         name="File",
-        description="FLAME parameters (.npz), or the folder of a capture tracked with FLAME",
+        description="FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a face performance: CSV "
+        "of Live Link Face or Audio2Face, its take folder, JSON of named weights, iFacialMocap's text",
         subtype="FILE_PATH",
         options=PATH_OPTIONS | {"SKIP_SAVE"},
     )
@@ -73,9 +94,42 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     start: bpy.props.IntProperty(
         name="Start Frame", description="Frame of the first keyframe", default=1, min=0, options={"SKIP_SAVE"}
     )
+    neutral: bpy.props.EnumProperty(
+        name="Neutral",
+        description="What the motion is taken relative to, so that the performer's own face is not applied",
+        items=(
+            ("none", "As Recorded", "Nothing is subtracted"),
+            ("quiet", "Quiet Face", "The median of the frames in which the face rests"),
+            ("first", "First Frame", "The first frame of the file"),
+        ),
+        options={"SKIP_SAVE"},
+    )
+    stay_trained: bpy.props.FloatProperty(
+        name="Stay Trained",
+        description="Lead expression, jaw and eyes softly back to the range of the head's own recording; 1: fully",
+        min=0.0,
+        max=1.0,
+        options={"SKIP_SAVE"},
+    )
+    smoothing: bpy.props.FloatProperty(
+        name="Smoothing",
+        description="Of a face performance: standard deviation in seconds",
+        min=0.0,
+        soft_max=0.2,
+        max=10.0,
+        options={"SKIP_SAVE"},
+    )
+    mirror: bpy.props.BoolProperty(
+        name="Mirror", description="Of a face performance: exchange left and right", options={"SKIP_SAVE"}
+    )
+    face_gain: _gain_property("Face Gain", "the face's shapes")
+    jaw_gain: _gain_property("Jaw Gain", "the jaw's shapes")
+    eyes_gain: _gain_property("Eyes Gain", "the gaze")
+    head_gain: _gain_property("Head Gain", "the head's rotation, which turns the neck")
     fps: bpy.props.FloatProperty(
         name="Recorded At",
-        description="Frames per second of the recording; 0: one timestep for each frame of the scene",
+        description="Frames per second of the recording; 0: one timestep for each frame of the scene. A face "
+        "performance has its own times",
         min=0.0,
         max=1000.0,
         options={"SKIP_SAVE"},
@@ -104,7 +158,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         options={"SKIP_SAVE"},
     )
     filename_ext = ".npz"
-    filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(default="*.npz;*.csv;*.json;*.txt", options={"HIDDEN"})
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:
@@ -114,7 +168,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_rig(cls, context)
+        return needs_rig_or_shapes(cls, context)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         return self.execute(context) if self.source else super().invoke(context, event)
@@ -125,21 +179,77 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         parts = [part for part in PARTS if getattr(self, part)]
         if not parts:
             raise StgaError("Apply Motion: no part is chosen; choose expression, jaw, eyes, neck or head")
-        name, motion = self._motion(context, head)
-        step = self._step(context.scene)
-        frames = retimed(motion, step)
-        end = self.start + len(frames) - 1
-        if end > LAST_FRAME:
-            raise StgaError(f"Apply Motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}")
-        if self.strength != 1.0:
-            frames = strengthened(frames, self.strength)
-        tracked = self._tracked(head, step) if self.own_offsets else None
-        apply_motion(head, frames, self.start, name, parts, self.place == "strip", self._warn, tracked)
+        path = None if self.source else file_path(self.filepath, "motion")
+        if path is not None and is_performance(path):
+            name, count = path.stem, self._apply_performance(context.scene, head, path, parts)
+        else:
+            name, count = self._apply_frames(context, head, parts)
+        end = self.start + count - 1
         if self.fit_range:
             context.scene.frame_end = max(context.scene.frame_end, end)
         context.scene.frame_set(context.scene.frame_current)
         self.report({"INFO"}, f"{name}: frames {self.start} to {end}")
         return {"FINISHED"}
+
+    def _apply_frames(self, context: Any, head: Any, parts: list[str]) -> tuple[str, int]:
+        """Apply a FLAME motion; returns its name and number of frames."""
+        name, motion = self._motion(context, head)
+        step = self._step(context.scene)
+        frames = retimed(motion, step)
+        self._check_end(len(frames))
+        frames, beyond = adapted(frames, self._options(), self._trained(head))
+        self._report_range(beyond)
+        tracked = self._tracked(head, step) if self.own_offsets else None
+        apply_motion(head, frames, self.start, name, parts, self.place == "strip", self._warn, tracked)
+        return name, len(frames)
+
+    def _apply_performance(self, scene: Any, head: Any, path: Path, parts: list[str]) -> int:
+        """Apply a face performance to controls, shape keys of its names, or expressions and bones; returns the number
+        of frames."""
+        performance, options = read_performance(path), self._options()
+        rate = scene.render.fps / scene.render.fps_base / self.speed
+        self._check_end(int(performance.times[-1] * rate) + 1)
+        if performance.lost:
+            self._warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
+        rig = rig_or_none(head)
+        if rig is not None and not has_controls(rig):
+            motion = performed(
+                performance, flame_of(capture_of(head), head.name), head.name, options, self._trained(head), rate
+            )
+            frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
+            self._report_range(motion.outside)
+            apply_motion(head, frames, self.start, path.stem, parts, self.place == "strip", self._warn)
+            return len(frames)
+        kept = tuple(
+            part for part, chosen in (("face", self.expression), ("jaw", self.jaw), ("eyes", self.eyes)) if chosen
+        )
+        prepared = prepared_performance(parts_kept(performance, kept), options, rate)
+        owner, paths = (head.data.shape_keys, checked_shape_keys(head)) if rig is None else (rig, control_paths())
+        weights = np.clip(self.strength * prepared.weights, -1.0, 2.0)
+        apply_weights(owner, paths, weights, self.start, path.stem, self.place == "strip")
+        return len(weights)
+
+    def _options(self) -> MotionOptions:
+        gains = {"face": self.face_gain, "jaw": self.jaw_gain, "eyes": self.eyes_gain, "head": self.head_gain}
+        return MotionOptions(self.strength, self.neutral, self.smoothing, self.mirror, gains, self.stay_trained)
+
+    def _trained(self, head: Any) -> TrainedRange | None:
+        """The range of the head's own recording, where it is asked for."""
+        if not self.stay_trained:
+            return None
+        own = flame_of(capture_of(head), head.name)
+        return trained_range([own.frame(timestep) for timestep in own.timesteps])
+
+    def _check_end(self, count: int) -> None:
+        end = self.start + count - 1
+        if end > LAST_FRAME:
+            raise StgaError(f"Apply Motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}")
+
+    def _report_range(self, beyond: Mapping[str, np.ndarray]) -> None:
+        for part, values in beyond.items():
+            if values.any():
+                share = 100 * float((values > 0).mean())
+                self.report({"INFO"}, f"{part}: {share:.0f} % of the frames were outside the head's own recording")
 
     def _motion(self, context: Any, head: Any) -> tuple[str, FlameSequence]:
         if not self.source:

@@ -14,6 +14,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.rig.arkit import shape_key_names
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from . import ids
 
@@ -97,6 +98,21 @@ def needs_rig(operator: Any, context: Any) -> bool:
         operator.poll_message_set(str(error))
         return False
     return True
+
+
+def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names; says what to do where not."""
+    if not needs_own_head(operator, context):
+        return False
+    return bool(shape_key_names(scene_settings(context).head)) or needs_rig(operator, context)
+
+
+def rig_or_none(head: Any) -> Any:
+    """The head's FLAME rig, or None where it has none."""
+    try:
+        return rig_of(head)
+    except StgaError:
+        return None
 
 
 class FileImport(ImportHelper):

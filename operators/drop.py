@@ -1,4 +1,4 @@
-"""Files dropped into the 3D viewport: a capture, an avatar or FLAME motion, Gaussian splats."""
+"""Files dropped into the 3D viewport: a capture, an avatar or FLAME motion, a face performance, Gaussian splats."""
 
 import zipfile
 from pathlib import Path
@@ -89,3 +89,12 @@ class PlyDrop(_ViewportDrop, bpy.types.FileHandler):
     bl_label = "Gaussian Splats (STGA)"
     bl_import_operator = ids.IMPORT_PLY
     bl_file_extensions = ".ply"
+
+
+class PerformanceDrop(_ViewportDrop, bpy.types.FileHandler):
+    """Blender asks which handler to use for .json files, which captures have too."""
+
+    bl_idname = "STGA_FH_performance"
+    bl_label = "Face Performance (STGA)"
+    bl_import_operator = ids.APPLY_MOTION
+    bl_file_extensions = ".csv;.json;.txt"

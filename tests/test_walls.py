@@ -30,6 +30,7 @@ LAYERS = (
     {"raster"},
     {"render"},
     {"tracking"},
+    {"driving"},
     {"training"},
     {"report"},
     {"requests"},

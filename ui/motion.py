@@ -5,8 +5,10 @@ from typing import Any, ClassVar
 import bpy
 
 from ..operators import ids
-from ..operators.common import is_head, scene_settings
-from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY
+from ..operators.common import is_head, rig_or_none, scene_settings
+from ..stga_addon.driving.names import ARKIT_SHAPES
+from ..stga_addon.scene.rig.arkit import has_controls
+from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY, property_path
 from .sidebar import SidebarPanel
 
 MAX_SLIDERS = 10  # the first components vary most
@@ -23,6 +25,24 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
         row.prop(settings, "motion_source")
         if settings.motion_source is not None:
             row.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK").source = settings.motion_source.name
+
+
+class ArkitPanel(SidebarPanel, bpy.types.Panel):
+    bl_idname = "STGA_PT_arkit"
+    bl_label = "ARKit Controls"
+    bl_parent_id = MotionPanel.bl_idname
+    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Any) -> None:
+        head = scene_settings(context).head
+        rig = rig_or_none(head) if is_head(head) else None
+        if rig is None or not has_controls(rig):
+            self.layout.operator(ids.ADD_ARKIT_CONTROLS, icon="ADD")
+            return
+        column = self.layout.column(align=True)
+        for name in ARKIT_SHAPES:
+            column.prop(rig, property_path(name), text=name, slider=True)
+        self.layout.operator(ids.REMOVE_ARKIT_CONTROLS, icon="X")
 
 
 class _Sliders(SidebarPanel):

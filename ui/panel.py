@@ -17,7 +17,7 @@ from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
 from .continue_panel import ContinuePanel
 from .effects import EffectsPanel
-from .motion import ExpressionPanel, IdentityPanel, MotionPanel
+from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
@@ -124,6 +124,7 @@ CLASSES = (
     EffectsPanel,
     ShowPanel,
     MotionPanel,
+    ArkitPanel,
     ExpressionPanel,
     IdentityPanel,
     RenderPanel,

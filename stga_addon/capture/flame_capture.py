@@ -49,13 +49,13 @@ def open_flame_capture(
     sequence = FlameSequence(
         model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
     )
-    return _flame_capture(root, sequence, model_file, views)
+    return sequence_capture(root, sequence, model_file, views)
 
 
 def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
     """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views. Raises StgaError."""
     model_file = _model_file(path, model_file)
-    return _flame_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
+    return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
 
 
 def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
@@ -63,9 +63,10 @@ def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
     return replace(capture, **_posed(capture.root, sequence))
 
 
-def _flame_capture(
-    root: Path, sequence: FlameSequence, model_file: Path, views: Mapping[str, tuple[View, ...]]
+def sequence_capture(
+    root: Path, sequence: FlameSequence, model_file: Path | None, views: Mapping[str, tuple[View, ...]]
 ) -> Capture:
+    """The capture of layout "flame" whose meshes a sequence makes; `root` and `model_file` say where it is from."""
     model = sequence.model
     regions = key_regions(model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"

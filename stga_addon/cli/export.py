@@ -9,6 +9,7 @@ from ..requests.open_head import OpenHead
 from ..requests.values import Export
 from .arguments import add_avatar, frame_rate, frame_span, usable_path, whole_number
 from .carry_out import carry_out
+from .motion import MOTION_HELP, add_motion_options, check_motion_options, motion_options
 
 NAME, HELP = "export", "write an avatar in another format"
 
@@ -18,6 +19,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--format", choices=tuple(FORMATS), required=True)
     parser.add_argument("--capture", type=usable_path, help="whose frames to bake (default: the run's)")
     parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture")
+    parser.add_argument("--motion", type=usable_path, metavar="FILE", help=MOTION_HELP)
+    add_motion_options(parser)
     parser.add_argument(
         "--timestep", type=whole_number(0), help="of a format that holds one frame (default: the neutral mesh)"
     )
@@ -47,10 +50,10 @@ def run(options: Namespace) -> None:
     if head is not None:
         fps = fps or head.fps
         is_posed = FORMATS[options.format].source != "frame" or options.timestep is not None
-        played = head.played() if is_posed else None
+        played = head.played() if is_posed and options.motion is None else None
     request = Export(
         options.avatar, options.out, options.format, options.capture, options.flame, played, options.timestep,
-        options.frames, fps, options.motion_only,
+        options.frames, fps, options.motion_only, options.motion, motion_options(options),
     )  # fmt: skip
     carry_out(request)
 
@@ -67,13 +70,19 @@ def _check_options(options: Namespace) -> None:
         if getattr(options, option) not in (None, False) and options.format not in formats:
             flag = f"--{option.replace('_', '-')}"
             raise StgaError(f"{flag} cannot be combined with --format {options.format}, only with {', '.join(formats)}")
+    if options.motion is None:
+        check_motion_options(options)
     if options.head is None:
         _check_capture_options(options)
 
 
 def _check_capture_options(options: Namespace) -> None:
     """Refuse a capture that would not be used, and a FLAME model without a capture that it could be of."""
-    if options.capture is not None and FORMATS[options.format].source == "frame" and options.timestep is None:
-        raise StgaError(f"--capture: has no effect with --format {options.format} without --timestep")
-    if options.flame is not None and options.capture is None and not options.avatar.is_dir():
+    if options.motion is not None and options.capture is not None:
+        raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
+    for name in ("capture", "motion"):
+        unused = FORMATS[options.format].source == "frame" and options.timestep is None
+        if getattr(options, name) is not None and unused:
+            raise StgaError(f"--{name}: has no effect with --format {options.format} without --timestep")
+    if options.flame is not None and options.capture is None and options.motion is None and not options.avatar.is_dir():
         raise StgaError("--flame: has no effect without --capture")

@@ -25,6 +25,7 @@ COMMANDS = (
     ".eval",
     ".select",
     ".export",
+    ".drive",
     ".info",
     ".presets",
     ".environment",

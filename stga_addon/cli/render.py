@@ -19,6 +19,7 @@ from .arguments import (
     whole_number,
 )
 from .carry_out import carry_out
+from .motion import MOTION_HELP, add_motion_options, check_motion_options, motion_options
 
 NAME, HELP = "render", "render an avatar as pictures, video or turntable"
 COVERED = 0.0
@@ -60,8 +61,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--motion",
         type=usable_path,
         metavar="FILE",
-        help="another person's FLAME motion (.npz, or a capture), at every timestep of it from each camera",
+        help=f"{MOTION_HELP}; at every timestep of it from each camera",
     )
+    add_motion_options(parser)
     add_device(parser)
     parser.add_argument("--background", type=color, default="white", help="white (default), black or R,G,B in 0…1")
     add_principal_point(parser, "what cy means in the file of --cameras (default: as in training; of a PLY vhap)")
@@ -77,7 +79,10 @@ def run(options: Namespace) -> None:
     seconds = TURNTABLE_S if options.seconds is None else options.seconds
     same = {name: getattr(options, name) for name in SAME_FIELDS}
     output, is_video = options.out or options.video, options.video is not None
-    carry_out(Render(options.source, output, is_video, seconds=seconds, played=played, **same))
+    request = Render(
+        options.source, output, is_video, seconds=seconds, played=played, motion_options=motion_options(options), **same
+    )
+    carry_out(request)
 
 
 def _check_film_options(options: Namespace) -> None:
@@ -95,7 +100,9 @@ def _check_film_options(options: Namespace) -> None:
 
 def _check_mesh_options(options: Namespace) -> None:
     """Raise StgaError for an option on meshes or cameras that would have no effect."""
-    if options.motion is not None and options.capture is not None:
+    if options.motion is None:
+        check_motion_options(options)
+    elif options.capture is not None:
         raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
     if options.principal_point is not None and options.cameras is None:
         raise StgaError("--principal-point: has no effect without --cameras")

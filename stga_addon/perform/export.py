@@ -13,11 +13,14 @@ from ..requests.results import Written
 from ..requests.values import Export
 from .export_web import capture_playback, still_playback
 from .inputs import open_avatar, required_capture, timesteps_between
+from .motion import motion_capture, open_avatar_motion
 
 
 def export(request: Export, report: Report, say: Say) -> Written:
     """Write the file or the folder. Says how much room several frames take; raises StgaError."""
     avatar, capture = open_avatar(request)
+    if request.motion is not None:
+        capture = motion_capture(request, open_avatar_motion(request, avatar, say), capture)
     fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")
     format, playback = FORMATS[request.file_format], None
     flame = None if capture is None else capture.flame

@@ -12,13 +12,11 @@ from ..avatar.file import read_avatar
 from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import covered_angles, to_and_fro, turntable
 from ..capture.model import View
-from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.ply import is_ply, read_ply
 from ..files import replacing
-from ..flame.motion import transferred_motion
 from ..flame.sequence import sequence_mesh
 from ..progress import Report, Say, counted
 from ..render.compose import Composer
@@ -27,8 +25,8 @@ from ..render.render import render_avatar, to_uint8
 from ..render.video import sequence_writer, video_writer
 from ..requests.results import Written
 from ..requests.values import Render
-from ..training.run.folder import read_run
-from .inputs import avatar_path, check_topology, open_avatar
+from .inputs import avatar_path, open_avatar
+from .motion import open_avatar_motion
 
 MAX_TURNTABLE_IMAGES = 100_000
 
@@ -46,7 +44,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
         views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
     composer = Composer(request.device)
     composer.choose()
-    subject = (_subject if request.motion is None else _reenacted)(request, composer)
+    subject = _subject(request, composer) if request.motion is None else _reenacted(request, composer, say)
     if request.is_film:
         _film(request, subject, subject.views if views is None else views, report)
     else:
@@ -166,18 +164,13 @@ def _subject(request: Render, composer: Composer) -> _Subject:
     )
 
 
-def _reenacted(request: Render, composer: Composer) -> _Subject:
-    """An avatar moved by another person's FLAME motion."""
+def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
+    """An avatar moved by another person's motion."""
     if is_ply(request.source):
         raise StgaError(f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
-    flame = request.flame or (read_run(request.source).flame if request.source.is_dir() else None)
     avatar = read_avatar(avatar_path(request.source))
-    assert request.motion is not None
-    motion = open_capture(request.motion, flame)
-    if motion.flame is None:
-        raise StgaError(f"{request.motion}: was not tracked with FLAME, so it has no parameters of expression and pose")
-    check_topology(motion, avatar)
-    sequence = transferred_motion(motion.flame, avatar.neutral)
+    motion = open_avatar_motion(request, avatar, say)
+    sequence = motion.sequence
 
     def mesh(timestep: int) -> np.ndarray:
         return sequence_mesh(sequence, timestep)
@@ -186,7 +179,7 @@ def _reenacted(request: Render, composer: Composer) -> _Subject:
         lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, request.background, composer),
         tuple(sequence.timesteps),
         lambda: _middle(mesh(sequence.timesteps[0])),
-        playback_fps(motion, request.fps),
+        request.fps or motion.fps or DEFAULT_FPS,
     )
 
 

@@ -1,7 +1,7 @@
 """Requests: what can be asked for, as plain values that any process or machine can carry out (`perform`)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ..capture.camera_path import TURNTABLE_S
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
+from ..driving.open_motion import MotionOptions
 from ..errors import StgaError
 from ..export.formats import FORMATS, check_suffix
 from ..flame.sequence import ZERO_POSES
@@ -218,7 +219,8 @@ class Render:
     fps             frames per second of a video or turntable; None: the capture's
     seconds         least duration of a turntable
     capture, flame  whose meshes drive the avatar; None: those of the run
-    motion          another person's FLAME motion, which drives the avatar instead; `flame`: its model file
+    motion          another person's motion, which drives the avatar instead, with `motion_options`; `flame`: the file
+                    of its model
     played          meshes that stand in for those of the capture
     background      sRGB in 0…1
     principal_point  convention of `cameras`; None: that of the avatar
@@ -239,6 +241,7 @@ class Render:
     background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
     principal_point: str | None = setting(None, choices=PRINCIPAL_POINTS)
     device: str = device_field()
+    motion_options: MotionOptions = field(default_factory=MotionOptions)
 
     @property
     def is_film(self) -> bool:
@@ -266,6 +269,7 @@ class Export:
     frames          first and last timestep of a format that holds several; None: all
     fps             of a format that has a frame rate; None: the capture's
     motion_only     of a web page: leave out the blend shapes and the skeleton of the FLAME model
+    motion          another person's motion, which drives the avatar instead, with `motion_options`
     """
 
     source: Path
@@ -278,6 +282,8 @@ class Export:
     frames: tuple[int, int] | None = None
     fps: float | None = setting(None, above=0)
     motion_only: bool = False
+    motion: Path | None = None
+    motion_options: MotionOptions = field(default_factory=MotionOptions)
 
     def check(self) -> None:
         """Raise StgaError for a file name of another format."""

@@ -11,6 +11,7 @@ from .test_import_operators import ball_avatar, write_motion  # noqa: E402
 
 HANDLERS = {
     "STGA_FH_capture": (".json", "stga.import_capture"),
+    "STGA_FH_performance": (".csv;.json;.txt", "stga.apply_motion"),
     "STGA_FH_npz": (".npz", "stga.open_npz"),
     "STGA_FH_ply": (".ply", "stga.import_ply"),
 }

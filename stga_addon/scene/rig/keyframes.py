@@ -1,8 +1,9 @@
 """Keyframes of a FLAME head: expressions, joint rotations, translation and tracked per-frame offsets."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import bpy
 import numpy as np
 
 from ...flame.forward import FlameFrame, joint_positions
@@ -11,7 +12,7 @@ from ...flame.motion import PARTS
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import FlameSequence
 from ..animation import write_curve, write_triangle_curves
-from ..compat import action_curves
+from ..compat import action_curves, copy_action, push_down_action
 from ..objects import Warn, log_warning
 from .names import (
     EXPRESSION_KEY,
@@ -59,6 +60,18 @@ def key_motion(
         translations = np.stack([frame.translation for frame in frames])
         for axis in range(3):
             write_curve(curves, ROOT_LOCATION, axis, at, translations[:, axis])
+
+
+def start_action(owner: Any, name: str, replaces: Callable[[str], bool], as_strip: bool) -> None:
+    """Give `owner` a new active action: empty with the old one as a strip, or the old one's copy without the curves
+    whose data path is to be replaced."""
+    if as_strip:
+        push_down_action(owner)
+        (owner.animation_data or owner.animation_data_create()).action = bpy.data.actions.new(name)
+        return
+    curves = copy_action(owner, name)
+    for curve in [curve for curve in curves if replaces(curve.data_path)]:
+        curves.remove(curve)
 
 
 def key_tracked_offsets(

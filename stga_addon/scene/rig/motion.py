@@ -14,11 +14,11 @@ from ...flame.motion import PARTS
 from ...flame.quaternions import to_axis_angle
 from ...flame.sequence import FlameSequence
 from ..arrays import evaluated_vertices, read_values
-from ..compat import copy_action, push_down_action
+from ..compat import push_down_action
 from ..objects import Warn, log_warning
 from ..timeline import iterate_frames
 from .flame_rig import rig_of
-from .keyframes import animated_by, key_motion, key_tracked_offsets, key_zero_offsets
+from .keyframes import animated_by, key_motion, key_tracked_offsets, key_zero_offsets, start_action
 from .names import EXPRESSION_KEY, expression_key, is_of_parts, offset_keys, parent_bone, slider_components
 
 MESH_TOLERANCE = 1e-4
@@ -48,7 +48,7 @@ def apply_motion(
     frames = [replace(frame, expr=_for_all_sliders(head, frame.expr)) for frame in frames]
     owners = animated_by(head, rig, parts)
     for owner in owners:
-        _start_action(owner, f"{owner.name} {name}", parts, as_strip)
+        start_action(owner, f"{owner.name} {name}", lambda path: is_of_parts(path, parts), as_strip)
     key_motion(head, rig, range(start, start + len(frames)), frames, parts, warn)
     if "expression" in parts and offset_keys(head):
         if tracked is None:
@@ -61,17 +61,6 @@ def apply_motion(
         owner.animation_data.action.use_fake_user = True
         if as_strip:
             push_down_action(owner, extrapolation="NOTHING")
-
-
-def _start_action(owner: Any, name: str, parts: Sequence[str], as_strip: bool) -> None:
-    """Give `owner` a new active action: empty with the old one as a strip, or the old one's copy without the parts."""
-    if as_strip:
-        push_down_action(owner)
-        (owner.animation_data or owner.animation_data_create()).action = bpy.data.actions.new(name)
-        return
-    curves = copy_action(owner, name)
-    for curve in [curve for curve in curves if is_of_parts(curve.data_path, parts)]:
-        curves.remove(curve)
 
 
 def _for_all_sliders(head: Any, expr: np.ndarray) -> np.ndarray:

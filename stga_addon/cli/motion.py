@@ -1,0 +1,78 @@
+"""Options of commands that take a motion."""
+
+import argparse
+from argparse import ArgumentParser, Namespace
+
+from ..driving.names import ARKIT_SHAPES, PARTS
+from ..driving.open_motion import MotionOptions
+from ..driving.transfer import NEUTRALS
+from ..errors import StgaError
+from .arguments import real_number
+
+DEFAULTS = {"strength": 1.0, "neutral": "none", "smooth": 0.0, "mirror": False, "gain": [], "stay_trained": 0.0}
+MOTION_HELP = (
+    "another person's motion: FLAME parameters (.npz, or a capture), or a performance in ARKit's shapes (CSV of Live "
+    "Link Face or Audio2Face, its take folder, JSON, iFacialMocap's text)"
+)
+
+
+def add_motion_options(parser: ArgumentParser) -> None:
+    """What `MotionOptions` holds."""
+    group = parser.add_argument_group("motion")
+    group.add_argument("--strength", type=real_number, help="of the motion; 1 (default): as recorded")
+    group.add_argument(
+        "--neutral", choices=NEUTRALS, help="take the motion relative to the performer's quiet face or first frame"
+    )
+    group.add_argument("--smooth", type=real_number, metavar="SECONDS", help="smooth a performance in time")
+    group.add_argument("--mirror", action="store_true", help="exchange left and right of a performance")
+    group.add_argument(
+        "--gain",
+        type=gain,
+        action="append",
+        default=[],
+        metavar="NAME=FACTOR",
+        help="scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may be repeated",
+    )
+    group.add_argument(
+        "--stay-trained",
+        type=share,
+        nargs="?",
+        const=1.0,
+        metavar="SHARE",
+        help="lead the motion softly back to the range that the run was trained on; 0 to 1 (default without: 0)",
+    )
+
+
+def gain(text: str) -> tuple[str, float]:
+    """Raises argparse.ArgumentTypeError for what is no NAME=FACTOR."""
+    name, _, factor = text.partition("=")
+    if name not in (*PARTS, "head", *ARKIT_SHAPES):
+        raise argparse.ArgumentTypeError(f"'{text}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
+    return name, real_number(factor)
+
+
+def share(text: str) -> float:
+    """A number from 0 to 1. Raises argparse.ArgumentTypeError for anything else."""
+    value = real_number(text)
+    if value > 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 to 1")
+    return value
+
+
+def motion_options(options: Namespace) -> MotionOptions:
+    """The options of `add_motion_options` as a value."""
+    return MotionOptions(
+        strength=1.0 if options.strength is None else options.strength,
+        neutral=options.neutral or "none",
+        smoothing=options.smooth or 0.0,
+        mirror=options.mirror,
+        gains=dict(options.gain),
+        stay_trained=options.stay_trained or 0.0,
+    )
+
+
+def check_motion_options(options: Namespace) -> None:
+    """Raise StgaError for an option of `add_motion_options` without --motion, where it would have no effect."""
+    for name, default in DEFAULTS.items():
+        if getattr(options, name) not in (None, default):
+            raise StgaError(f"--{name.replace('_', '-')}: has no effect without --motion")

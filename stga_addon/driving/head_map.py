@@ -1,0 +1,245 @@
+"""The map from ARKit's 52 weights to the parameters of one FLAME head."""
+
+import hashlib
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..flame.forward import FlameFrame
+from ..flame.model import JOINTS, FlameModel
+from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
+from ..flame.sequence import FlameSequence, with_identity
+from ..tracking.posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .correspondence import face_points
+from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
+from .performance import Performance
+from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_shapes
+
+JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")
+"""Those that turn the jaw; jawForward, which a rotation cannot do, is left to the expressions."""
+PRODUCT_SHAPES = tuple(name for name in ARKIT_SHAPES if name.startswith(("jaw", "mouth")))
+"""Shapes whose products with jawOpen are features: a jaw that turns carries what they move."""
+PRODUCTS = np.array([COLUMN[name] for name in PRODUCT_SHAPES])
+FEATURES = COUNT + len(PRODUCTS)
+GAZE_RAD = 0.61
+"""Rotation of an eye at weight 1 of an eyeLook shape: the largest in recorded takes of Live Link Face."""
+RIDGE_M = 5e-5
+"""Root mean square displacement of the face that a unit of an expression coefficient must be worth."""
+JAW_STEPS = 4
+MAX_JAW_RAD = 0.8
+"""A jaw turns less; further, the fit has left what it is linear in."""
+# jawOpen, jawLeft and jawRight at which the other shapes are combined.
+JAW_POSES = (
+    (0, 0, 0), (0.25, 0, 0), (0.5, 0, 0), (0.75, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0.5, 0), (0, 0, 0.5),
+    (0.5, 0.5, 0), (0.5, 0, 0.5), (1, 1, 0), (1, 0, 1), (0.25, 1, 0), (0.25, 0, 1),
+)  # fmt: skip
+COMBINATIONS = 60
+"""Random combinations of the other shapes at each of the poses of the jaw."""
+ACTIVE_SHARE = 0.35
+"""Of the shapes in a combination."""
+CACHED_MAPS = 8
+_cache: OrderedDict[bytes, "HeadMap"] = OrderedDict()
+
+
+@dataclass(frozen=True)
+class HeadMap:
+    """Parameters of a head of E expressions as functions of ARKit weights.
+
+    points       where the N face points lie on the head's mesh
+    used         (478,) bool: which of MediaPipe's landmarks they are
+    targets      (52, N, 3) meters: what each shape does to them on this head
+    expressions  (FEATURES, E) coefficients per feature (`features`)
+    jaw          (52, 3) axis-angle per weight
+    eyes         (52, 6) axis-angle of left and right eye per weight
+    reach        (52,) 0 to 1: how much of each shape's displacement the head can do
+    """
+
+    points: SurfacePoints
+    used: np.ndarray
+    targets: np.ndarray
+    expressions: np.ndarray
+    jaw: np.ndarray
+    eyes: np.ndarray
+    reach: np.ndarray
+
+    def parameters(self, weights: np.ndarray) -> np.ndarray:
+        """(T, E + 9) expression coefficients, jaw and eyes of weights (T, 52)."""
+        effective = effective_weights(weights)
+        return np.concatenate(
+            [features(weights) @ self.expressions, effective @ self.jaw, effective @ self.eyes], axis=1
+        )
+
+    def frames(self, performance: Performance) -> list[FlameFrame]:
+        """One frame per row of the performance; the head's rotation turns the neck."""
+        values, zero = self.parameters(performance.weights), np.zeros(3)
+        count = self.expressions.shape[1]
+        turns = np.zeros((len(values), 3)) if performance.head is None else head_turns(performance.head)
+        return [
+            FlameFrame(row[:count], zero, turn, row[count : count + 3], zero, row[count + 3 :])
+            for row, turn in zip(values, turns, strict=True)
+        ]
+
+
+def features(weights: np.ndarray) -> np.ndarray:
+    """(T, FEATURES) of weights (T, 52): the `effective_weights`, then jawOpen times each of PRODUCT_SHAPES."""
+    effective = effective_weights(weights)
+    return np.concatenate([effective, effective[:, JAW_OPEN, None] * effective[:, PRODUCTS]], axis=1)
+
+
+def head_turns(angles: np.ndarray) -> np.ndarray:
+    """Axis-angle (T, 3) of yaw, pitch and roll (T, 3): about y, then the turned x, then the turned z."""
+    yaw, pitch, roll = np.asarray(angles, np.float64).T
+    zero = np.zeros_like(yaw)
+    about = [(zero, yaw, zero), (pitch, zero, zero), (zero, zero, roll)]
+    first, second, third = (from_axis_angle(np.stack(axis, axis=1)) for axis in about)
+    return to_axis_angle(multiply(multiply(first, second), third))
+
+
+def head_map(sequence: FlameSequence, name: str) -> HeadMap:
+    """The map for the model and identity of a sequence; computed once, then kept in memory.
+
+    `name` is what errors call the head. Raises StgaError as `face_points` does.
+    """
+    person = with_identity(sequence).model
+    digest = hashlib.blake2b()
+    for array in (
+        person.v_template,
+        person.shapedirs,
+        person.posedirs,
+        person.weights,
+        person.j_regressor,
+        person.faces,
+    ):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    if key not in _cache:
+        _cache[key] = _fitted(person, *face_points(sequence.model, name))
+        while len(_cache) > CACHED_MAPS:
+            _cache.popitem(last=False)
+    return _cache[key]
+
+
+def person_of(model: FlameModel, neutral: np.ndarray) -> FlameSequence:
+    """A sequence without timesteps of the person whose neutral mesh (V, 3) this is."""
+    return FlameSequence(model, np.zeros(model.n_identity), neutral - model.v_template, (), _no_frame)
+
+
+def _no_frame(timestep: int) -> FlameFrame:
+    raise KeyError(timestep)
+
+
+def _fitted(person: FlameModel, places: SurfacePoints, used: np.ndarray) -> HeadMap:
+    """The map of a model without identity components."""
+    points = SurfacePoints(places.face[used], places.barycentric[used])
+    fit = _Fit(person, points, used)
+    expressions = fit.expressions()
+    eyes = _gaze()
+    found = HeadMap(points, used, fit.targets, expressions, fit.jaw, eyes, np.zeros(COUNT))
+    return replace(found, reach=_reach(found, fit, person))
+
+
+class _Fit:
+    """Least squares for one person at the N face points."""
+
+    def __init__(self, person: FlameModel, points: SurfacePoints, used: np.ndarray) -> None:
+        source = face_shapes()
+        self.posed = PosedPoints(person, points)
+        self.count = person.n_expression
+        self.neutral = self.posed.positions(np.zeros(self.count), np.zeros(RIGID_SIZE))
+        self.targets = source.shapes[:, used] @ _similarity(source.points[used], self.neutral).T
+        self.ridge = RIDGE_M**2 * len(self.neutral)
+        self.jaw = self._jaw()
+
+    def rigid(self, jaw: np.ndarray) -> np.ndarray:
+        """(18,) pose and translation with the jaw (3,) turned."""
+        rigid = np.zeros(RIGID_SIZE)
+        at = 3 * JOINTS.index("jaw")
+        rigid[at : at + 3] = jaw
+        return rigid
+
+    def coefficients(self, jaw: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """(S, E) ridge solutions for points (S, N, 3) with the jaw (3,) turned; points are linear in coefficients."""
+        start, slopes = self.posed.linearized(np.zeros(self.count), self.rigid(jaw))
+        matrix = slopes[..., : self.count].reshape(-1, self.count)
+        residual = (wanted - start).reshape(len(wanted), -1)
+        normal = matrix.T @ matrix + self.ridge * np.eye(self.count)
+        return np.asarray(np.linalg.solve(normal, matrix.T @ residual.T).T)
+
+    def expressions(self) -> np.ndarray:
+        """(FEATURES, E) that best give the coefficients of single shapes and of random combinations."""
+        rows, solutions = [], []
+        for number, pose in enumerate(JAW_POSES):
+            weights = _combinations(pose, np.random.default_rng(number))
+            jaw = np.zeros(COUNT)
+            jaw[[COLUMN[name] for name in JAW_SHAPES]] = pose
+            wanted = self.neutral + np.tensordot(effective_weights(weights), self.targets, 1)
+            rows.append(features(weights))
+            solutions.append(self.coefficients(jaw @ self.jaw, wanted))
+        return np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
+
+    def _jaw(self) -> np.ndarray:
+        """(52, 3) axis-angle of the shapes that turn the jaw, each fitted together with expressions."""
+        found = np.zeros((COUNT, 3))
+        at = self.count + 3 * JOINTS.index("jaw")
+        columns = [*range(self.count), at, at + 1, at + 2]
+        for name in JAW_SHAPES:
+            wanted, values = self.neutral + self.targets[COLUMN[name]], np.zeros(len(columns))
+            for _ in range(JAW_STEPS):
+                start, slopes = self.posed.linearized(values[: self.count], self.rigid(values[self.count :]))
+                matrix = slopes[..., columns].reshape(-1, len(columns))
+                prior = np.diag([self.ridge] * self.count + [self.ridge * 1e-3] * 3)
+                step = matrix.T @ (wanted - start).ravel() - prior @ values
+                values = values + np.linalg.solve(matrix.T @ matrix + prior, step)
+                values[self.count :] = np.clip(values[self.count :], -MAX_JAW_RAD, MAX_JAW_RAD)
+            found[COLUMN[name]] = values[self.count :]
+        return found
+
+
+def _combinations(pose: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    """(S, 52) weights: each shape alone and random combinations, all with the jaw at `pose`."""
+    weights = rng.random((COMBINATIONS, COUNT)) * (rng.random((COMBINATIONS, COUNT)) < ACTIVE_SHARE)
+    weights[::2, MOUTH_CLOSE] = rng.random(len(weights[::2]))
+    weights[:, MOUTH_CLOSE] *= pose[0]
+    alone = np.eye(COUNT)
+    alone[MOUTH_CLOSE] *= pose[0]
+    weights = np.concatenate([weights, alone, np.zeros((1, COUNT))])
+    weights[:, [COLUMN[name] for name in OPTIONAL]] = 0
+    weights[:, [COLUMN[name] for name in JAW_SHAPES]] = pose
+    return np.asarray(weights)
+
+
+def _similarity(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation times scale that best lays centered points (N, 3) over others (Umeyama 1991)."""
+    first, second = source - source.mean(axis=0), target - target.mean(axis=0)
+    left, values, right = np.linalg.svd(second.T @ first)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return np.asarray(left @ sign @ right * (values @ np.diag(sign)) / (first**2).sum())
+
+
+def _gaze() -> np.ndarray:
+    """(52, 6) axis-angle of left and right eye; out and in are away from and towards the nose."""
+    eyes = np.zeros((COUNT, 6))
+    for side, first, outward in (("Left", 0, 1.0), ("Right", 3, -1.0)):
+        eyes[COLUMN[f"eyeLookDown{side}"], first] = GAZE_RAD
+        eyes[COLUMN[f"eyeLookUp{side}"], first] = -GAZE_RAD
+        eyes[COLUMN[f"eyeLookOut{side}"], first + 1] = outward * GAZE_RAD
+        eyes[COLUMN[f"eyeLookIn{side}"], first + 1] = -outward * GAZE_RAD
+    return eyes
+
+
+def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
+    """(52,) of each shape alone, mouthClose at an open jaw; gaze is whole where the head has eyeballs."""
+    weights = np.eye(COUNT)
+    weights[MOUTH_CLOSE, JAW_OPEN] = 1
+    values = found.parameters(weights)
+    moved = np.stack(
+        [fit.posed.positions(row[: fit.count], fit.rigid(row[fit.count : fit.count + 3])) for row in values]
+    )
+    done = moved - fit.neutral
+    done[MOUTH_CLOSE] = moved[MOUTH_CLOSE] - moved[JAW_OPEN]
+    size, missed = (np.sqrt((each**2).sum(axis=(1, 2))) for each in (found.targets, found.targets - done))
+    reach = np.clip(1 - missed / np.maximum(size, 1e-12), 0, 1) * (size > 0)
+    eyeballs = (person.weights[:, [JOINTS.index("left_eye"), JOINTS.index("right_eye")]] > 0.5).any()
+    looks = np.array([name.startswith("eyeLook") for name in ARKIT_SHAPES])
+    return np.where(looks & eyeballs, 1.0, reach)

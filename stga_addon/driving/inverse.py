@@ -1,0 +1,166 @@
+"""The other way: FLAME parameters as ARKit weights, and the CSV file that holds them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..files import replacing
+from ..flame.forward import FlameFrame
+from ..flame.quaternions import from_axis_angle, to_matrices
+from ..flame.sequence import FlameSequence, with_identity
+from ..tracking.posed_points import RIGID_SIZE, PosedPoints
+from .head_map import JAW_SHAPES, PRODUCTS, HeadMap, head_map
+from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
+from .performance import Performance
+from .shapes import JAW_OPEN, MOUTH_CLOSE
+
+MAX_SWEEPS = 60
+CONVERGED = 1e-5
+"""Largest change of a weight in a sweep, below which the descent stops."""
+NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
+CHUNK = 256
+"""Rows whose matrices are held at once."""
+RIDGE = 1e-9
+"""Share of the mean squared displacement that keeps weights apart which this head cannot tell apart."""
+TIMECODE_BASE = 60
+EXTRA_COLUMNS = ("HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw", "LeftEyePitch", "LeftEyeRoll", "RightEyeYaw",
+                 "RightEyePitch", "RightEyeRoll")  # fmt: skip
+
+
+def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Performance:
+    """The motion of a FLAME head as ARKit weights: the least-squares fit of 0 to 1 to what its face does.
+
+    The neck's rotation becomes the head's; other head motion has no place in a performance. `name` is what errors call
+    the head.
+    """
+    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    weights = arkit_weights(frames, head_map(sequence, name), sequence)
+    first = sequence.timesteps[0]
+    times = (np.array(sequence.timesteps) - first) / fps
+    return Performance(times, weights, head_angles(np.stack([frame.neck_pose for frame in frames])), fps)
+
+
+def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameSequence) -> np.ndarray:
+    """(T, 52) weights of 0 to 1 whose parameters (`HeadMap.parameters`) move the face most like the frames.
+
+    The jaw's and the gaze's shapes follow from the rotations; what they do to the skin is taken off, and the others
+    follow from the expression coefficients by coordinate descent on the non-negative least squares.
+    """
+    weights = np.zeros((len(frames), COUNT))
+    jaw_columns = [COLUMN[name] for name in JAW_SHAPES]
+    jaw = np.stack([frame.jaw_pose for frame in frames])
+    weights[:, jaw_columns] = _descended(*_normal(found.jaw[jaw_columns], jaw), np.zeros((len(frames), 3)))
+    looks = [column for column, name in enumerate(ARKIT_SHAPES) if name.startswith("eyeLook")]
+    eyes = np.stack([frame.eyes_pose for frame in frames])
+    weights[:, looks] = np.clip(eyes @ np.linalg.pinv(found.eyes[looks]) * 2, 0, 1)
+    fixed = {*jaw_columns, *looks, *(COLUMN[name] for name in OPTIONAL)}
+    free = np.array([column for column in range(COUNT) if column not in fixed])
+    opened = weights[:, JAW_OPEN]
+    linear, by_jaw = found.expressions[:COUNT], np.zeros((COUNT, found.expressions.shape[1]))
+    by_jaw[PRODUCTS] = found.expressions[COUNT:]
+    known = weights @ linear + opened[:, None] * (weights @ by_jaw)
+    wanted = np.stack([frame.expr for frame in frames]) - known
+    metric = _metric(found, sequence)
+    first, second, wanted = linear[free] @ metric, by_jaw[free] @ metric, wanted @ metric
+    cross = first @ second.T
+    gram = np.stack([first @ first.T, cross + cross.T, second @ second.T])
+    right = wanted @ first.T + opened[:, None] * (wanted @ second.T)
+    limits = np.ones((len(frames), len(free)))
+    limits[:, free == MOUTH_CLOSE] = opened[:, None]
+    powers = np.stack([np.ones_like(opened), opened, opened**2], axis=1)
+    weights[:, free] = _descended(gram, right, np.zeros_like(right), powers, limits)
+    return weights
+
+
+def _metric(found: HeadMap, sequence: FlameSequence) -> np.ndarray:
+    """(E, E) factor: the length of coefficients times it is how far they move the face's points."""
+    person = with_identity(sequence).model
+    _, slopes = PosedPoints(person, found.points).linearized(np.zeros(person.n_expression), np.zeros(RIGID_SIZE))
+    matrix = slopes[..., : person.n_expression].reshape(-1, person.n_expression)
+    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def _normal(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return (rows @ rows.T)[None], wanted @ rows.T
+
+
+def _descended(
+    gram: np.ndarray,
+    right: np.ndarray,
+    start: np.ndarray,
+    powers: np.ndarray | None = None,
+    limits: np.ndarray | float = 1.0,
+) -> np.ndarray:
+    """(T, K) minimizers from 0 to `limits` of ½ wᵀGw − rᵀw by cyclic coordinate descent, all rows at once.
+
+    gram (P, K, K) with G = Σ powers[:, p] gram[p], powers (T, P); right (T, K).
+    """
+    powers = np.ones((len(right), 1)) if powers is None else powers
+    limits = np.broadcast_to(limits, right.shape)
+    weights = start.copy()
+    ridge = RIDGE * float(np.trace(gram[0])) / max(len(gram[0]), 1)
+    rows = [powers @ gram[:, column] for column in range(right.shape[1])]
+    for _ in range(MAX_SWEEPS):
+        largest = 0.0
+        for column, row in enumerate(rows):
+            curvature = row[:, column] + ridge
+            slope = right[:, column] - (row * weights).sum(axis=1) - ridge * weights[:, column]
+            old = weights[:, column].copy()
+            weights[:, column] = np.clip(old + slope / np.maximum(curvature, 1e-30), 0, limits[:, column])
+            largest = max(largest, float(np.abs(weights[:, column] - old).max(initial=0)))
+        if largest < CONVERGED:
+            break
+    for first in range(0, len(weights), CHUNK):
+        part = slice(first, first + CHUNK)
+        matrices = np.einsum("tp,pjk->tjk", powers[part], gram) + ridge * np.eye(len(rows))
+        weights[part] = _polished(matrices, right[part], weights[part], limits[part])
+    return weights
+
+
+def _polished(matrices: np.ndarray, right: np.ndarray, weights: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Minimizers from 0 to `limits` of ½ wᵀGw − rᵀw near weights (T, K), by projected Newton steps (Bertsekas 1982)."""
+
+    def value(w: np.ndarray) -> np.ndarray:
+        return np.asarray((w * (0.5 * np.einsum("tjk,tk->tj", matrices, w) - right)).sum(axis=1))
+
+    for _ in range(NEWTON_STEPS):
+        slope = right - np.einsum("tjk,tk->tj", matrices, weights)
+        held = ((weights <= 0) & (slope < 0)) | ((weights >= limits) & (slope > 0))
+        free = ~held
+        reduced = matrices * (free[:, :, None] & free[:, None, :])
+        reduced[:, np.arange(right.shape[1]), np.arange(right.shape[1])] += held
+        step = np.linalg.solve(reduced, np.where(held, 0.0, slope)[..., None])[..., 0]
+        tried = np.stack([np.clip(weights + share * step, 0, limits) for share in STEP_SHARES])
+        best = np.stack([value(each) for each in tried]).argmin(axis=0)
+        weights = tried[best, np.arange(len(weights))]
+    return weights
+
+
+def head_angles(turns: np.ndarray) -> np.ndarray:
+    """(T, 3) yaw, pitch and roll of axis-angle (T, 3); the inverse of `head_map.head_turns`."""
+    matrices = to_matrices(from_axis_angle(turns))
+    yaw = np.arctan2(matrices[:, 0, 2], matrices[:, 2, 2])
+    pitch = np.arcsin(np.clip(-matrices[:, 1, 2], -1, 1))
+    return np.stack([yaw, pitch, np.arctan2(matrices[:, 1, 0], matrices[:, 1, 1])], axis=1)
+
+
+def write_performance(path: Path, performance: Performance) -> None:
+    """Write a performance as a CSV file in Live Link Face's layout, atomically."""
+    names = [name[0].upper() + name[1:] for name in ARKIT_SHAPES]
+    header = ["Timecode", "BlendShapeCount", *names, *EXTRA_COLUMNS]
+    head = np.zeros((len(performance.times), 3)) if performance.head is None else performance.head
+    lines = [",".join(header)]
+    for time, weights, turn in zip(performance.times.tolist(), performance.weights, head, strict=True):
+        cells = [*weights.tolist(), *turn.tolist(), *[0.0] * (len(EXTRA_COLUMNS) - 3)]
+        lines.append(",".join([_timecode(time), str(COUNT + len(EXTRA_COLUMNS)), *(f"{cell:.6f}" for cell in cells)]))
+    with replacing(path) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _timecode(seconds: float) -> str:
+    ticks = round(seconds * TIMECODE_BASE * 1000)
+    frames, sub = divmod(ticks, 1000)
+    whole, frame = divmod(frames, TIMECODE_BASE)
+    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{frame:02d}.{sub:03d}"

@@ -1,0 +1,159 @@
+"""The one place where a file becomes the motion of a head: FLAME parameters, captures and ARKit performances."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.flame_capture import flame_model
+from ..capture.open import open_capture
+from ..errors import StgaError
+from ..export.playback import playback_fps
+from ..flame.forward import FlameFrame
+from ..flame.model import FlameModel
+from ..flame.motion import strengthened, transferred_motion
+from ..flame.sequence import FlameSequence
+from ..schema import setting
+from .head_map import head_map, person_of
+from .performance import Performance, amplified, mirrored, relative_to, resampled, smoothed
+from .read_performance import is_performance, read_performance
+from .transfer import (
+    NEUTRALS,
+    TrainedRange,
+    chosen_neutral,
+    exchanged_neutral,
+    led_back,
+    outside,
+    quiet_neutral,
+    quiet_weights,
+)
+
+MAX_GAIN, MAX_SMOOTHING_S = 100.0, 60.0
+NEEDS_FLAME = "needs the FLAME model file (.pkl or .npz) of the head that it is to move"
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """What is done to a motion on its way to a head.
+
+    strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about its first pose
+    neutral    "none"; "quiet" or "first": the motion is taken relative to the performer's quiet face, or first frame
+    smoothing  seconds, standard deviation; of performances alone, like the next two
+    mirror     exchange left and right
+    gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
+    stay_trained  0 to 1: how far parameters are led back to the range that the avatar was trained on
+    """
+
+    strength: float = setting(1.0, 0, MAX_GAIN)
+    neutral: str = setting("none", choices=NEUTRALS)
+    smoothing: float = setting(0.0, 0, MAX_SMOOTHING_S)
+    mirror: bool = False
+    gains: Mapping[str, float] = field(default_factory=dict)
+    stay_trained: float = setting(0.0, 0, 1)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion on one head, and what was found on the way.
+
+    fps      timesteps per second; None where unknown
+    lost     rows that the file lacks between its first and last
+    outside  part -> (T,) how far each frame was outside the trained range (`transfer.outside`); empty without a range
+    """
+
+    sequence: FlameSequence
+    fps: float | None
+    lost: int = 0
+    outside: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+def open_motion(
+    path: Path,
+    flame: Path | None,
+    neutral: np.ndarray,
+    faces: np.ndarray,
+    options: MotionOptions | None = None,
+    trained: TrainedRange | None = None,
+    fps: float | None = None,
+) -> Motion:
+    """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles `faces` (F, 3).
+
+    path   FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a performance (`read_performance`)
+    flame  the model file; None: the one in the capture's folder
+    fps    rate that a performance is resampled to; None: its own. Timesteps of FLAME motions stay as they are
+    Raises StgaError where the file is no motion, or its model has other triangles.
+    """
+    options = options or MotionOptions()
+    chosen_neutral(str(path), options.neutral)
+    if is_performance(path):
+        if flame is None:
+            raise StgaError(f"{path}: {NEEDS_FLAME}; give it with --flame")
+        model = flame_model(flame)
+        _check_faces(path, model, faces)
+        return performed(read_performance(path), person_of(model, neutral), str(flame), options, trained, fps)
+    capture = open_capture(path, flame)
+    if capture.flame is None:
+        raise StgaError(f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose")
+    _check_faces(path, capture.flame.model, faces)
+    sequence = transferred_motion(capture.flame, neutral)
+    frames, beyond = adapted([sequence.frame(timestep) for timestep in sequence.timesteps], options, trained)
+    return Motion(_with_frames(sequence, sequence.timesteps, frames), playback_fps(capture), 0, beyond)
+
+
+def performed(
+    performance: Performance,
+    person: FlameSequence,
+    name: str,
+    options: MotionOptions,
+    trained: TrainedRange | None = None,
+    fps: float | None = None,
+) -> Motion:
+    """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what errors call it."""
+    prepared = prepared_performance(performance, options, fps)
+    frames, beyond = _finished(head_map(person, name).frames(prepared), options, trained)
+    timesteps = tuple(range(len(frames)))
+    return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
+
+
+def adapted(
+    frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None = None
+) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
+    """Frames of another person's FLAME motion with the options' neutral, strength and range; and part -> (T,) how far
+    they were outside the trained range before they were led back (`transfer.outside`)."""
+    if options.neutral != "none":
+        theirs = quiet_neutral(frames if options.neutral == "quiet" else frames[:1])
+        frames = exchanged_neutral(frames, theirs, None if trained is None else trained.neutral)
+    return _finished(frames, options, trained)
+
+
+def prepared_performance(performance: Performance, options: MotionOptions, fps: float | None = None) -> Performance:
+    """The performance at an even rate, relative to its neutral face, smoothed, amplified and mirrored."""
+    changed = resampled(performance, fps)
+    if options.neutral != "none":
+        first = performance.weights[0]
+        changed = relative_to(changed, quiet_weights(performance) if options.neutral == "quiet" else first)
+    changed = amplified(smoothed(changed, options.smoothing), options.gains)
+    return mirrored(changed) if options.mirror else changed
+
+
+def _finished(
+    frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
+) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
+    """The frames at the strength and led back, and how far they were outside the trained range before that."""
+    if options.strength != 1.0:
+        frames = strengthened(frames, options.strength)
+    if trained is None:
+        return frames, {}
+    beyond = outside(frames, trained)
+    return (led_back(frames, trained, options.stay_trained) if options.stay_trained else frames), beyond
+
+
+def _with_frames(person: FlameSequence, timesteps: tuple[int, ...], frames: list[FlameFrame]) -> FlameSequence:
+    known = dict(zip(timesteps, frames, strict=True))
+    return replace(person, timesteps=timesteps, frame=known.__getitem__)
+
+
+def _check_faces(path: Path, model: FlameModel, faces: np.ndarray) -> None:
+    if not np.array_equal(model.faces, faces):
+        raise StgaError(f"{path}: its mesh has other triangles than the one this avatar was trained on")

@@ -1,0 +1,236 @@
+"""Reading of face performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap and named weights in JSON."""
+
+import csv
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError, shorten
+from ..files import file_size, read_json
+from .facial_mocap import parse_packet
+from .names import COUNT, arkit_name, columns_of
+from .performance import Performance
+from .timecode import seconds_of
+
+SUFFIXES = (".csv", ".json", ".txt")
+MAX_TEXT_BYTES = 256 << 20
+MAX_ROWS = 1 << 20
+MAX_WEIGHT = 10.0
+"""Beyond it, weights are in percent, or are no weights."""
+DEFAULT_FPS = 60.0
+"""Of files that hold neither times nor a rate: ARKit's own."""
+MIN_FPS, MAX_FPS = 1.0, 1000.0
+HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
+COUNT_COLUMN, TIMECODE_COLUMNS, SECONDS_COLUMNS = "blendshapecount", ("timecode",), ("time", "timestamp", "seconds")
+TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
+"""Endings of files that Live Link Face writes beside a take's own."""
+FRAME_KEYS, NAME_KEYS = ("frames", "weightMat", "weights"), ("facsNames", "names", "blendShapeNames", "blendshapes")
+WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
+CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "weight"))
+
+
+def is_performance(path: Path) -> bool:
+    """Whether a path has the form of a performance: one of `SUFFIXES`, or a Live Link Face take's folder."""
+    if path.is_dir():
+        return (
+            not (path / "flame_param").is_dir() and bool(_take_files(path)) and not any(path.glob("transforms*.json"))
+        )
+    return path.suffix.lower() in SUFFIXES
+
+
+def read_performance(path: Path) -> Performance:
+    """Read a performance by its content.
+
+    CSV of Live Link Face (or the take's folder) and of Audio2Face; JSON of Audio2Face and LAM-Audio2Expression, of
+    MediaPipe's blend shapes, or of any named weights per frame; iFacialMocap's packets as lines of text. Columns are
+    found by name. Raises StgaError naming the file, the row, and the shapes that are missing.
+    """
+    if path.is_dir():
+        path = _take_file(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return _read_json(path)
+    if suffix == ".csv":
+        return _read_csv(path)
+    if suffix == ".txt":
+        return _read_packets(path)
+    raise StgaError(f"{path}: is no performance; expected {', '.join(SUFFIXES)} or the folder of a take")
+
+
+def _take_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ".csv" and path.is_file())
+
+
+def _take_file(folder: Path) -> Path:
+    files = _take_files(folder)
+    own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
+    if len(own) != 1:
+        names = ", ".join(path.name for path in own[:4]) or "none"
+        raise StgaError(f"{folder}: a take's folder holds one CSV file, found {names}")
+    return own[0]
+
+
+def _text(path: Path) -> str:
+    if file_size(path) > MAX_TEXT_BYTES:
+        raise StgaError(f"{path}: has more than the {MAX_TEXT_BYTES} bytes allowed")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise StgaError(f"{path}: is not UTF-8 text") from error
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _read_csv(path: Path) -> Performance:
+    try:
+        rows = [row for row in csv.reader(_text(path).splitlines()) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise StgaError(f"{path}: is not valid CSV ({error})") from error
+    if not rows:
+        raise StgaError(f"{path}: is empty, expected a row of column names")
+    header, body = [cell.strip() for cell in rows[0]], rows[1:]
+    columns = columns_of(str(path), header)
+    plain = {name.rsplit(".", 1)[-1].lower(): index for index, name in reversed(list(enumerate(header)))}
+    body = [row for row in body if _has_face(row, plain.get(COUNT_COLUMN))]
+    if not body:
+        raise StgaError(f"{path}: has no row with a face")
+    weights = np.zeros((len(body), COUNT))
+    for column, index in columns.items():
+        weights[:, column] = [_number(path, row, number, index, header) for number, row in enumerate(body)]
+    head = None
+    if all(name in plain for name in HEAD_COLUMNS):
+        cells = [[_number(path, row, n, plain[name], header) for name in HEAD_COLUMNS] for n, row in enumerate(body)]
+        head = np.array(cells) if np.any(cells) else None
+    return _performance(path, _csv_times(path, body, plain, header), weights, head)
+
+
+def _has_face(row: list[str], count: int | None) -> bool:
+    """Rows without a face have a count of 0, or end after it."""
+    return count is None or (len(row) > count + 1 and row[count].strip() not in ("", "0"))
+
+
+def _csv_times(path: Path, body: list[list[str]], plain: dict[str, int], header: list[str]) -> np.ndarray | None:
+    code = next((plain[name] for name in TIMECODE_COLUMNS if name in plain), None)
+    if code is not None and any(":" in row[code] for row in body):
+        return seconds_of(str(path), [row[code] for row in body])
+    at = code if code is not None else next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
+    if at is None:
+        return None
+    return np.array([_number(path, row, number, at, header) for number, row in enumerate(body)])
+
+
+def _number(path: Path, row: list[str], number: int, index: int, header: list[str]) -> float:
+    text = row[index] if index < len(row) else ""
+    try:
+        return float(text)
+    except ValueError:
+        raise StgaError(
+            f"{path}: row {number + 1}: {shorten(header[index])} is {shorten(text)}, expected a number"
+        ) from None
+
+
+def _read_packets(path: Path) -> Performance:
+    lines = [line for line in _text(path).splitlines() if line.strip()]
+    packets = [parse_packet(line.encode()) for line in lines]
+    known = [packet for packet in packets if packet is not None]
+    if not known:
+        raise StgaError(f"{path}: has no line of iFacialMocap, such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|")
+    columns_of(str(path), known[0].names)
+    weights = np.stack([packet.weights for packet in known])
+    heads = [packet.head for packet in known]
+    head = None if any(turn is None for turn in heads) else np.array(heads)
+    return _performance(path, None, weights, head)
+
+
+def _read_json(path: Path) -> Performance:
+    document = read_json(path)
+    outer = document if isinstance(document, dict) else {}
+    frames = next((outer[key] for key in FRAME_KEYS if isinstance(outer.get(key), list)), document)
+    if not isinstance(frames, list) or not frames:
+        raise StgaError(f"{path}: has no list of frames; expected one of {', '.join(FRAME_KEYS)}")
+    names = next((outer[key] for key in NAME_KEYS if isinstance(outer.get(key), list)), None)
+    rows = [_json_weights(path, number, frame, names) for number, frame in enumerate(frames)]
+    listed = list(rows[0])
+    columns = columns_of(str(path), listed)
+    weights = np.zeros((len(rows), COUNT))
+    for column, index in columns.items():
+        name = listed[index]
+        for number, row in enumerate(rows):
+            if name not in row:
+                raise StgaError(f"{path}: frame {number + 1}: lacks {shorten(name)}")
+            weights[number, column] = row[name]
+    times = None
+    if all(isinstance(frame, dict) and _is_number(frame.get("time")) for frame in frames):
+        times = np.array([float(frame["time"]) for frame in frames])
+    return _performance(path, times, weights, None, _json_rate(path, outer))
+
+
+def _json_rate(path: Path, outer: dict[str, Any]) -> float | None:
+    inner = outer.get("metadata")
+    for source in (outer, inner if isinstance(inner, dict) else {}):
+        for key in ("exportFps", "fps"):
+            if key in source:
+                if not _is_number(source[key]):
+                    raise StgaError(f"{path}: {key} is {shorten(source[key])}, expected a number")
+                return float(source[key])
+    return None
+
+
+def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) -> dict[str, float]:
+    """Name -> weight of one frame in any of the forms that `read_performance` takes."""
+    where, found = f"{path}: frame {number + 1}", frame
+    if isinstance(frame, dict):
+        found = next((frame[key] for key in WEIGHT_KEYS if key in frame), frame)
+    if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
+        name_keys, value_keys = CATEGORY_KEYS
+        pairs = [
+            (
+                next((entry[k] for k in name_keys if k in entry), None),
+                next((entry[k] for k in value_keys if k in entry), 0),
+            )
+            for entry in found
+        ]
+        found = {str(name): value for name, value in pairs}
+    if isinstance(found, list):
+        if names is None or len(names) != len(found):
+            known = "none" if names is None else str(len(names))
+            raise StgaError(f"{where}: has {len(found)} weights, but the file names {known}")
+        found = {str(name): value for name, value in zip(names, found, strict=True)}
+    if not isinstance(found, dict):
+        raise StgaError(f"{where}: is {shorten(frame)}, expected named weights")
+    weights = {str(name): value for name, value in found.items() if arkit_name(str(name)) or _is_number(value)}
+    for name, value in weights.items():
+        if not _is_number(value):
+            raise StgaError(f"{where}: {shorten(name)} is {shorten(value)}, expected a number")
+    return {name: float(value) for name, value in weights.items()}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _performance(
+    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray | None, fps: float | None = None
+) -> Performance:
+    """The checked performance in the order of its times; of rows with the same time the first."""
+    if len(weights) > MAX_ROWS:
+        raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
+    if not (np.abs(weights) <= MAX_WEIGHT).all():
+        raise StgaError(f"{path}: holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1")
+    if head is not None and not (np.abs(head) <= 4 * math.pi).all():
+        raise StgaError(f"{path}: head rotation is beyond two turns, or not finite; expected radians")
+    if times is None:
+        rate = DEFAULT_FPS if fps is None else fps
+        times = np.arange(len(weights)) / rate if MIN_FPS <= rate <= MAX_FPS else np.full(len(weights), np.nan)
+    if not np.isfinite(times).all():
+        raise StgaError(f"{path}: its times or its rate are not usable; expected {MIN_FPS:g} to {MAX_FPS:g} a second")
+    times, first = np.unique(times - times.min(), return_index=True)
+    steps = np.diff(times)
+    rate = fps or (1 / float(np.median(steps)) if len(steps) else DEFAULT_FPS)
+    if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
+        raise StgaError(
+            f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, expected {MIN_FPS:g} to {MAX_FPS:g}"
+        )
+    return Performance(times, weights[first], None if head is None else head[first], rate)

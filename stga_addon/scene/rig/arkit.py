@@ -1,0 +1,181 @@
+"""ARKit's 52 shapes in Blender: controls on a FLAME rig, and heads that have shape keys of these names."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...driving.head_map import PRODUCTS, HeadMap
+from ...driving.names import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
+from ...driving.shapes import MOUTH_CLOSE
+from ...errors import StgaError
+from ..animation import add_driver, write_curve
+from ..compat import action_curves, push_down_action
+from .keyframes import start_action
+from .names import expression_key, key_value_path, property_path, rotation_path
+
+SUMS = "stga_arkit_sums"
+"""Property of the rig: partial sums of the expressions, and the axis-angles of jaw and eyes."""
+JOINT_ROWS = {"jaw": (0, 1, 2), "left_eye": (3, 4, 5), "right_eye": (6, 7, 8)}
+MAX_EXPRESSION = 255
+"""Characters of a driver's expression, by Blender's limit."""
+VARIABLES = "abcdefghijklmnpqrstuvwxyz"
+"""Of the shapes in a partial sum; o is jawOpen."""
+NEGLIGIBLE = 1e-4
+"""Coefficient of a shape that is left out of an expression's sum."""
+
+
+def has_controls(rig: Any) -> bool:
+    """Whether a rig has the 52 controls."""
+    return SUMS in rig
+
+
+def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
+    """Add a slider per ARKit shape to the rig, which drives expressions, jaw and eyes by arithmetic alone.
+
+    Driven sliders and bones take their values from the controls, not from keyframes; `remove_controls` gives them back.
+    Controls that are there already keep their values and keyframes.
+    """
+    remove_drivers(head, rig)
+    for name, reach in zip(ARKIT_SHAPES, found.reach.tolist(), strict=True):
+        if name not in rig:
+            rig[name] = 0.0
+        rig.id_properties_ui(name).update(
+            min=-1.0, max=2.0, soft_min=0.0, soft_max=1.0, default=0.0,
+            description=f"ARKit's {name}; this head does {100 * reach:.0f} % of it",
+        )  # fmt: skip
+    linear = np.concatenate([found.expressions[:COUNT], found.jaw, found.eyes], axis=1)
+    products = np.zeros_like(linear)
+    products[PRODUCTS, : found.expressions.shape[1]] = found.expressions[COUNT:]
+    parts = [_parts(linear[:, column], products[:, column]) for column in range(linear.shape[1])]
+    rig[SUMS] = [0.0] * sum(map(len, parts))
+    slot, paths = 0, []
+    for column_parts in parts:
+        paths.append([f"{property_path(SUMS)}[{slot + number}]" for number in range(len(column_parts))])
+        for text, columns in column_parts:
+            variables = {VARIABLES[k]: (rig, property_path(ARKIT_SHAPES[c])) for k, c in enumerate(columns)}
+            variables["o"] = (rig, property_path("jawOpen"))
+            add_driver(rig, property_path(SUMS), slot, text, variables)
+            slot += 1
+    count = found.expressions.shape[1]
+    for component, terms in enumerate(paths[:count]):
+        if terms and expression_key(component) in head.data.shape_keys.key_blocks:
+            variables = {VARIABLES[k]: (rig, path) for k, path in enumerate(terms)}
+            add_driver(
+                head.data.shape_keys, key_value_path(expression_key(component)), -1, "+".join(variables), variables
+            )
+    for joint, rows in JOINT_ROWS.items():
+        _drive_joint(rig, joint, [paths[count + row] for row in rows])
+
+
+def remove_controls(head: Any, rig: Any) -> None:
+    """Remove the controls with their drivers and keyframes: expressions, jaw and eyes play their own again."""
+    remove_drivers(head, rig)
+    if rig.animation_data is not None and rig.animation_data.action is not None:
+        curves = action_curves(rig)
+        for curve in [curve for curve in curves if is_control_path(curve.data_path)]:
+            curves.remove(curve)
+    for name in ARKIT_SHAPES:
+        rig.pop(name, None)
+
+
+def remove_drivers(head: Any, rig: Any) -> None:
+    """Remove the drivers of `add_controls`, where there are any."""
+    if not has_controls(rig):
+        return
+    for owner in (rig, head.data.shape_keys):
+        for driver in [] if owner.animation_data is None else list(owner.animation_data.drivers):
+            targets = [target.data_path for variable in driver.driver.variables for target in variable.targets]
+            if driver.data_path == property_path(SUMS) or any(path.startswith(property_path(SUMS)) for path in targets):
+                owner.animation_data.drivers.remove(driver)
+    del rig[SUMS]
+
+
+def is_control_path(data_path: str) -> bool:
+    """Whether an f-curve of the rig animates one of the controls."""
+    return any(data_path == property_path(name) for name in ARKIT_SHAPES)
+
+
+def shape_key_names(head: Any) -> dict[int, str]:
+    """Column of the 52 -> the shape key of an object that has its name in any spelling; empty without any."""
+    keys = head.data.shape_keys if head.type == "MESH" else None
+    blocks = [] if keys is None else [block.name for block in keys.key_blocks[1:]]
+    return {COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block)) is not None}
+
+
+def key_weights(owner: Any, paths: dict[int, str], numbers: Sequence[int], weights: np.ndarray) -> None:
+    """Add keyframes of weights (T, 52) at the frames `numbers` to the active action of `owner`.
+
+    paths  column -> data path of its value; a shape that never moves gets a single keyframe
+    """
+    curves, at = action_curves(owner), np.asarray(numbers)
+    for column, path in paths.items():
+        values = weights[:, column]
+        keyed = slice(None) if (values != values[0]).any() else slice(1)
+        write_curve(curves, path, 0, at[keyed], values[keyed])
+
+
+def apply_weights(
+    owner: Any, paths: dict[int, str], weights: np.ndarray, start: int, name: str, as_strip: bool = False
+) -> None:
+    """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T, 52), one row per
+    Blender frame from `start` on. The previous animation is kept as `rig.motion.apply_motion` keeps it. Raises
+    StgaError where the owner is in tweak mode."""
+    if owner.animation_data is not None and owner.animation_data.use_tweak_mode:
+        raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
+    replaced = set(paths.values())
+    start_action(owner, f"{owner.name} {name}", lambda path: path in replaced, as_strip)
+    key_weights(owner, paths, range(start, start + len(weights)), weights)
+    owner.animation_data.action.use_fake_user = True
+    if as_strip:
+        push_down_action(owner, extrapolation="NOTHING")
+
+
+def control_paths() -> dict[int, str]:
+    """Column of the 52 -> data path of its control on the rig."""
+    return {column: property_path(name) for name, column in COLUMN.items()}
+
+
+def checked_shape_keys(head: Any) -> dict[int, str]:
+    """Column -> data path of the shape keys with ARKit names. Raises StgaError where the object has none."""
+    names = shape_key_names(head)
+    if not names:
+        raise StgaError(f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names, such as jawOpen")
+    return {column: key_value_path(name) for column, name in names.items()}
+
+
+def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int]]]:
+    """Expressions, each within Blender's limit, and the shapes that their variables are, whose sum is one parameter."""
+    found: list[tuple[str, list[int]]] = []
+    text, columns = "", []
+    for column in np.flatnonzero(np.abs(linear) + np.abs(products) > NEGLIGIBLE).tolist():
+        for _ in range(2):
+            term = _term(VARIABLES[len(columns)], column, float(linear[column]), float(products[column]))
+            if len(text) + len(term) <= MAX_EXPRESSION and len(columns) + 1 < len(VARIABLES):
+                break
+            found.append((text, columns))
+            text, columns = "", []
+        text, columns = text + term, [*columns, column]
+    return [*found, (text, columns)] if columns else found
+
+
+def _term(variable: str, column: int, linear: float, product: float) -> str:
+    """One shape's share; mouthClose counts up to jawOpen (`effective_weights`)."""
+    value = f"min({variable},max(o,0))" if column == MOUTH_CLOSE else variable
+    if abs(product) <= NEGLIGIBLE:
+        return f"{linear:+.4e}*{value}"
+    return f"+{value}*({linear:.4e}{product:+.4e}*o)"
+
+
+def _drive_joint(rig: Any, joint: str, terms: Sequence[Sequence[str]]) -> None:
+    """Drive a bone's quaternion by its axis-angle, whose three components are sums of at most one term each."""
+    variables = {letter: (rig, paths[0]) for letter, paths in zip("abc", terms, strict=True) if paths}
+    if not variables:
+        return
+    squared = "+".join(f"{letter}*{letter}" for letter in variables)
+    length = f"sqrt({squared}+1e-12)"
+    path = rotation_path(joint)
+    add_driver(rig, path, 0, f"cos({length}/2)", variables)
+    for element, letter in enumerate("abc", 1):
+        text = f"{letter}*sin({length}/2)/{length}" if letter in variables else "0"
+        add_driver(rig, path, element, text, variables)

@@ -1,0 +1,118 @@
+"""Face performances in Blender: Apply Motion, ARKit controls, and heads with shape keys of ARKit's names."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
+from stga_addon.driving.head_map import head_map  # noqa: E402
+from stga_addon.driving.inverse import write_performance  # noqa: E402
+from stga_addon.driving.names import ARKIT_SHAPES, COLUMN  # noqa: E402
+from stga_addon.driving.performance import Performance  # noqa: E402
+from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
+from stga_addon.flame.sequence import FlameSequence  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+
+pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
+TOLERANCE_M = 1e-5
+RNG = np.random.default_rng(4)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SimpleNamespace:
+    """The demo's head of another identity, imported from its own short motion; a performance of 7 rows at 30 Hz."""
+    model = synthetic_flame(0)
+    write_flame(model, tmp_path / "flame.npz")
+    shape = np.linspace(-0.5, 0.5, model.n_identity)
+    np.savez(tmp_path / "own.npz", expr=RNG.normal(0, 0.3, (3, 10)), jaw_pose=np.zeros((3, 3)), shape=shape)
+    weights = RNG.random((7, 52)) * (RNG.random((7, 52)) < 0.4)
+    weights[0] = 0
+    head = RNG.normal(0, 0.2, (7, 3))
+    write_performance(tmp_path / "take.csv", Performance(np.arange(7) / 30, weights, head, 30.0))
+    bpy.context.scene.render.fps = 30
+    bpy.ops.stga.import_motion(filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz"))
+    bpy.context.scene.render.fps = 30
+    own = FlameSequence(model, shape, None, (), {}.__getitem__)
+    return SimpleNamespace(own=own, map=head_map(own, "demo"), weights=weights, turns=head, take=tmp_path / "take.csv")
+
+
+def the_head():
+    return bpy.context.scene.stga.head
+
+
+def at(frame: int) -> np.ndarray:
+    bpy.context.scene.frame_set(frame)
+    return evaluated_vertices(the_head())
+
+
+def expected(scene, row: int, turned: bool) -> np.ndarray:
+    take = Performance(np.zeros(1), scene.weights[row][None], scene.turns[row][None] if turned else None, 30.0)
+    return flame_forward(scene.own.model, scene.own.shape, scene.map.frames(take)[0])
+
+
+def test_apply_a_performance(scene):
+    """Catches a performance at another rate or place than asked for, or on another identity."""
+    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=10) == {"FINISHED"}
+    for row in (0, 3, 6):
+        np.testing.assert_allclose(at(10 + row), expected(scene, row, True), atol=TOLERANCE_M)
+    assert bpy.context.scene.frame_end >= 16
+    bpy.ops.stga.apply_motion(filepath=str(scene.take), start=10, speed=0.5, place="strip")
+    np.testing.assert_allclose(at(16), expected(scene, 3, True), atol=TOLERANCE_M)
+
+
+def test_controls(scene):
+    """Catches a control that moves something else than the map says, needs Python at playback, or stays behind."""
+    before = at(1)
+    assert bpy.ops.stga.add_arkit_controls() == {"FINISHED"}
+    head = the_head()
+    rig = rig_of(head)
+    drivers = [*rig.animation_data.drivers, *head.data.shape_keys.animation_data.drivers]
+    assert all(driver.driver.is_simple_expression and driver.driver.is_valid for driver in drivers)
+    zero = np.zeros(3)
+    neutral = FlameFrame(np.zeros(10), zero, zero, zero, zero, np.zeros(6))
+    np.testing.assert_allclose(at(1), flame_forward(scene.own.model, scene.own.shape, neutral), atol=TOLERANCE_M)
+    for row in (1, 2):
+        for name in ARKIT_SHAPES:
+            rig[name] = float(scene.weights[row, COLUMN[name]])
+        rig.update_tag()
+        bpy.context.view_layer.update()
+        np.testing.assert_allclose(at(1), expected(scene, row, False), atol=2 * TOLERANCE_M)
+    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1) == {"FINISHED"}
+    np.testing.assert_allclose(at(4), expected(scene, 3, False), atol=2 * TOLERANCE_M)
+    assert rig["jawOpen"] == pytest.approx(scene.weights[3, COLUMN["jawOpen"]], abs=1e-5)
+    assert bpy.ops.stga.remove_arkit_controls() == {"FINISHED"}
+    assert not any(name in rig for name in ARKIT_SHAPES)
+    np.testing.assert_allclose(at(1), before, atol=1e-7)
+
+
+def test_a_head_with_shape_keys(scene, tmp_path):
+    """Catches a head of another model that has ARKit's shapes, in its own spelling, and cannot be driven."""
+    from capture.factory import write_mesh_capture
+
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ball")))
+    bpy.context.scene.render.fps = 30
+    head = the_head()
+    if head.data.shape_keys is None:
+        head.shape_key_add(name="Basis")
+    for name in ("JawOpen", "mouthSmile_L"):
+        head.shape_key_add(name=name, from_mix=False).value = 0
+    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1, strength=0.5) == {"FINISHED"}
+    bpy.context.scene.frame_set(4)
+    keys = head.data.shape_keys.key_blocks
+    assert keys["JawOpen"].value == pytest.approx(0.5 * scene.weights[3, COLUMN["jawOpen"]], abs=1e-5)
+    assert keys["mouthSmile_L"].value == pytest.approx(0.5 * scene.weights[3, COLUMN["mouthSmileLeft"]], abs=1e-5)
+
+
+def test_mistakes(scene, tmp_path):
+    """Catches tracebacks, and a head that is changed by a file that cannot be read."""
+    before = sorted(bpy.data.actions.keys())
+    text = scene.take.read_text()
+    (tmp_path / "typo.csv").write_text(text.replace("JawOpen", "JawOpne"))
+    with pytest.raises(RuntimeError, match="lacks jawOpen; it has 'JawOpne'"):
+        bpy.ops.stga.apply_motion(filepath=str(tmp_path / "typo.csv"))
+    assert sorted(bpy.data.actions.keys()) == before

@@ -1,0 +1,90 @@
+"""A generated head in FLAME's topology with expressions, and random ARKit poses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from flame.mouths import open_flame
+
+from stga_addon.driving.correspondence import face_points
+from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
+from stga_addon.driving.shapes import face_shapes
+from stga_addon.flame.model import FlameModel
+
+KERNEL_M, REACH_M = 0.006, 0.012
+RIGID = tuple(name for name in ARKIT_SHAPES if name.startswith("jaw"))
+OPPOSITES = (
+    ("jawLeft", "jawRight"),
+    ("mouthLeft", "mouthRight"),
+    *(
+        (f"eyeLook{a}{side}", f"eyeLook{b}{side}")
+        for a, b in (("Up", "Down"), ("In", "Out"))
+        for side in ("Left", "Right")
+    ),
+)
+SAMPLES = 400
+
+
+def generated_flame(shared_data: Path, components: int) -> FlameModel:
+    """FLAME 2023 Open's template and 60 identity components, a jaw and eyes, and expressions (`with_expressions`)."""
+    model = _with_eyes(open_flame(shared_data))
+    return with_expressions(replace(model, posedirs=0 * model.posedirs), components)
+
+
+def with_expressions(model: FlameModel, components: int) -> FlameModel:
+    """The model with other expressions: FLAME's own are not published openly.
+
+    They are principal components of what random combinations of ICT-FaceKit's shapes other than the jaw's do, spread
+    from the face's points over the mesh.
+    """
+    identity = model.shapedirs[:, :, : model.n_identity]
+    places, used = face_points(model, "head")
+    points = places.on(model.v_template, model.faces)[used]
+    distance = np.linalg.norm(model.v_template[:, None] - points, axis=2)
+    spread = np.exp(-0.5 * (distance / KERNEL_M) ** 2)
+    spread /= np.maximum(spread.sum(axis=1, keepdims=True), 1e-9)
+    spread *= np.exp(-((np.maximum(distance.min(axis=1), REACH_M) - REACH_M) ** 2) / REACH_M**2)[:, None]
+    spread[model.weights[:, 3:].any(axis=1)] = 0
+    kept = [column for column, name in enumerate(ARKIT_SHAPES) if name not in RIGID]
+    moved = np.einsum("vp,spc->svc", spread, face_shapes().shapes[kept][:, used]).reshape(len(kept), -1)
+    weights = random_poses(SAMPLES, np.random.default_rng(0))[:, kept]
+    # Principal components of weights @ moved, from the small matrix of the shapes' products.
+    values, vectors = np.linalg.eigh(moved @ moved.T)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    _, sizes, axes = np.linalg.svd((weights - weights.mean(axis=0)) @ root, full_matrices=False)
+    axes = axes[:components] @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T @ moved
+    expressions = (sizes[:components, None] * axes / np.sqrt(SAMPLES)).T.reshape(-1, 3, min(components, len(kept)))
+    return replace(model, shapedirs=np.concatenate([identity, expressions], axis=2))
+
+
+def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 52) weights as of a face in motion: a third of the shapes, no opposites, a third with closed lips."""
+    weights = rng.random((count, COUNT)) * (rng.random((count, COUNT)) < 1 / 3)
+    for pair in OPPOSITES:
+        chosen = rng.integers(0, 2, count)
+        for number, name in enumerate(pair):
+            weights[:, COLUMN[name]] *= chosen == number
+    closed = rng.random(count) < 1 / 3
+    weights[closed, COLUMN["jawOpen"]] = rng.random(int(closed.sum()))
+    weights[:, COLUMN["mouthClose"]] = np.where(closed, weights[:, COLUMN["jawOpen"]] * rng.random(count), 0)
+    weights[:, COLUMN["tongueOut"]] = 0
+    return np.asarray(weights)
+
+
+def _with_eyes(model: FlameModel) -> FlameModel:
+    """The model whose eyeballs, the smaller parts of the mesh, follow their joints."""
+    label = np.arange(len(model.v_template))
+    while True:
+        merged = label.copy()
+        for corner in range(3):
+            np.minimum.at(merged, model.faces[:, corner], label[model.faces].min(axis=1))
+        if (merged == label).all():
+            break
+        label = merged
+    weights, regressor = model.weights.copy(), model.j_regressor.copy()
+    for part in np.unique(label)[1:]:
+        inside = label == part
+        joint = 3 if model.v_template[inside, 0].mean() > 0 else 4
+        weights[inside] = np.eye(5)[joint]
+        regressor[joint] = inside / inside.sum()
+    return replace(model, weights=weights, j_regressor=regressor)

@@ -1,0 +1,88 @@
+"""Performances on the command line: rendered, exported, and converted."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.camera import look_at
+from stga_addon.cli.main import main
+from stga_addon.development.demo.head import synthetic_flame, write_flame
+from stga_addon.driving.inverse import write_performance
+from stga_addon.driving.names import COLUMN
+from stga_addon.driving.performance import Performance
+from stga_addon.driving.read_performance import read_performance
+from stga_addon.flame.forward import flame_forward, neutral_frame
+from stga_addon.flame.sequence import read_motion, sequence_mesh
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, Path]:
+    """The demo's model, an avatar of another identity of it, and ten frames in which the jaw opens and turns left."""
+    folder = tmp_path_factory.mktemp("drive")
+    model = synthetic_flame(0)
+    write_flame(model, folder / "flame.npz")
+    neutral = flame_forward(model, np.full(model.n_identity, 0.5), neutral_frame(model)).astype(np.float32)
+    write_avatar(folder / "a.npz", Avatar(lattice_splats(neutral, model.faces, order=0), "stga", neutral, model.faces))
+    weights = np.zeros((10, 52))
+    weights[:, COLUMN["jawOpen"]] = np.linspace(0, 0.9, 10)
+    weights[:, COLUMN["jawLeft"]] = np.linspace(0, 0.5, 10)
+    write_performance(folder / "take.csv", Performance(np.arange(10) / 30, weights, None, 30.0))
+    camera = look_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), 64, 64, 130.0)
+    world = np.linalg.inv(np.vstack([camera.world_to_camera, [0, 0, 0, 1]])[:4])
+    world[:, 1:3] *= -1
+    entry = {"file_path": "x.png", "timestep_index": 0, "camera_index": 0, "transform_matrix": world.tolist(),
+             "fl_x": 130.0, "fl_y": 130.0, "cx": 32.0, "cy": 32.0, "w": 64, "h": 64}  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps({"frames": [entry]}))
+    return {name: folder / name for name in ("flame.npz", "a.npz", "take.csv", "cameras.json")}
+
+
+def test_convert_there_and_back(files, tmp_path, capsys):
+    """Catches a motion that `read_motion` refuses, another rate, and a mirror that does not exchange sides."""
+    out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
+    assert (
+        main(["drive", *map(str, (files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out))]) == 0
+    )
+    model = synthetic_flame(0)
+    motion = read_motion(out, model)
+    assert len(motion.timesteps) == 19
+    drop = sequence_mesh(motion, 18) - sequence_mesh(motion, 0)
+    assert drop[:, 1].min() < -0.008
+    arguments = [out, "--flame", files["flame.npz"], "--mirror", "--out", back]
+    assert main(["drive", *map(str, arguments)]) == 0
+    weights = read_performance(back).weights
+    np.testing.assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
+    np.testing.assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
+    assert main(["drive", str(out), "--out", str(tmp_path / "x.npz")]) == 2
+    assert "holds FLAME parameters already" in capsys.readouterr().err
+    assert main(["drive", str(files["take.csv"]), "--out", str(tmp_path / "x.npz")]) == 2
+    assert "needs the FLAME model file" in capsys.readouterr().err
+
+
+def test_render_and_export_a_performance(files, tmp_path, capsys):
+    """Catches a command that takes FLAME motions alone, or options that change nothing."""
+    base = ["render", files["a.npz"], "--cameras", files["cameras.json"], "--motion", files["take.csv"]]
+    base += ["--flame", files["flame.npz"], "--device", "cpu", "--out"]
+    assert main([str(a) for a in [*base, tmp_path / "full"]]) == 0
+    assert main([str(a) for a in [*base, tmp_path / "less", "--gain", "jaw=0.2"]]) == 0
+    full, less = (
+        [np.asarray(Image.open(path)).astype(int) for path in sorted((tmp_path / name).iterdir())]
+        for name in ("full", "less")
+    )
+    assert len(full) == len(less) == 10
+    assert np.abs(full[0] - less[0]).max() <= 1
+    assert np.abs(full[9] - full[0]).sum() > 2 * np.abs(less[9] - less[0]).sum() > 0
+    ply = [files["a.npz"], "--format", "ply", "--timestep", 9, "--motion", files["take.csv"], "--flame"]
+    assert main(["export", *map(str, [*ply, files["flame.npz"], "--out", tmp_path / "a.ply"])]) == 0
+    assert (tmp_path / "a.ply").stat().st_size > 1000
+    assert main([str(a) for a in [*base, tmp_path / "x", "--stay-trained"]]) == 2
+    assert "is no run with a FLAME capture" in capsys.readouterr().err
+    ply = ["export", files["a.npz"], "--format", "ply", "--mirror", "--out", tmp_path / "b.ply"]
+    assert main([str(a) for a in ply]) == 2
+    assert "--mirror: has no effect without --motion" in capsys.readouterr().err

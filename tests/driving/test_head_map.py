@@ -1,0 +1,177 @@
+"""ARKit's shapes on a head of any mesh, against its own masks, mediapipe, and a nonlinear solver."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.driving.correspondence import face_points
+from stga_addon.driving.head_map import head_map, head_turns
+from stga_addon.driving.inverse import arkit_weights, captured_performance, head_angles, write_performance
+from stga_addon.driving.names import ARKIT_SHAPES, COLUMN
+from stga_addon.driving.open_motion import MotionOptions, performed
+from stga_addon.driving.performance import Performance
+from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.shapes import effective_weights
+from stga_addon.errors import StgaError
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.sequence import FlameSequence
+
+from .heads import generated_flame, random_poses, with_expressions
+
+NOSE_TIP, UPPER_LIP, LOWER_LIP, CHIN, RIGHT_EYE, LEFT_EYE = 4, 13, 14, 152, 33, 263
+MOUTH_LEFT, MOUTH_RIGHT = 291, 61
+
+
+def sequence_of(model, shape=None) -> FlameSequence:
+    return FlameSequence(model, np.zeros(model.n_identity) if shape is None else shape, None, (), {}.__getitem__)
+
+
+@pytest.fixture(scope="module")
+def demo():
+    """The demo's head, whose 10 expressions are not ICT-FaceKit's, and its map."""
+    sequence = sequence_of(synthetic_flame(1))
+    return sequence, head_map(sequence, "demo")
+
+
+@pytest.fixture(scope="module")
+def rich():
+    """The demo's head with 48 expressions that reach most shapes, of another identity, and its map."""
+    model = with_expressions(synthetic_flame(0), 48)
+    sequence = sequence_of(model, np.random.default_rng(0).normal(0, 0.5, model.n_identity))
+    return sequence, head_map(sequence, "rich")
+
+
+def posed(sequence, found, weights) -> np.ndarray:
+    """(N, 3) face points of one row of weights."""
+    row = found.parameters(weights[None])[0]
+    count, zero = sequence.model.n_expression, np.zeros(3)
+    frame = FlameFrame(row[:count], zero, zero, row[count : count + 3], zero, row[count + 3 :])
+    return found.points.on(flame_forward(sequence.model, sequence.shape, frame), sequence.model.faces)
+
+
+def weights_of(**values: float) -> np.ndarray:
+    weights = np.zeros(len(ARKIT_SHAPES))
+    for name, value in values.items():
+        weights[COLUMN[name]] = value
+    return weights
+
+
+def test_points_lie_where_the_masks_are(demo):
+    """Catches points on another feature, mirrored, or on the back of the head."""
+    model = demo[0].model
+    places, used = face_points(model, "demo")
+    at, corners = places.on(model.v_template, model.faces), model.faces[places.face]
+    assert used.sum() > 440
+    for point, mask in ((NOSE_TIP, "nose"), (UPPER_LIP, "lips"), (LOWER_LIP, "lips")):
+        assert np.isin(corners[point], model.masks[mask]).any(), mask
+    near_eyes = [np.linalg.norm(at[p] - model.v_template[model.masks[m]], axis=1).min()
+                 for p, m in ((LEFT_EYE, "left_eye_region"), (RIGHT_EYE, "right_eye_region"))]  # fmt: skip
+    assert max(near_eyes) < 0.006
+    assert at[LEFT_EYE, 0] > 0.02 and at[RIGHT_EYE, 0] < -0.02  # noqa: PT018
+    assert at[CHIN, 1] < at[LOWER_LIP, 1] < at[NOSE_TIP, 1]
+
+
+@pytest.mark.slow
+def test_points_agree_with_the_detector(shared_data):
+    """Catches a registration that slides along the face: mediapipe's own landmarks on pictures of the same head."""
+    pytest.importorskip("mediapipe")
+    from stga_addon.tracking.correspondence import calibrate
+    from stga_addon.tracking.detectors import make_detector
+
+    model = generated_flame(shared_data, 1)
+    places, used = face_points(model, "open FLAME")
+    detected, reliable = calibrate(model, make_detector(), "open FLAME")
+    apart = places.on(model.v_template, model.faces) - detected.on(model.v_template, model.faces)
+    distance = np.linalg.norm(apart, axis=1)[used & reliable]
+    assert np.median(distance) < 0.002
+    assert np.quantile(distance, 0.9) < 0.004
+
+
+def test_directions(demo):
+    """Catches a jaw that closes, left for right, eyes that look the other way, and a tongue that does anything."""
+    sequence, found = demo
+    model, rest = sequence.model, posed(*demo, weights_of())
+    row = {number: index for index, number in enumerate(np.flatnonzero(found.used))}
+    opened = posed(*demo, weights_of(jawOpen=1.0)) - rest
+    assert opened[row[CHIN], 1] < -0.008
+    assert abs(opened[row[NOSE_TIP]]).max() < 0.003
+    smile = np.linalg.norm(posed(*demo, weights_of(mouthSmileLeft=1.0)) - rest, axis=1)
+    assert smile[row[MOUTH_LEFT]] > smile[row[MOUTH_RIGHT]]
+    assert posed(*demo, weights_of(jawLeft=1.0))[row[CHIN], 0] > rest[row[CHIN], 0] + 0.002
+    np.testing.assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
+    assert found.reach[COLUMN["tongueOut"]] == 0
+    for name, axis, sign in (("eyeLookUpLeft", 1, 1), ("eyeLookOutLeft", 0, 1), ("eyeLookInLeft", 0, -1)):
+        row_ = found.parameters(weights_of(**{name: 1.0})[None])[0]
+        zero = np.zeros(3)
+        frame = FlameFrame(np.zeros(model.n_expression), zero, zero, zero, zero, row_[model.n_expression + 3 :])
+        ball = model.weights[:, 3] > 0.9
+        before = model.v_template[ball]
+        pupil = before[:, 2].argmax()
+        moved = flame_forward(model, sequence.shape, frame)[ball][pupil] - before[pupil]
+        assert sign * moved[axis] > 0.003, name
+
+
+@pytest.mark.slow
+def test_combinations_against_a_free_fit(rich):
+    """Catches a map that adds up single shapes wrongly: closed lips on an open jaw are among the poses."""
+    sequence, found = rich
+    count, zero, faces = sequence.model.n_expression, np.zeros(3), sequence.model.faces
+    weights = random_poses(12, np.random.default_rng(3))
+    rest, missed, best = posed(*rich, weights_of()), [], []
+    for row in weights:
+        wanted = rest + np.tensordot(effective_weights(row), found.targets, 1)
+
+        def points(values):
+            frame = FlameFrame(values[:count], zero, zero, values[count:], zero, np.zeros(6))
+            return found.points.on(flame_forward(sequence.model, sequence.shape, frame), faces)
+
+        start = found.parameters(row[None])[0, : count + 3]
+        free = least_squares(lambda values: (points(values) - wanted).ravel() * 1000, start, max_nfev=6)  # noqa: B023
+        missed.append(np.linalg.norm(posed(sequence, found, row) - wanted, axis=1).mean())
+        best.append(np.linalg.norm(points(free.x) - wanted, axis=1).mean())
+    assert np.mean(missed) < 1.1 * np.mean(best)
+
+
+def test_there_and_back(rich, tmp_path):
+    """Catches weights lost on the way to a FLAME motion and back to a file: within 0.01 where the head tells them
+    apart."""
+    sequence, found = rich
+    weights = random_poses(40, np.random.default_rng(5)) * 0.8
+    head = np.random.default_rng(6).normal(0, 0.2, (40, 3))
+    take = Performance(np.arange(40) / 30, weights, head, 30.0)
+    write_performance(tmp_path / "a.csv", take)
+    read = read_performance(tmp_path / "a.csv")
+    np.testing.assert_allclose(read.weights, weights, atol=1e-6)
+    motion = performed(read, sequence, "rich", MotionOptions())
+    back = captured_performance(motion.sequence, "rich", motion.fps)
+    write_performance(tmp_path / "b.csv", back)
+    again = read_performance(tmp_path / "b.csv")
+    np.testing.assert_allclose(again.times, take.times, atol=1e-4)
+    np.testing.assert_allclose(again.head, head, atol=1e-5)
+    error = np.abs(again.weights - effective_weights(weights)).max(axis=0)
+    sure = [COLUMN[name] for name in ARKIT_SHAPES if name.startswith(("eyeLook", "jawOpen", "jawLeft", "jawRight"))]
+    assert error[sure].max() < 0.01
+    assert (error < 0.01).sum() >= 30, {name: round(float(e), 3) for name, e in zip(ARKIT_SHAPES, error, strict=True)}
+    # What cannot be told apart still looks the same.
+    frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
+    for number, row in enumerate(arkit_weights(frames, found, sequence)[:5]):
+        apart = posed(sequence, found, row) - posed(sequence, found, weights[number])
+        assert np.linalg.norm(apart, axis=1).max() < 5e-4
+
+
+def test_head_turns_are_their_angles():
+    """Catches an order of yaw, pitch and roll that differs between the two ways."""
+    angles = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 3))
+    np.testing.assert_allclose(head_angles(head_turns(angles)), angles, atol=1e-9)
+    np.testing.assert_allclose(head_turns([[0.3, 0, 0]]), [[0, 0.3, 0]], atol=1e-12)
+
+
+def test_a_head_without_a_face():
+    """Catches a map of nonsense for a model in other units or axes."""
+    model = synthetic_flame(0)
+    small = replace(model, v_template=model.v_template * 0.001)
+    with pytest.raises(StgaError, match="tiny: its eyes lie 0 mm apart"):
+        head_map(sequence_of(small), "tiny")

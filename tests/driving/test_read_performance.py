@@ -1,0 +1,197 @@
+"""Performances of every tool as the same weights."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, arkit_name
+from stga_addon.driving.performance import Performance, mirrored, resampled, smoothed
+from stga_addon.driving.read_performance import is_performance, read_performance
+from stga_addon.errors import StgaError
+
+PASCAL = [name[0].upper() + name[1:] for name in ARKIT_SHAPES]
+ROTATIONS = [
+    "HeadYaw",
+    "HeadPitch",
+    "HeadRoll",
+    *(f"{s}Eye{a}" for s in ("Left", "Right") for a in ("Yaw", "Pitch", "Roll")),
+]
+HEADER = ["Timecode", "BlendShapeCount", *PASCAL, *ROTATIONS]
+RNG = np.random.default_rng(0)
+WEIGHTS = RNG.random((6, 52)).round(4)
+
+
+def write_csv(path: Path, codes: list[str], weights: np.ndarray, header: list[str] = HEADER) -> Path:
+    """A Live Link Face file; head rotation is (0.1, 0.2, 0.3) in each row."""
+    values = {**dict(zip(PASCAL, weights.T, strict=True)), **{n: np.full(len(weights), 0.0) for n in ROTATIONS}}
+    values |= {name: np.full(len(weights), 0.1 * (k + 1)) for k, name in enumerate(ROTATIONS[:3])}
+    rows = [",".join([code, "61", *(f"{values[name][n]:.6f}" for name in header[2:])]) for n, code in enumerate(codes)]
+    path.write_text("\n".join([",".join(header), *rows]) + "\n")
+    return path
+
+
+def test_live_link_face_rows_at_half_the_timecodes_rate_over_midnight(tmp_path):
+    """Catches columns read by place, a time base guessed from the rows, and a jump of a day at midnight."""
+    frames = np.arange(0, 130, 2) + 60 * 86_399 + 31  # of 60 a second
+    codes = [
+        f"{n // 216000 % 24:02d}:{n // 3600 % 60:02d}:{n // 60 % 60:02d}:{n % 60:02d}.250" for n in frames.tolist()
+    ]
+    weights = np.random.default_rng(1).random((len(codes), 52)).round(5)
+    swapped = HEADER.copy()
+    swapped[2], swapped[40] = swapped[40], swapped[2]
+    found = read_performance(write_csv(tmp_path / "take.csv", codes, weights, swapped))
+    np.testing.assert_allclose(found.weights, weights, atol=1e-6)
+    np.testing.assert_allclose(found.times, np.arange(len(codes)) / 30, atol=1e-9)
+    assert found.fps == pytest.approx(30)
+    np.testing.assert_allclose(found.head, [[0.1, 0.2, 0.3]] * len(codes))
+
+
+def test_lost_rows_and_rows_without_a_face(tmp_path):
+    """Catches a performance that plays faster where rows are missing, and a face of zeros where none was seen."""
+    codes = [f"10:00:{n // 60:02d}:{n % 60:02d}.000" for n in range(55, 65)]
+    weights = np.repeat(np.linspace(0, 0.9, 10)[:, None], 52, axis=1)
+    lines = write_csv(tmp_path / "take.csv", codes, weights).read_text().splitlines()
+    lines[4] = "10:00:00:58.000,0"
+    del lines[6:8]
+    (tmp_path / "take.csv").write_text("\n".join(lines))
+    found = read_performance(tmp_path / "take.csv")
+    assert (len(found.times), found.lost) == (7, 3)
+    np.testing.assert_allclose(resampled(found).weights, weights, atol=1e-6)
+    np.testing.assert_allclose(resampled(found, 120.0).weights[::2], weights, atol=1e-6)
+
+
+def test_drop_frame_timecode_keeps_time_over_a_minute(tmp_path):
+    """Catches frame numbers that 29.97 timecode leaves out counted as lost frames."""
+    codes = [f"00:00:59;{n:02d}" for n in range(20, 30)] + [f"00:01:00;{n:02d}" for n in range(2, 12)]
+    found = read_performance(write_csv(tmp_path / "take.csv", codes, np.zeros((20, 52))))
+    np.testing.assert_allclose(np.diff(found.times), 1001 / 30000, atol=1e-9)
+
+
+def test_fifty_one_shapes_and_a_takes_folder(tmp_path):
+    """Catches a source without the tongue, and the extra files of a take's folder."""
+    header = [name for name in HEADER if name != "TongueOut"]
+    (tmp_path / "take").mkdir()
+    write_csv(tmp_path / "take/Slate_1.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], WEIGHTS, header)
+    write_csv(tmp_path / "take/Slate_1_neutral.csv", ["01:00:00:00.0"], WEIGHTS[:1])
+    assert is_performance(tmp_path / "take")
+    found = read_performance(tmp_path / "take")
+    np.testing.assert_allclose(found.weights[:, :51], WEIGHTS[:, :51], atol=1e-6)
+    assert not found.weights[:, 51].any()
+
+
+def test_every_json_form_and_audio2face_csv(tmp_path):
+    """Catches a tool whose file is refused, or whose weights come to other shapes."""
+    order = RNG.permutation(52)
+    names = [ARKIT_SHAPES[k] for k in order]
+    rows = WEIGHTS[:, order].tolist()
+    categories = [[("_neutral", 0.5), *zip(names, row, strict=True)] for row in rows]
+    mediapipe = [{"blendshapes": [{"categoryName": n, "score": v} for n, v in frame]} for frame in categories]
+    documents = {
+        "audio2face": {"exportFps": 25.0, "numPoses": 52, "numFrames": 6, "facsNames": names, "weightMat": rows},
+        "lam": {
+            "names": names,
+            "metadata": {"fps": 25.0},
+            "frames": [{"weights": row, "time": n / 25} for n, row in enumerate(rows)],
+        },
+        "mediapipe": {"fps": 25, "frames": mediapipe},
+        "plain": {"fps": 25, "frames": [dict(zip(names, row, strict=True)) for row in rows]},
+    }
+    for name, document in documents.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(document))
+        found = read_performance(tmp_path / f"{name}.json")
+        np.testing.assert_allclose(found.weights, WEIGHTS, err_msg=name)
+        assert found.fps == pytest.approx(25), name
+    header = ["timeCode", *(f"blendShapes.{PASCAL[k]}" for k in order)]
+    lines = [",".join(map(str, [n / 25, *row])) for n, row in enumerate(rows)]
+    (tmp_path / "a2f.csv").write_text("\n".join([",".join(header), *lines]))
+    found = read_performance(tmp_path / "a2f.csv")
+    np.testing.assert_allclose(found.weights, WEIGHTS)
+    assert found.fps == pytest.approx(25)
+
+
+def test_facial_mocap_lines(tmp_path):
+    """Catches percent taken for shares, degrees for radians, and the separator of version 2."""
+    short = {name: name.replace("Left", "_L").replace("Right", "_R") for name in ARKIT_SHAPES}
+    lines = []
+    for n, row in enumerate(WEIGHTS):
+        sign = "&" if n % 2 else "-"
+        fields = [f"{short[name]}{sign}{100 * value:.2f}" for name, value in zip(ARKIT_SHAPES, row, strict=True)]
+        lines.append("|".join(fields) + "|=head#90,45,-30,0.1,0.2,0.3|rightEye#1,2,3|leftEye#1,2,3|")
+    (tmp_path / "take.txt").write_text("\n".join(lines))
+    found = read_performance(tmp_path / "take.txt")
+    np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(found.head), [[45, 90, -30]] * 6)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda text: text.replace("JawOpen", "JawOpne"), "lacks jawOpen; it has 'JawOpne'"),
+        (lambda text: text.replace("MouthClose,", "Other,").replace("JawLeft", "X"), "lacks jawLeft, mouthClose"),
+        (lambda text: "Timecode,JawOpen\n0,1\n", "names 1 of ARKit's 52"),
+        (lambda text: text.replace("0.5", "half", 1), "expected a number"),
+        (lambda text: text.replace("01:00:00:00.0", "noon"), "Timecode is 'noon'"),
+        (lambda text: text.splitlines()[0], "has no row with a face"),
+        (lambda text: text.replace("0.1", "91.1"), "beyond"),
+        (lambda text: "", "is empty"),
+    ],
+)
+def test_mistakes_are_one_sentence(tmp_path, change, sentence):
+    """Catches tracebacks, and sentences that do not say which names are missing."""
+    path = write_csv(tmp_path / "take.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], np.full((6, 52), 0.5))
+    path.write_text(change(path.read_text()))
+    with pytest.raises(StgaError, match=sentence) as caught:
+        read_performance(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("document", "sentence"),
+    [
+        ({"names": ["jawOpen"], "frames": [[0.1, 0.2]]}, "has 2 weights, but the file names 1"),
+        ({"frames": [dict.fromkeys(ARKIT_SHAPES[:-3], 0.1)]}, "lacks noseSneerLeft, noseSneerRight"),
+        ({"frames": [dict.fromkeys(ARKIT_SHAPES, 0.1), {}]}, "frame 2: lacks 'eyeBlinkLeft'"),
+        ({"frames": [dict.fromkeys(ARKIT_SHAPES, "x")]}, "expected a number"),
+        ({"other": 1}, "has no list of frames"),
+        ([3], "expected named weights"),
+        ({"fps": 0, "frames": [dict.fromkeys(ARKIT_SHAPES, 0.1)]}, "not usable"),
+    ],
+)
+def test_mistakes_in_json(tmp_path, document, sentence):
+    """Catches tracebacks for JSON of other forms."""
+    (tmp_path / "x.json").write_text(json.dumps(document))
+    with pytest.raises(StgaError, match=sentence):
+        read_performance(tmp_path / "x.json")
+
+
+def test_names_in_every_spelling():
+    """Catches a shape that is another tool's by its spelling, and words that only look like shapes."""
+    for spelled in (
+        "mouthSmileLeft",
+        "MouthSmileLeft",
+        "mouthSmile_L",
+        "mouth_smile_left",
+        "blendShapes.MouthSmileLeft",
+    ):
+        assert arkit_name(spelled) == "mouthSmileLeft", spelled
+    assert arkit_name("browInnerUp_L") is None
+    assert arkit_name("_neutral") is None
+
+
+def test_mirror_and_smoothing():
+    """Catches a pair that is not exchanged, and smoothing that moves a take in time or changes a held pose."""
+    base = Performance(np.arange(40) / 30, np.zeros((40, 52)), np.tile([0.1, 0.2, 0.3], (40, 1)), 30.0)
+    base.weights[20, COLUMN["eyeBlinkLeft"]] = 1.0
+    base.weights[:, COLUMN["jawOpen"]] = 0.4
+    other = mirrored(base)
+    assert other.weights[20, COLUMN["eyeBlinkRight"]] == 1.0
+    np.testing.assert_allclose(other.head[0], [-0.1, 0.2, -0.3])
+    np.testing.assert_array_equal(mirrored(other).weights, base.weights)
+    soft = smoothed(base, 0.05).weights
+    np.testing.assert_allclose(soft[:, COLUMN["jawOpen"]], 0.4)
+    blink = soft[:, COLUMN["eyeBlinkLeft"]]
+    assert blink.argmax() == 20
+    assert blink.sum() == pytest.approx(1)
+    assert blink.max() < 0.4

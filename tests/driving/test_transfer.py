@@ -1,0 +1,70 @@
+"""Motion of one person on another's head."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stga_addon.driving.performance import Performance, relative_to
+from stga_addon.driving.transfer import (
+    exchanged_neutral,
+    led_back,
+    outside,
+    quiet_neutral,
+    quiet_weights,
+    trained_range,
+)
+from stga_addon.flame.forward import FlameFrame
+
+ZERO = np.zeros(3)
+FRAME = FlameFrame(np.zeros(4), ZERO, ZERO, ZERO, ZERO, np.zeros(6))
+
+
+def talking(bias: np.ndarray, count: int = 60) -> list[FlameFrame]:
+    """Quiet for a third of the time, on top of a bias that the person's own face leaves in the coefficients."""
+    time = np.arange(count)
+    moves = np.where(time < count // 3, 0, np.sin(time))[:, None] * [2.0, -1.0, 0.5, 0.0]
+    return [replace(FRAME, expr=bias + row, jaw_pose=np.array([0.1 * max(row[0], 0), 0, 0])) for row in moves]
+
+
+def test_the_performers_own_face_is_left_out():
+    """Catches a neutral taken from the middle of speech, and one that keeps the other person's face."""
+    bias, own = np.array([1.5, -0.7, 0.3, 2.0]), np.array([0.2, 0.0, -0.1, 0.0])
+    frames = talking(bias)
+    theirs = quiet_neutral(frames)
+    np.testing.assert_allclose(theirs["face"], bias)
+    np.testing.assert_allclose(theirs["jaw"], 0)
+    moved = exchanged_neutral(frames, theirs, quiet_neutral(talking(own)))
+    for frame, expected in zip(moved, talking(own), strict=True):
+        np.testing.assert_allclose(frame.expr, expected.expr, atol=1e-12)
+        np.testing.assert_allclose(frame.jaw_pose, expected.jaw_pose, atol=1e-12)
+
+
+def test_a_resting_face_that_is_not_zero():
+    """Catches a calibrated performance that no longer closes the eyes, or starts with a smile."""
+    weights = np.zeros((50, 52))
+    weights[:, 3] = 0.2
+    weights[10:15, 3] = 1.0
+    take = Performance(np.arange(50) / 30, weights, None, 30.0)
+    rest = quiet_weights(take)
+    assert rest[3] == 0.2
+    changed = relative_to(take, rest).weights[:, 3]
+    np.testing.assert_allclose(changed[:10], 0)
+    np.testing.assert_allclose(changed[10:15], 1)
+
+
+def test_led_back_to_what_was_trained():
+    """Catches a motion that is changed where it was trained, is led beyond the range, or is cut off without motion."""
+    trained = trained_range(talking(np.zeros(4), 200))
+    inside = talking(np.zeros(4))
+    for before, after in zip(inside, led_back(inside, trained), strict=True):
+        np.testing.assert_allclose(after.expr, before.expr, atol=0.05)
+    wild = [replace(FRAME, expr=np.array([scale, 0, 0, 0])) for scale in (0.0, 4.0, 8.0, 100.0)]
+    assert outside(wild, trained)["face"][0] == 0
+    np.testing.assert_allclose(outside(wild, trained)["face"][2], 3.0, rtol=0.05)
+    assert not outside(wild, trained)["jaw"].any()
+    led = [frame.expr[0] for frame in led_back(wild, trained)]
+    assert led == sorted(led)
+    assert 2.0 < led[1] < led[2] < led[3] <= 2.0 * 1.25 + 0.01
+    half = led_back(wild, trained, 0.5)[2].expr[0]
+    assert half == (8.0 + led[2]) / 2
+    np.testing.assert_array_equal(led_back(wild, trained, 0.0)[3].expr, wild[3].expr)
