@@ -25,10 +25,11 @@ import pytest
 from capture import factory
 from PIL import Image
 
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.report import preset_timing
 from stga_addon.requests.folder import write_request
-from stga_addon.requests.values import Train
+from stga_addon.requests.values import Export, Played, Render, Train
 from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")
@@ -130,6 +131,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (case / "unfinished/avatar.npz").unlink()
     settings = read_run(case / "run").settings
     write_request(case / "job", Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}))
+    avatar, meshes = case / "run/avatar.npz", {4: open_capture(capture).neutral}
+    played = Played(meshes, selection={4: np.ones(320, bool)})
+    cameras = case / "mesh/transforms_val.json"
+    write_request(case / "render_job", Render(avatar, case / "asked", cameras=cameras, capture=capture))
+    write_request(case / "export_job", Export(avatar, case / "asked.stga", "web", capture, played=played))
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
     (case / "head").mkdir()
     head = {
@@ -408,7 +414,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "train": (1, train),
     "track": (1, track),
     "avatar": (0.5, avatar),
-    "perform": (0.5, lambda rng, case: [some_path(rng, case, "job", "run")]),
+    "perform": (1, lambda rng, case: [some_path(rng, case, "job", "render_job", "export_job")]),
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
     "demo": (0.2, demo),
