@@ -26,6 +26,7 @@ from capture import factory
 from PIL import Image
 from tracking.test_track import record
 
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.report import preset_timing
@@ -33,13 +34,18 @@ from stga_addon.requests.folder import write_request
 from stga_addon.requests.values import (
     Analyze,
     Evaluate,
+    Export,
     Extend,
+    Played,
     Refine,
+    Render,
     RenderRecording,
     Request,
     Resume,
+    Select,
     SelectForTake,
     SolveAgain,
+    TimePresets,
     Track,
     Train,
 )
@@ -180,6 +186,7 @@ def requests_about(case: Path) -> dict[str, Request]:
     capture, run, footage, once = case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
     key = np.zeros(synthetic_flame(0).n_expression + 18)
+    avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
     requests: tuple[Request, ...] = (
         Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
         Resume(run, capture, device="cpu"),
@@ -191,6 +198,10 @@ def requests_about(case: Path) -> dict[str, Request]:
         RenderRecording(case / "none.bin", case / "asked.mp4", 1, 25.0),
         Analyze(capture),
         Evaluate(run),
+        Render(avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture),
+        Export(avatar, case / "asked.stga", "web", capture, played=played),
+        Select(capture),
+        TimePresets(capture),
     )
     return {type(request).__name__: request for request in requests}
 
