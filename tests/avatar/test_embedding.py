@@ -9,6 +9,7 @@ from stga_addon.avatar.embedding import (
     WORLD,
     face_areas,
     face_frames,
+    frame_backward,
     to_local,
     to_world,
 )
@@ -186,3 +187,27 @@ def test_unknown_convention_is_refused():
     """Catches a misspelt convention that would silently train in another frame."""
     with pytest.raises(ValueError, match="gaussian-avatars"):
         face_frames(*random_mesh(0), random_mesh(0)[0], "gaussian-avatars")
+
+
+@pytest.mark.parametrize("part", ["force", "torque", "growth"])
+def test_backward_agrees_with_differences(part: str) -> None:
+    """Catches a gradient that leaves out what turns or grows a triangle, takes an edge for another, or has a wrong
+    sign: against central differences of the frames in random directions."""
+    vertices, faces = random_mesh(4)
+    rng = np.random.default_rng(5)
+    neutral = vertices + rng.normal(0, 0.01, vertices.shape)
+    given = {name: np.zeros((len(faces), 3)) for name in ("force", "torque")} | {"growth": np.zeros(len(faces))}
+    given[part] = rng.normal(size=given[part].shape)
+    frames = face_frames(vertices, faces, neutral)
+    found = frame_backward(vertices, faces, frames, **given)
+    step = 1e-7
+    for _ in range(3):
+        direction = rng.normal(size=vertices.shape)
+        after, before = (face_frames(vertices + sign * step * direction, faces, neutral) for sign in (1, -1))
+        moved = np.einsum("fji,fj->fi", frames.rotation, (after.origin - before.origin) / (2 * step))
+        spun = np.einsum("fji,fjk->fik", frames.rotation, (after.rotation - before.rotation) / (2 * step))
+        turned = np.stack([spun[:, 2, 1], spun[:, 0, 2], spun[:, 1, 0]], -1)  # of a skew-symmetric matrix
+        grown = np.log(after.scale / before.scale) / (2 * step)
+        expected = sum((given[name] * each).sum() for name, each in (("force", moved), ("torque", turned)))
+        expected += (given["growth"] * grown).sum()
+        assert (found * direction).sum() == pytest.approx(expected, rel=1e-5)
