@@ -83,6 +83,8 @@ def run(options: Namespace) -> None:
     if options.video is not None and options.video.suffix.lower() != ".mp4":
         raise StgaError(f"{options.video}: a video's name ends in .mp4")
     _check_film_options(options)
+    if options.motion is None:
+        check_motion_options(options)
     if options.head is None:
         _check_mesh_options(options)
     if options.cameras is None and options.video is None and options.turntable is None:
@@ -121,9 +123,7 @@ def _check_film_options(options: Namespace) -> None:
 
 def _check_mesh_options(options: Namespace) -> None:
     """Raise StgaError for an option on meshes or cameras that would have no effect."""
-    if options.motion is None:
-        check_motion_options(options)
-    elif options.capture is not None:
+    if options.motion is not None and options.capture is not None:
         raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
     if options.principal_point is not None and options.cameras is None:
         raise StgaError("--principal-point: has no effect without --cameras")

@@ -16,7 +16,7 @@ from ..flame.motion import strengthened, transferred_motion
 from ..flame.sequence import FlameSequence
 from .head_map import head_map, person_of
 from .performance import Performance, amplified, mirrored, relative_to, resampled, smoothed
-from .read_performance import is_performance, read_performance
+from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_performance
 from .transfer import (
     TrainedRange,
     chosen_neutral,
@@ -126,6 +126,12 @@ def adapted(
 
 def prepared_performance(performance: Performance, options: MotionOptions, fps: float | None = None) -> Performance:
     """The performance at an even rate, relative to its neutral face, smoothed, amplified and mirrored."""
+    if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
+        raise StgaError(
+            f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
+        )
+    if performance.times[-1] * (fps or performance.fps) > MAX_ROWS:
+        raise StgaError(f"a performance of {performance.times[-1]:.0f} s at {fps:g} frames per second is too long")
     changed = resampled(performance, fps)
     if options.neutral != "none":
         first = performance.weights[0]
