@@ -7,6 +7,7 @@ import numpy as np
 
 from ..capture.flame_capture import flame_model
 from ..capture.open import open_capture
+from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, write_performance
 from ..driving.open_motion import NEEDS_FLAME, MotionOptions, performed, prepared_performance
 from ..driving.read_performance import is_performance, read_performance
@@ -50,7 +51,7 @@ def run(options: Namespace) -> None:
     if suffix not in SUFFIXES:
         raise StgaError(f"{options.out}: expected a name that ends in {' or '.join(SUFFIXES)}")
     chosen = motion_options(options)
-    if chosen.stay_trained:
+    if options.stay_trained is not None:
         raise StgaError("--stay-trained: has no effect here, where there is no avatar")
     if not is_performance(options.source):
         _write_shapes(options, chosen)
@@ -89,7 +90,7 @@ def _person(options: Namespace) -> FlameSequence:
     if options.flame is None:
         raise StgaError(f"{options.source}: {NEEDS_FLAME}; give it with --flame")
     model = flame_model(options.flame)
-    return FlameSequence(model, np.zeros(model.n_identity), None, (), {}.__getitem__)
+    return person_of(model, model.v_template)
 
 
 def write_motion(path: Path, sequence: FlameSequence) -> None:

@@ -4,12 +4,12 @@ import argparse
 from argparse import ArgumentParser, Namespace
 
 from ..driving.names import ARKIT_SHAPES, PARTS
-from ..driving.open_motion import MotionOptions
+from ..driving.open_motion import MAX_FACTOR, MAX_SMOOTHING_S, MotionOptions
 from ..driving.transfer import NEUTRALS
 from ..errors import StgaError
 from .arguments import real_number
 
-DEFAULTS = {"strength": 1.0, "neutral": "none", "smooth": 0.0, "mirror": False, "gain": [], "stay_trained": 0.0}
+OPTIONS = ("strength", "neutral", "smooth", "mirror", "gain", "stay_trained")
 MOTION_HELP = (
     "another person's motion: FLAME parameters (.npz, or a capture), or a performance in ARKit's shapes (CSV of Live "
     "Link Face or Audio2Face, its take folder, JSON, iFacialMocap's text)"
@@ -19,11 +19,11 @@ MOTION_HELP = (
 def add_motion_options(parser: ArgumentParser) -> None:
     """What `MotionOptions` holds."""
     group = parser.add_argument_group("motion")
-    group.add_argument("--strength", type=real_number, help="of the motion; 1 (default): as recorded")
+    group.add_argument("--strength", type=factor, help="of the motion; 1 (default): as recorded")
     group.add_argument(
         "--neutral", choices=NEUTRALS, help="take the motion relative to the performer's quiet face or first frame"
     )
-    group.add_argument("--smooth", type=real_number, metavar="SECONDS", help="smooth a performance in time")
+    group.add_argument("--smooth", type=smoothing, metavar="SECONDS", help="smooth a performance in time")
     group.add_argument("--mirror", action="store_true", help="exchange left and right of a performance")
     group.add_argument(
         "--gain",
@@ -39,23 +39,38 @@ def add_motion_options(parser: ArgumentParser) -> None:
         nargs="?",
         const=1.0,
         metavar="SHARE",
-        help="lead the motion softly back to the range that the run was trained on; 0 to 1 (default without: 0)",
+        help="lead the motion softly back to the range that the run was trained on, and print how far it was outside; "
+        "0: print only, 1 (default): fully",
     )
 
 
 def gain(text: str) -> tuple[str, float]:
     """Raises argparse.ArgumentTypeError for what is no NAME=FACTOR."""
-    name, _, factor = text.partition("=")
+    name, _, value = text.partition("=")
     if name not in (*PARTS, "head", *ARKIT_SHAPES):
         raise argparse.ArgumentTypeError(f"'{text}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
-    return name, real_number(factor)
+    return name, factor(value)
+
+
+def factor(text: str) -> float:
+    """A number from 0 to MAX_FACTOR. Raises argparse.ArgumentTypeError for anything else."""
+    return _at_most(text, MAX_FACTOR)
+
+
+def smoothing(text: str) -> float:
+    """Seconds from 0 to MAX_SMOOTHING_S. Raises argparse.ArgumentTypeError for anything else."""
+    return _at_most(text, MAX_SMOOTHING_S)
 
 
 def share(text: str) -> float:
     """A number from 0 to 1. Raises argparse.ArgumentTypeError for anything else."""
+    return _at_most(text, 1.0)
+
+
+def _at_most(text: str, limit: float) -> float:
     value = real_number(text)
-    if value > 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 to 1")
+    if value > limit:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 to {limit:g}")
     return value
 
 
@@ -67,12 +82,13 @@ def motion_options(options: Namespace) -> MotionOptions:
         smoothing=options.smooth or 0.0,
         mirror=options.mirror,
         gains=dict(options.gain),
-        stay_trained=options.stay_trained or 0.0,
+        stay_trained=options.stay_trained,
     )
 
 
 def check_motion_options(options: Namespace) -> None:
     """Raise StgaError for an option of `add_motion_options` without --motion, where it would have no effect."""
-    for name, default in DEFAULTS.items():
-        if getattr(options, name) not in (None, default):
+    for name in OPTIONS:
+        value = getattr(options, name)
+        if value is not None and value is not False and value != []:
             raise StgaError(f"--{name.replace('_', '-')}: has no effect without --motion")

@@ -72,6 +72,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 def run(options: Namespace) -> None:
     _check_film_options(options)
     head, played = options.head, None
+    if options.motion is None:
+        check_motion_options(options)
     if head is None:
         _check_mesh_options(options)
     elif options.motion is None and not is_ply(options.source):
@@ -100,9 +102,7 @@ def _check_film_options(options: Namespace) -> None:
 
 def _check_mesh_options(options: Namespace) -> None:
     """Raise StgaError for an option on meshes or cameras that would have no effect."""
-    if options.motion is None:
-        check_motion_options(options)
-    elif options.capture is not None:
+    if options.motion is not None and options.capture is not None:
         raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
     if options.principal_point is not None and options.cameras is None:
         raise StgaError("--principal-point: has no effect without --cameras")

@@ -82,7 +82,7 @@ def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
         return np.asarray((first * second).sum(axis=-1))
 
     def along(edge: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        return np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1)
+        return np.asarray(np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1))
 
     ab, ac = b - a, c - a
     d00, d01, d11 = dot(ab, ab), dot(ab, ac), dot(ac, ac)
@@ -152,7 +152,7 @@ def _aligned(surface: _Surface, pupils: np.ndarray, skin: np.ndarray) -> tuple[n
         linear = found[entries].reshape(3, 3)
         points = basis @ found
         normals = source.normals @ np.linalg.inv(linear)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return points, normals
 
 

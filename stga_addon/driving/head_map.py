@@ -176,7 +176,7 @@ class _Fit:
             wanted = self.neutral + np.tensordot(effective_weights(weights), self.targets, 1)
             rows.append(features(weights))
             solutions.append(self.coefficients(jaw @ self.jaw, wanted))
-        return np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0])
 
     def _jaw(self) -> np.ndarray:
         """(52, 3) axis-angle of the shapes that turn the jaw, each fitted together with expressions."""

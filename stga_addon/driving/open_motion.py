@@ -17,7 +17,7 @@ from ..flame.sequence import FlameSequence
 from ..schema import setting
 from .head_map import head_map, person_of
 from .performance import Performance, amplified, mirrored, relative_to, resampled, smoothed
-from .read_performance import is_performance, read_performance
+from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_performance
 from .transfer import (
     NEUTRALS,
     TrainedRange,
@@ -29,7 +29,7 @@ from .transfer import (
     quiet_weights,
 )
 
-MAX_GAIN, MAX_SMOOTHING_S = 100.0, 60.0
+MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
 NEEDS_FLAME = "needs the FLAME model file (.pkl or .npz) of the head that it is to move"
 
 
@@ -42,15 +42,16 @@ class MotionOptions:
     smoothing  seconds, standard deviation; of performances alone, like the next two
     mirror     exchange left and right
     gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
-    stay_trained  0 to 1: how far parameters are led back to the range that the avatar was trained on
+    stay_trained  0 to 1: how far parameters are led back to the range that the avatar was trained on; None: that range
+                  is not asked for
     """
 
-    strength: float = setting(1.0, 0, MAX_GAIN)
+    strength: float = setting(1.0, 0, MAX_FACTOR)
     neutral: str = setting("none", choices=NEUTRALS)
     smoothing: float = setting(0.0, 0, MAX_SMOOTHING_S)
     mirror: bool = False
     gains: Mapping[str, float] = field(default_factory=dict)
-    stay_trained: float = setting(0.0, 0, 1)
+    stay_trained: float | None = setting(None, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,13 @@ def adapted(
 
 def prepared_performance(performance: Performance, options: MotionOptions, fps: float | None = None) -> Performance:
     """The performance at an even rate, relative to its neutral face, smoothed, amplified and mirrored."""
+    if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
+        raise StgaError(
+            f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
+        )
+    rate = fps or performance.fps
+    if performance.times[-1] * rate > MAX_ROWS:
+        raise StgaError(f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long")
     changed = resampled(performance, fps)
     if options.neutral != "none":
         first = performance.weights[0]

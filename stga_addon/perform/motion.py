@@ -17,7 +17,7 @@ from ..training.run.folder import read_run
 
 
 def open_avatar_motion(request: Render | Export, avatar: Avatar, say: Say) -> Motion:
-    """The request's motion on its avatar; says how far it is outside the trained range, where that is known.
+    """The request's motion on its avatar; says how far it is outside the trained range, where that is asked for.
 
     Raises StgaError.
     """
@@ -25,8 +25,9 @@ def open_avatar_motion(request: Render | Export, avatar: Avatar, say: Say) -> Mo
     source, options = request.source, request.motion_options
     run = read_run(source) if source.is_dir() else None
     flame = request.flame or (run.flame if run is not None else None)
-    trained = None if run is None else _trained(source, request.flame)
-    if trained is None and options.stay_trained:
+    asked = options.stay_trained is not None
+    trained = _trained(source, request.flame) if asked and run is not None else None
+    if asked and trained is None:
         raise StgaError(f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be the range")
     motion = open_motion(request.motion, flame, avatar.neutral, avatar.faces, options, trained, request.fps)
     for line in findings(motion):

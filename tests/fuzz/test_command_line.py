@@ -29,6 +29,8 @@ from tracking.test_track import record
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.driving.inverse import write_performance
+from stga_addon.driving.performance import Performance
 from stga_addon.report import preset_timing
 from stga_addon.requests.folder import write_request
 from stga_addon.requests.values import (
@@ -169,6 +171,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "fps": 24.0,
     }
     (case / "head/head.json").write_text(json.dumps(head))
+    write_performance(case / "take.csv", Performance(np.arange(3) / 30, np.full((3, 52), 0.3), None, 30.0))
     np.savez(case / "motion.npz", expr=np.zeros((2, 2)), pose=np.zeros((2, 15)), shape=np.zeros(4))
     case.rename(folder / "template")
     (folder / "start").mkdir()
@@ -382,7 +385,7 @@ def render(rng: random.Random, case: Path) -> list[str]:
     arguments += ["--seconds", rng.choice(["0", "0.1"]), *option(rng, 0.1, "--fps", "10", "0", "-1", "nan")]
     arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
     arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
-    arguments += option(rng, 0.2, "--motion", some_path(rng, case, "motion.npz", "flame"))
+    arguments += option(rng, 0.2, "--motion", some_path(rng, case, "motion.npz", "flame", "take.csv"))
     arguments += option(rng, 0.2, "--background", "black", "0,0.5,1", "nan,0,0", "1,2", "1e400,0,0", *TEXTS)
     arguments += option(rng, 0.1, "--principal-point", "vhap", "opencv", *TEXTS)
     if rng.random() < 0.2:
@@ -477,6 +480,18 @@ def avatar(rng: random.Random, case: Path) -> list[str]:
     return [*track(rng, case), *iterations, *(["--no-blend"] if rng.random() < 0.8 else [])]
 
 
+def drive(rng: random.Random, case: Path) -> list[str]:
+    arguments = [some_path(rng, case, "take.csv", "motion.npz", "flame")]
+    arguments += ["--out", some_path(rng, case, "new.csv", "new.npz")]
+    arguments += option(rng, 0.7, "--flame", some_path(rng, case, "flame/model.npz"))
+    arguments += option(rng, 0.2, "--head", some_path(rng, case, "flame", "mesh"))
+    arguments += option(rng, 0.2, "--fps", "25", *NUMBERS)
+    arguments += option(rng, 0.2, "--neutral", "quiet", "first", *TEXTS)
+    arguments += option(rng, 0.2, "--strength", "2", *NUMBERS)
+    arguments += option(rng, 0.2, "--smooth", "0.1", *NUMBERS)
+    return arguments + option(rng, 0.2, "--gain", "jaw=2", "x=1", "jaw=nan", *TEXTS)
+
+
 def environment(rng: random.Random, case: Path) -> list[str]:
     action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
     return ["--folder", some_path(rng, case, "new"), *action]
@@ -486,6 +501,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "info": (3, info),
     "select": (3, select),
     "export": (3, export),
+    "drive": (1, drive),
     "render": (3, render),
     "eval": (2, evaluate),
     "train": (1, train),

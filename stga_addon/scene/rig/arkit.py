@@ -147,7 +147,8 @@ def checked_shape_keys(head: Any) -> dict[int, str]:
 def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int]]]:
     """Expressions, each within Blender's limit, and the shapes that their variables are, whose sum is one parameter."""
     found: list[tuple[str, list[int]]] = []
-    text, columns = "", []
+    text = ""
+    columns: list[int] = []
     for column in np.flatnonzero(np.abs(linear) + np.abs(products) > NEGLIGIBLE).tolist():
         for _ in range(2):
             term = _term(VARIABLES[len(columns)], column, float(linear[column]), float(products[column]))
