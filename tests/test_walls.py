@@ -34,6 +34,7 @@ LAYERS = (
     {"report"},
     {"requests"},
     {"perform"},
+    {"batch"},
     {"scene"},
     {"cli"},
     {"development"},

@@ -1,0 +1,29 @@
+"""The engines and templates that there are: a row and a file each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+
+from .engine import Engine
+
+
+@dataclass(frozen=True)
+class EngineRow:
+    """module and name: the function that makes the engine from its address ("" for none); what: for the help."""
+
+    module: str
+    name: str
+    what: str
+
+
+ENGINES = {
+    "local": EngineRow(".local", "make_local", "this machine, as many jobs at once as its processors and memory allow"),
+}
+"""Name on the command line -> engine."""
+
+
+def make_engine(name: str, address: str = "") -> Engine:
+    """Raises StgaError where the engine is not there, or has no use for an address."""
+    row = ENGINES[name]
+    make: Callable[[str], Engine] = getattr(import_module(row.module, __package__), row.name)
+    return make(address)
