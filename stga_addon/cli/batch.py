@@ -5,7 +5,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 
-from ..batch.engines.table import ENGINES
+from ..batch.engines.table import EMITTERS, ENGINES
 from ..batch.plan import Plan, plan_of_captures, read_plan
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
@@ -34,6 +34,10 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--dry-run", action="store_true", help="print the jobs, and how long they are expected to take")
     what = "; ".join(f"{name}: {row.what}" for name, row in ENGINES.items())
     parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{what} (default local)")
+    files = "; ".join(f"{name}: {row.what}" for name, row in EMITTERS.items())
+    parser.add_argument(
+        "--emit", choices=tuple(EMITTERS), help=f"write a file by which a farm carries out the jobs: {files}"
+    )
     parser.add_argument("--address", default="", help="of a running cluster (ray)")
 
 
@@ -41,6 +45,9 @@ def run(options: Namespace) -> None:
     plan = _with_threads(batch_plan(options), options)
     if options.dry_run:
         _print_plan(plan)
+        return
+    if options.emit is not None:
+        _emit(plan, options.emit)
         return
     _carry_out(plan, options)
 
@@ -92,7 +99,8 @@ def _with_threads(plan: Plan, options: Namespace) -> Plan:
     """The plan with threads for the jobs that name none: this machine's processors, shared among them."""
     from ..batch.engines.local import processors
 
-    threads = options.threads or max(1, processors() // len(plan.jobs) if options.engine == "local" else 1)
+    is_here = options.engine == "local" and options.emit is None
+    threads = options.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1)
     jobs = [
         job if job.resources.threads else replace(job, resources=replace(job.resources, threads=threads))
         for job in plan.jobs
@@ -109,6 +117,19 @@ def _print_plan(plan: Plan) -> None:
     batch = Batch(plan)
     batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
     print("\n".join(plan_lines(batch, processors())))
+
+
+def _emit(plan: Plan, name: str) -> None:
+    from ..batch.engines.table import emit
+    from ..batch.lease import hold_folder
+    from ..batch.run import Batch
+
+    with hold_folder(plan.out):
+        batch = Batch(plan)
+        if batch.unfinished:
+            print(f"{len(batch.unfinished)} jobs: {emit(name, batch)}")
+        else:
+            print("every job is finished")
 
 
 def _carry_out(plan: Plan, options: Namespace) -> None:
