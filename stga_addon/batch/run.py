@@ -196,6 +196,8 @@ class _Loop:
             entry = self._entries[name]
             if misses > MAX_MISSES or (len(fitting) >= MAX_BEGUN and not self._engine.takes_all):
                 break
+            if name not in self._ready:  # what it comes after could not be prepared
+                continue
             if not self._engine.has_room(entry.job):
                 misses += 1
             elif self._prepare(entry):

@@ -17,7 +17,7 @@ from .tiny import splats_of, tiny_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
-import os, sys
+import os, subprocess, sys
 sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tests"]
 from pathlib import Path
 from batch.simulated import carry_out
@@ -28,11 +28,12 @@ engine = make_engine("ray")
 assert os.environ["RAY_AUTH_MODE"] == "token"
 import ray
 address = ray.get_runtime_context().gcs_address
-stranger = {**os.environ, "RAY_AUTH_TOKEN": "0" * 64}
-look = f"import ray; ray.init(address={address!r}, log_to_driver=False); print(ray.cluster_resources())"
-import subprocess
-refused = subprocess.run([sys.executable, "-c", look], env=stranger, capture_output=True, text=True)
-assert refused.returncode and "CPU" not in refused.stdout, refused
+look = f"from ray._raylet import GcsClient; print(GcsClient(address={address!r}).get_all_node_info(timeout=60))"
+for token, code in ((os.environ["RAY_AUTH_TOKEN"], 0), ("0" * 64, 1)):
+    variables = {**os.environ, "RAY_AUTH_TOKEN": token}
+    asked = subprocess.run([sys.executable, "-c", look], env=variables, capture_output=True, text=True, timeout=120)
+    assert asked.returncode == code, asked
+    assert ("InvalidAuthToken" in asked.stderr) == bool(code), asked
 batch, _ = carry_out(tiny_plan(Path(sys.argv[2]), iterations=100), engine)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """

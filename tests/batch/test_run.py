@@ -121,15 +121,19 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
     assert second.submitted == ["look-00001", "look-00002", "look-00003"]
 
 
-def test_files_of_others_stay(tmp_path: Path) -> None:
-    """Catches a batch that moves or overwrites a folder which no job of a batch wrote."""
-    plan = empty_jobs(tmp_path, 2)
+@pytest.mark.parametrize("takes_all", [False, True])
+def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
+    """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts the jobs after it."""
+    plan = empty_jobs(tmp_path, 2, {"again": AFTER["again"]})
     own = tmp_path / "runs/look-00000/run.json"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    batch, _ = carry_out(plan, SimulatedEngine())
+    engine = SimulatedEngine(takes_all=takes_all)
+    batch, _ = carry_out(plan, engine)
+    assert engine.submitted == ["look-00001", "again-00001"]
+    assert states(batch)["again-00000"] == JobState.BLOCKED
     assert "holds files that no job of a batch wrote" in batch.entries["look-00000"].error
-    assert states(batch)["look-00001"] == JobState.FINISHED
+    assert states(batch)["again-00001"] == JobState.FINISHED
     assert own.read_text() == "mine"
 
 
