@@ -35,6 +35,7 @@ LAYERS = (
     {"report"},
     {"requests"},
     {"perform"},
+    {"batch"},
     {"scene"},
     {"cli"},
     {"development"},

@@ -21,6 +21,7 @@ COMMANDS = (
     ".refine",
     ".extend",
     ".perform",
+    ".batch",
     ".render",
     ".eval",
     ".select",

@@ -10,9 +10,11 @@ from ..errors import StgaError
 from ..progress import Cancelled, Progress, Report, Say, ignore
 from ..requests import values
 from ..requests.folder import PREVIEW, has_request, read_request, write_result
-from ..requests.results import Result
-from ..requests.values import Request
+from ..requests.results import Result, Written
+from ..requests.values import Extend, Refine, Request, Resume, Track, Train
 from ..schema import validate
+from ..tracking.folder import is_written
+from ..training.run.folder import has_run
 from ..worker.status import StatusWriter, status_writer
 
 PREVIEW_INTERVAL_S = 4.0
@@ -49,21 +51,47 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     return work(request, report, say)
 
 
-def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore) -> Result | None:
+def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, resume: bool = False) -> Result | None:
     """Carry out the request in a folder, with its status, previews and result there; None where it was cancelled.
 
-    also: reported to as well. Raises as `perform` does; the message is in the final status, too.
+    also: reported to as well. resume: what the request's output folder holds is what this request began (`resumed`).
+    Raises as `perform` does; the message is in the final status, too.
     """
     if not has_request(folder):  # before anything is written into a folder that may be of something else
         raise StgaError(f"{folder}: holds no request")
     with status_writer(folder) as writer:
         writer.update(0.0, "Starting")
         try:
-            result = perform(read_request(folder), _StatusReport(writer, also), say)
+            request = read_request(folder)
+            left = resumed(request) if resume else request
+            result = perform(left, _StatusReport(writer, also), say) if left else _tracked(request)
         except Cancelled:
             return None
         write_result(folder, result)
         return result
+
+
+def resumed(request: Request) -> Request | None:
+    """What is left of a request that was interrupted, or finished, by an earlier process; None: nothing.
+
+    Requests other than trainings and tracking begin again: they write their files anew.
+    """
+    match request:
+        case Train() if has_run(request.run):
+            return Resume(
+                request.run, request.capture, request.flame, request.principal_point, request.device, request.selection
+            )
+        case Refine() | Extend() if has_run(request.run):
+            return Resume(request.run, flame=request.flame, device=request.device)
+        case Track() if is_written(request.out):
+            return None
+    return request
+
+
+def _tracked(request: Request) -> Written:
+    """The result of a tracking whose process ended between the capture and its result."""
+    assert isinstance(request, Track)
+    return Written(request.out)
 
 
 class _StatusReport:

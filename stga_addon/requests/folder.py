@@ -49,9 +49,10 @@ def check_request(request: Request) -> None:
             check_output(request.output)
 
 
-def worker_arguments(folder: Path) -> list[str]:
-    """What a worker's interpreter runs after `-m` for the request in the folder."""
-    return ["stga_addon", "perform", str(folder.resolve())]
+def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
+    """What a worker's interpreter runs after `-m` for the request in the folder (`stga perform`)."""
+    limit = [] if threads is None else ["--threads", str(threads)]
+    return ["stga_addon", "perform", str(folder.resolve()), *limit, *(["--resume"] if resume else [])]
 
 
 def write_request(folder: Path, request: Request) -> None:

@@ -391,6 +391,33 @@ def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path: Path, capture: Pat
     assert inspect_worker(folder).state == WorkerState.FINISHED
 
 
+@pytest.mark.slow
+def test_a_request_continues_what_it_began(tmp_path: Path, capture: Path) -> None:
+    """Catches a job of a farm that fails, or trains anew, when it is started again after a kill."""
+    pytest.importorskip("torch")
+    request = training(tmp_path / "run", capture, iterations=40)
+    folder = asked(request)
+
+    def cancel(progress: Progress) -> bool:
+        return iteration_of(progress) >= 5
+
+    perform_in_folder(folder, also=cancel, resume=True)
+    asked(request)
+    with pytest.raises(StgaError, match="already holds a run"):
+        perform_in_folder(folder)
+    asked(request)
+    iterations = []
+    perform_in_folder(folder, also=lambda progress: iterations.append(iteration_of(progress)), resume=True)
+    assert min(n for n in iterations if n) > 5
+    assert max(iterations) == 40
+    tracked = Track(tmp_path, tmp_path / "head.npz", tmp_path / "tracked")
+    assert performing.resumed(tracked) == tracked
+    tracked.out.mkdir()
+    (tracked.out / "transforms_train.json").touch()
+    write_request(tracked.out / "job", tracked)
+    assert perform_in_folder(tracked.out / "job", resume=True) == Written(tracked.out)
+
+
 def iteration_of(progress: Progress) -> float:
     return progress.figures().get("iteration", 0)
 

@@ -1,0 +1,94 @@
+"""Engine of this machine: as many workers at once as its processors and memory allow."""
+
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ...errors import StgaError
+from ...requests.folder import worker_arguments
+from ...worker.launch import start_worker
+from ...worker.status import inspect_worker
+from ..job import Job
+from .engine import Ended, training_python
+
+MEMORY_SHARE = 0.9
+"""Share of the memory that is free at the start that workers may use."""
+GPUS = 1
+"""Jobs at once that need a GPU to themselves."""
+
+
+class LocalEngine:
+    """Starts a worker process per job, as Blender's panel does; a worker outlives the batch's process.
+
+    cores, memory_gb   for all workers together; by default what this process may use, and what is free
+    """
+
+    takes_all = False
+    interval_s = 0.1
+
+    def __init__(self, cores: int | None = None, memory_gb: float | None = None, python: str | None = None) -> None:
+        self._cores = cores or processors()
+        self._memory_gb = MEMORY_SHARE * free_memory_gb() if memory_gb is None else memory_gb
+        self._python = python or training_python()
+        self._jobs: dict[str, tuple[Job, subprocess.Popen[bytes] | None]] = {}
+
+    def has_room(self, job: Job) -> bool:
+        """Whether it fits beside what is running; a job that is larger than the machine runs alone."""
+        if not self._jobs:
+            return True
+        wanted = [job.resources, *(other.resources for other, _ in self._jobs.values())]
+        threads = sum(resources.threads or self._cores for resources in wanted)
+        memory = sum(resources.memory_gb for resources in wanted)
+        return threads <= self._cores and memory <= self._memory_gb and sum(r.gpu for r in wanted) <= GPUS
+
+    def submit(self, jobs: Sequence[Job]) -> None:
+        for job in jobs:
+            arguments = worker_arguments(job.request_folder, job.resources.threads or None, resume=True)
+            self._jobs[job.name] = job, start_worker(job.request_folder, self._python, arguments)
+
+    def adopt(self, job: Job) -> None:
+        self._jobs[job.name] = job, None
+
+    def running(self) -> Mapping[str, str]:
+        return dict.fromkeys(self._jobs, platform.node())
+
+    def ended(self) -> Mapping[str, Ended]:
+        found = {}
+        for name, (job, process) in list(self._jobs.items()):
+            if process is not None and process.poll() is None:
+                continue
+            snapshot = inspect_worker(job.request_folder, process)
+            if not snapshot.state.is_alive:
+                del self._jobs[name]
+                found[name] = Ended(snapshot, process is None or (process.returncode or -1) < 0)
+        return found
+
+    def withdraw(self) -> Sequence[str]:
+        return ()
+
+    def close(self) -> None:
+        """Workers go on; nothing is held."""
+
+
+def make_local(address: str) -> LocalEngine:
+    """Raises StgaError for an address."""
+    if address:
+        raise StgaError("--address: has no effect with --engine local")
+    return LocalEngine()
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def free_memory_gb() -> float:
+    """Memory that is available, in GB; infinite where the system does not say (Windows, macOS)."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return math.inf
+    return next((int(line.split()[1]) * 1024 / 1e9 for line in lines if line.startswith("MemAvailable:")), math.inf)

@@ -1,0 +1,129 @@
+"""Engine of a Ray cluster: one that runs already (its address), or one that is started on this machine.
+
+A task runs `stga perform` on the job's folder, so that only the command and the exit code go through Ray's object
+store. https://docs.ray.io/en/latest/ray-core/tasks.html
+"""
+
+import os
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+from ...errors import StgaError
+from ...worker.environment import PYTHON_VARIABLE
+from ...worker.launch import PACKAGES_FOLDER
+from ...worker.status import LOG_FILE, inspect_worker, read_status
+from ..job import Job
+from .engine import Ended, job_command
+from .local import processors
+
+MAX_WAITING = 1000
+"""Tasks that are submitted at once: more wait here, not in Ray's memory."""
+NODE_RETRIES = 5
+"""How often Ray begins a task again elsewhere whose machine has gone."""
+TOKEN_MODE, TOKEN = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"
+"""Environment variables by which only who has the token may use a cluster (Ray 2.52)."""
+
+
+class RayEngine:
+    """Submits each job when what it comes after is finished; Ray minds resources."""
+
+    takes_all = False
+    interval_s = 0.2
+
+    def __init__(self, address: str) -> None:
+        """Raises StgaError where Ray is not installed, or the cluster cannot be reached."""
+        if find_spec("ray") is None:
+            raise StgaError("--engine ray: the package ray is not installed (pip install 'stga-addon[ray]')")
+        if not address and TOKEN_MODE not in os.environ:  # other users of this machine cannot submit to it
+            os.environ.update({TOKEN_MODE: "token", TOKEN: secrets.token_hex(32)})
+        import ray  # reads the environment
+
+        try:
+            if address:
+                ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+            else:
+                ray.init(num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+            raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
+        self._ray = ray
+        self._task = ray.remote(max_retries=NODE_RETRIES)(_task(PYTHON_VARIABLE))
+        self._adopted: dict[str, Job] = {}
+        self._jobs: dict[Any, Job] = {}
+        self._machines: dict[str, str] = {}
+
+    def has_room(self, job: Job) -> bool:
+        return len(self._jobs) < MAX_WAITING
+
+    def submit(self, jobs: Sequence[Job]) -> None:
+        for job in jobs:
+            needs = job.resources
+            options = {"num_cpus": needs.threads or 1, "num_gpus": int(needs.gpu), "memory": needs.memory_gb * 1e9}
+            task = self._task.options(name=job.name, **options)
+            log = str(job.request_folder / LOG_FILE)
+            self._jobs[task.remote(job_command(job), str(PACKAGES_FOLDER), log)] = job
+
+    def adopt(self, job: Job) -> None:
+        self._adopted[job.name] = job
+
+    def running(self) -> Mapping[str, str]:
+        """The jobs that have written a status: Ray does not tell cheaply which tasks wait for a machine."""
+        jobs = [*self._jobs.values(), *self._adopted.values()]
+        begun = [job for job in jobs if read_status(job.request_folder) is not None]
+        return {job.name: self._machines.get(job.name, "ray") for job in begun}
+
+    def ended(self) -> Mapping[str, Ended]:
+        found = {}
+        for name, job in list(self._adopted.items()):
+            snapshot = inspect_worker(job.request_folder)
+            if not snapshot.state.is_alive:
+                del self._adopted[name]
+                found[name] = Ended(snapshot, is_lost=True)
+        if self._jobs:
+            ready, _ = self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=0)
+            found.update({job.name: self._end(task, job) for task in ready for job in [self._jobs.pop(task)]})
+        return found
+
+    def _end(self, task: Any, job: Job) -> Ended:
+        try:
+            code, self._machines[job.name] = self._ray.get(task)
+        except self._ray.exceptions.RayError:  # its machine or Ray's worker has gone, more often than NODE_RETRIES
+            code = -1
+        return Ended(inspect_worker(job.request_folder), code < 0)
+
+    def withdraw(self) -> Sequence[str]:
+        """Take back the tasks that have not begun."""
+        waiting = [task for task, job in self._jobs.items() if read_status(job.request_folder) is None]
+        for task in waiting:
+            self._ray.cancel(task)
+        return [self._jobs.pop(task).name for task in waiting]
+
+    def close(self) -> None:
+        self._ray.shutdown()
+
+
+def make_ray(address: str) -> RayEngine:
+    """The engine of the cluster at an address; "": one that is started here and ends with the batch."""
+    return RayEngine(address)
+
+
+def _task(python_variable: str) -> Callable[[list[str], str, str], tuple[int, str]]:
+    """The function that Ray carries out. It is sent to the machine as it is, which need not have this package in the
+    Python that Ray runs in: it uses nothing from outside itself."""
+
+    def run_command(command: list[str], packages: str, log: str) -> tuple[int, str]:
+        """Run a command with its output in a log; returns its exit code and the machine's name."""
+        import os
+        import platform
+        import subprocess
+
+        variables = {**os.environ, "PYTHONPATH": packages}
+        command = [variables.get(python_variable) or command[0], *command[1:]]
+        for name in ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES"):  # Ray's own settings; the command has its --threads
+            variables.pop(name, None)
+        with open(log, "ab") as out:
+            code = subprocess.call(command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out)
+        return code, platform.node()
+
+    return run_command

@@ -1,0 +1,176 @@
+"""Engine of a SLURM cluster: one sbatch array per table of the plan and needs, with dependencies between the arrays.
+
+https://slurm.schedmd.com/sbatch.html. The jobs of a machine that dies are put back into the queue (--requeue), and
+continue from their checkpoints. Liveness is squeue's, state and figures are those of the jobs' folders.
+"""
+
+import re
+import shlex
+import shutil
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ...errors import StgaError
+from ...files import replacing
+from ...worker.launch import PACKAGES_FOLDER
+from ...worker.status import LOG_FILE, WorkerState, inspect_worker
+from ..job import Job, Resources
+from .engine import Ended, job_command
+
+TIMEOUT_S = 60.0
+MAX_ARRAY = 1000
+"""Jobs of an array: SLURM's default MaxArraySize is 1001."""
+QUEUE_FORMAT = "%i|%T|%N"
+"""Of squeue: job, state, machines."""
+ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
+GRACE_S = 10.0
+"""Seconds after its submission in which a job that squeue does not list yet is not gone."""
+
+
+@dataclass
+class _Submitted:
+    """A job, its name in SLURM ("12_3") and when it was submitted."""
+
+    job: Job
+    name: str
+    since: float
+
+
+class SlurmEngine:
+    """Submits every job at once; SLURM's scheduler minds resources and dependencies."""
+
+    takes_all = True
+    interval_s = 2.0
+
+    def __init__(self) -> None:
+        missing = next((name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None)
+        if missing is not None:
+            raise StgaError(f"--engine slurm: the program {missing} was not found; start it where SLURM is installed")
+        self._jobs: dict[str, _Submitted] = {}
+        self._arrays: dict[str, str] = {}
+        self._machines: dict[str, str] = {}
+
+    def has_room(self, job: Job) -> bool:
+        return True
+
+    def submit(self, jobs: Sequence[Job]) -> None:
+        """Raises StgaError with sbatch's words where it refuses an array."""
+        groups: dict[tuple[str, Resources, int], list[Job]] = {}
+        for job in jobs:
+            number = 0
+            while len(groups.setdefault((job.table, job.resources, number), [])) == MAX_ARRAY:
+                number += 1
+            groups[job.table, job.resources, number].append(job)
+        for group in _ordered(list(groups.values())):
+            self._submit_array(group)
+
+    def _submit_array(self, jobs: Sequence[Job]) -> None:
+        script = jobs[0].folder.parent / "slurm" / f"{jobs[0].table}-{time.time_ns()}.sh"
+        with replacing(script) as partial:
+            partial.write_text(_script(jobs), encoding="utf-8")
+        waits = sorted({self._arrays[other] for job in jobs for other in job.after if other in self._jobs})
+        needs = jobs[0].resources
+        command = [
+            "sbatch", "--parsable", "--requeue", f"--job-name=stga-{jobs[0].table}", f"--array=0-{len(jobs) - 1}",
+            f"--cpus-per-task={needs.threads or 1}", f"--mem={round(1000 * needs.memory_gb)}M", "--output=/dev/null",
+            *(["--gres=gpu:1"] if needs.gpu else []),
+            *([f"--dependency=afterany:{':'.join(waits)}"] if waits else []),
+            str(script),
+        ]  # fmt: skip
+        array = _call(command).strip().partition(";")[0]
+        for index, job in enumerate(jobs):
+            self._jobs[job.name] = _Submitted(job, f"{array}_{index}", time.monotonic())
+            self._arrays[job.name] = array
+
+    def adopt(self, job: Job) -> None:
+        """A worker that is alive by its lock; its place in SLURM's queue is not known."""
+        self._jobs[job.name] = _Submitted(job, "", time.monotonic())
+
+    def running(self) -> Mapping[str, str]:
+        return {name: self._machines[one.name] for name, one in self._jobs.items() if one.name in self._machines}
+
+    def ended(self) -> Mapping[str, Ended]:
+        states = _queue()
+        self._machines = {name: machine for name, (state, machine) in states.items() if state in ON_MACHINE}
+        found = {}
+        for name, one in list(self._jobs.items()):
+            if one.name in states:
+                continue
+            snapshot = inspect_worker(one.job.request_folder)
+            is_new = one.name and time.monotonic() - one.since < GRACE_S
+            if snapshot.state.is_alive or (is_new and snapshot.state in (WorkerState.NONE, WorkerState.LOST)):
+                continue
+            del self._jobs[name]
+            found[name] = Ended(snapshot, is_lost=True)
+        return found
+
+    def withdraw(self) -> Sequence[str]:
+        """Take back the jobs that wait in the queue."""
+        states = _queue()
+        waiting = [name for name, one in self._jobs.items() if states.get(one.name, ("", ""))[0] == "PENDING"]
+        if waiting:
+            _call(["scancel", "--state=PENDING", *sorted({self._arrays[name] for name in waiting})])
+        for name in waiting:
+            del self._jobs[name]
+        return waiting
+
+    def close(self) -> None:
+        """The queue goes on by itself."""
+
+
+def make_slurm(address: str) -> SlurmEngine:
+    """Raises StgaError for an address, and where SLURM's programs are missing."""
+    if address:
+        raise StgaError("--address: has no effect with --engine slurm, which uses the cluster of its configuration")
+    return SlurmEngine()
+
+
+def _ordered(groups: list[list[Job]]) -> list[list[Job]]:
+    """The groups, each after those whose jobs it comes after, as the jobs of a plan are sorted by what they wait for.
+
+    Tables wait for tables, so that groups have no circle.
+    """
+    group_of = {job.name: number for number, group in enumerate(groups) for job in group}
+    placed: list[int] = []
+
+    def place(number: int) -> None:
+        if number in placed:
+            return
+        for other in {group_of[name] for job in groups[number] for name in job.after if name in group_of} - {number}:
+            place(other)
+        placed.append(number)
+
+    for number in range(len(groups)):
+        place(number)
+    return [groups[number] for number in placed]
+
+
+def _script(jobs: Sequence[Job]) -> str:
+    """What each job of an array runs: the command of its index, with its output in the job's own log."""
+    packages = shlex.quote(str(PACKAGES_FOLDER))
+    lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
+    lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]
+    for index, job in enumerate(jobs):
+        log = shlex.quote(str(job.request_folder / LOG_FILE))
+        lines.append(f"{index}) exec {shlex.join(job_command(job))} >>{log} 2>&1 ;;")
+    return "\n".join([*lines, "esac", ""])
+
+
+def _queue() -> dict[str, tuple[str, str]]:
+    """Job in SLURM -> state and machine, of this user's jobs."""
+    lines = _call(["squeue", "--me", "--noheader", "--array", f"--format={QUEUE_FORMAT}"]).splitlines()
+    rows = [line.split("|") for line in lines if line.count("|") == 2]
+    return {job: (state, machine) for job, state, machine in rows if re.fullmatch(r"\d+_\d+", job)}
+
+
+def _call(command: Sequence[str]) -> str:
+    """Output of one of SLURM's programs. Raises StgaError with its message."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise StgaError(f"{command[0]}: cannot be run ({error})") from error
+    if done.returncode:
+        raise StgaError(f"{command[0]}: {done.stderr.strip() or f'exit status {done.returncode}'}")
+    return done.stdout

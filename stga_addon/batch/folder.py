@@ -1,0 +1,101 @@
+"""Folder of a job: what it holds from earlier starts of the batch, and how it is prepared for a worker.
+
+job.json   beside the request: the job's identity, how long it was expected to take, and took
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import StgaError
+from ..files import read_json, write_json
+from ..requests.folder import has_request, write_request
+from ..schema import from_json, setting, to_json
+from ..worker.launch import prepare_status_folder
+from ..worker.lock import is_locked
+from ..worker.status import LOCK_FILE, WorkerState, read_status
+from .job import Job
+from .plan import REPLACED
+
+JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """Content of job.json.
+
+    digest    of `job_digest`
+    forecast_s, seconds   how long the job was expected to take, and took over all its processes; 0: unknown
+    machine   that carried it out last
+    """
+
+    digest: str
+    forecast_s: float = setting(0.0, 0)
+    seconds: float = setting(0.0, 0)
+    machine: str = ""
+
+
+def write_record(job: Job, record: JobRecord) -> None:
+    """Raises StgaError on a full disk."""
+    write_json(job.request_folder / JOB_FILE, {"format": FORMAT, "version": VERSION, **to_json(record)})
+
+
+def read_record(job: Job) -> JobRecord | None:
+    """None where the job was never prepared, or by another version."""
+    try:
+        values = read_json(job.request_folder / JOB_FILE)
+        named = isinstance(values, dict) and (values.pop("format", None), values.pop("version", None))
+        record: JobRecord | None = from_json(JobRecord, values) if named == (FORMAT, VERSION) else None
+    except StgaError:
+        return None
+    return record
+
+
+def is_done(job: Job, digest: str) -> bool:
+    """Whether a worker has finished this very job, and what it wrote is there."""
+    record = read_record(job)
+    if record is None or record.digest != digest:
+        return False
+    status = read_status(job.request_folder)
+    written = job.product is None or job.product.exists()
+    return status is not None and status.state == WorkerState.FINISHED and written
+
+
+def is_running(job: Job, digest: str) -> bool:
+    """Whether a worker of an earlier start is carrying out this very job."""
+    record = read_record(job)
+    return record is not None and record.digest == digest and is_locked(job.request_folder / LOCK_FILE)
+
+
+def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
+    """Make the job's folder ready for a worker, which continues what an earlier one began.
+
+    What another request wrote there is moved aside; returns where to. Raises StgaError while a worker is running in
+    the folder, or where it holds files that no job wrote.
+    """
+    record, moved = read_record(job), None
+    if record is not None and record.digest != digest:
+        prepare_status_folder(job.request_folder)  # raises while a worker is running
+        moved, record = _move_aside(job.folder), None
+    if record is None:
+        if job.folder.is_dir() and any(path.name != job.request_folder.name for path in job.folder.iterdir()):
+            raise StgaError(f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'")
+        write_record(job, JobRecord(digest, forecast_s))
+    if record is None or not has_request(job.request_folder):
+        write_request(job.request_folder, job.request)
+    else:
+        prepare_status_folder(job.request_folder)
+    return moved
+
+
+def _move_aside(folder: Path) -> Path:
+    """Move a job's folder to the first free name in the batch's folder REPLACED."""
+    target, number = folder.parent / REPLACED / folder.name, 1
+    while target.exists():
+        number += 1
+        target = folder.parent / REPLACED / f"{folder.name}_{number}"
+    try:
+        target.parent.mkdir(exist_ok=True)
+        folder.rename(target)
+    except OSError as error:
+        raise StgaError(f"{folder}: cannot be moved to {target} ({error.strerror or error})") from error
+    return target

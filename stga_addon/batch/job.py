@@ -1,0 +1,98 @@
+"""Jobs of a batch: a request each, what it comes after and what it needs."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from ..requests.folder import request_folder
+from ..requests.values import Extend, Refine, Request, Resume, Train
+from ..schema import setting
+from ..training.run.folder import AVATAR
+
+KINDS: dict[str, type[Any]] = {}
+"""Name of a request in a plan -> its dataclass: every request but Resume, which is how an interrupted one continues."""
+TRAININGS = (Train, Refine, Extend)
+OUTPUT_FIELDS = ("out", "output")
+"""Names of the field that says where a request writes; of a training it is `run`."""
+MAX_THREADS = 1024
+
+
+def kind_name(kind: type[Any]) -> str:
+    """ "select-for-take" for SelectForTake."""
+    return "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__).lstrip("-")
+
+
+KINDS.update({kind_name(kind): kind for kind in get_args(Request) if kind is not Resume})
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a job needs of a machine.
+
+    threads   to compute on; 0: the machine's, shared among the jobs of the batch
+    gpu       whether it needs a GPU to itself
+    """
+
+    threads: int = setting(0, 0, MAX_THREADS)
+    memory_gb: float = setting(2.0, above=0)
+    gpu: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """A request in a folder of its own.
+
+    name      unique in the batch, the same each time that the plan is read
+    table     name of the table in the plan that the job is of
+    folder    what the request writes lies in it; the request itself in `request_folder`
+    after     names of the jobs that have to be finished before
+    minutes   how long the plan says that it takes
+    """
+
+    name: str
+    table: str
+    request: Request
+    folder: Path
+    after: tuple[str, ...] = ()
+    resources: Resources = field(default_factory=Resources)
+    minutes: float | None = setting(None, above=0)
+
+    @property
+    def request_folder(self) -> Path:
+        return request_folder(self.folder)
+
+    @property
+    def product(self) -> Path | None:
+        """The file or folder that the request writes; None where its result is all."""
+        if isinstance(self.request, TRAININGS):
+            return self.request.run / AVATAR
+        name = output_field(type(self.request))
+        path = None if name is None else getattr(self.request, name)
+        return path if isinstance(path, Path) else None
+
+
+def output_field(kind: type[Any]) -> str | None:
+    """The field that says where requests of a kind write; None where they have none."""
+    if kind in TRAININGS:
+        return "run"
+    names = [spec.name for spec in fields(kind)]
+    return next((name for name in OUTPUT_FIELDS if name in names), None)
+
+
+def path_fields(kind: type[Any]) -> Collection[str]:
+    """The fields of a request that hold a path, or several."""
+    return [name for name, hint in get_type_hints(kind).items() if _holds_path(hint)]
+
+
+def _holds_path(hint: Any) -> bool:
+    return hint is Path or any(_holds_path(part) for part in get_args(hint))
+
+
+def input_paths(request: Request) -> Mapping[str, tuple[Path, ...]]:
+    """Field -> the paths that a request reads, of those that are given."""
+    kind = type(request)
+    names = [name for name in path_fields(kind) if name != output_field(kind)]
+    values = {name: getattr(request, name) for name in names}
+    paths = {name: value if isinstance(value, tuple) else (value,) for name, value in values.items()}
+    return {name: found for name, items in paths.items() if (found := tuple(p for p in items if isinstance(p, Path)))}

@@ -1,0 +1,218 @@
+"""Report of a batch: one HTML file that needs nothing else, neither files beside it nor a network."""
+
+import base64
+import html
+import io
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import replacing
+from ..format import format_duration
+from ..training.evaluate.forecast import curve_of, saved_line
+from ..training.run.folder import has_run, read_run
+from ..training.run.metrics_log import read_metrics
+from ..worker.status import log_lines
+from .run import Batch, Entry, JobState
+
+REPORT = "report.html"
+MAX_CURVES, MAX_PICTURES, MAX_FAILURES, MAX_ROWS = 24, 24, 50, 2000
+"""Limits of the report; of more curves and pictures, evenly spread ones by PSNR are shown."""
+PICTURE_HEIGHT_PX = 240
+JPEG_QUALITY = 85
+LOG_LINES = 12
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 70rem; padding: 0 1rem; color: #1c1c1c;
+       background: #fff; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
+table { border-collapse: collapse; width: 100%; } th, td { text-align: left; padding: .25rem .6rem .25rem 0;
+       border-bottom: 1px solid #ddd; vertical-align: top; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+.failed { color: #a3200d; } .quiet { color: #666; }
+pre { background: #f4f4f4; padding: .6rem; overflow-x: auto; font-size: 13px; }
+figure { display: inline-block; margin: 0 1rem 1rem 0; } figcaption { font-size: 13px; }
+svg { max-width: 100%; height: auto; }
+"""
+Run = tuple[Entry, list[dict[str, Any]]]
+"""A finished training, and the evaluations of its metrics.jsonl."""
+
+
+def write_report(batch: Batch) -> Path:
+    """Write report.html into the batch's folder and return its path. Raises StgaError where it cannot be written."""
+    runs = _runs(batch)
+    parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
+    title = html.escape(batch.plan.out.name)
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    path = batch.plan.out / REPORT
+    with replacing(path) as partial:
+        partial.write_text(f"{head}<h1>Batch {title}</h1>{''.join(parts)}</html>\n", encoding="utf-8")
+    return path
+
+
+def _runs(batch: Batch) -> list[Run]:
+    """The finished trainings, from the lowest PSNR to the highest."""
+    found: list[Run] = []
+    for entry in batch.entries.values():
+        if entry.state.is_done and has_run(entry.job.folder):
+            with suppress(StgaError):
+                found.append((entry, read_metrics(entry.job.folder)))
+    return sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
+
+
+def _figures(run: Run) -> dict[str, Any]:
+    """The evaluation of the avatar that the run keeps; empty without held-out views."""
+    entry, metrics = run
+    lines = [line for line in metrics if "psnr" in line]
+    with suppress(StgaError):
+        return dict(saved_line(lines, read_run(entry.job.folder).settings.target_psnr)) if lines else {}
+    return {}
+
+
+def _spread(runs: Sequence[Run], count: int) -> list[Run]:
+    """So many of the runs, evenly spread, the first and the last among them."""
+    if len(runs) <= count:
+        return list(runs)
+    return [runs[round(index)] for index in np.linspace(0, len(runs) - 1, count)]
+
+
+def _summary(batch: Batch) -> str:
+    entries = batch.entries.values()
+    counts = [(state, sum(entry.state == state for entry in entries)) for state in JobState]
+    text = ", ".join(f"{count} {state}" for state, count in counts if count)
+    seconds = sum(entry.seconds for entry in entries)
+    off = [abs(miss) for entry in entries if (miss := _forecast_error(entry)) is not None]
+    forecasts = f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})." if off else ""
+    source = html.escape(batch.plan.source)
+    return f"<p>{source}: {len(entries)} jobs: {text}. {format_duration(seconds)} of work.{forecasts}</p>"
+
+
+def _forecast_error(entry: Entry) -> float | None:
+    """By how much a finished job took longer than expected, as a share of that; None where nothing was expected."""
+    if not (entry.state.is_done and entry.forecast_s and entry.seconds):
+        return None
+    return entry.seconds / entry.forecast_s - 1
+
+
+def _failures(batch: Batch) -> str:
+    failed = batch.failures
+    if not failed:
+        return ""
+    items = [_failure(entry) for entry in failed[:MAX_FAILURES]]
+    more = f"<p>… and {len(failed) - MAX_FAILURES} more</p>" if len(failed) > MAX_FAILURES else ""
+    return f"<h2>Failures</h2>{''.join(items)}{more}"
+
+
+def _failure(entry: Entry) -> str:
+    name, error = html.escape(entry.job.name), html.escape(entry.error)
+    log = log_lines(entry.job.request_folder, LOG_LINES) if entry.state == JobState.FAILED else []
+    text = f"<pre>{html.escape(chr(10).join(log))}</pre>" if log else ""
+    return f'<p><b>{name}</b>: <span class="failed">{error or entry.state}</span></p>{text}'
+
+
+def _chart(runs: Sequence[Run]) -> str:
+    """PSNR over training time as SVG."""
+    shown = [run for run in _spread(runs, MAX_CURVES) if curve_of(run[1])]
+    if not shown or find_spec("matplotlib") is None:
+        return ""
+    from ..report.charts import finish_axes, psnr_axes
+
+    figure, axes = psnr_axes("PSNR on held-out views")
+    for entry, metrics in reversed(shown):
+        axes.plot(*np.array(curve_of(metrics)).T, marker=".", label=entry.job.name)
+    finish_axes(axes)
+    drawn = io.StringIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None})
+    of = f" of {len(runs)}" if len(shown) < len(runs) else ""
+    svg = drawn.getvalue()
+    return f"<h2>Curves ({len(shown)}{of} runs)</h2>{svg[svg.index('<svg') :]}"
+
+
+def _pictures(runs: Sequence[Run]) -> str:
+    figures = [_picture(entry, _figures((entry, metrics))) for entry, metrics in _spread(runs, MAX_PICTURES)]
+    shown = [figure for figure in figures if figure]
+    if not shown:
+        return ""
+    return f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}"
+
+
+def _picture(entry: Entry, figures: dict[str, Any]) -> str:
+    """A run's first held-out image beside its avatar; empty where it has none, or cannot be opened here."""
+    try:
+        pair = held_out_pair(entry.job.folder)
+    except (StgaError, ModuleNotFoundError):
+        return ""
+    if pair is None:
+        return ""
+    psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
+    data = base64.b64encode(_jpeg(pair)).decode("ascii")
+    name = html.escape(entry.job.name)
+    image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="data:image/jpeg;base64,{data}">'
+    return f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>"
+
+
+def held_out_pair(run: Path) -> np.ndarray | None:
+    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None where its capture has no such view.
+
+    Raises StgaError where the run or its capture cannot be opened.
+    """
+    from ..avatar.file import read_avatar
+    from ..capture.images import read_image
+    from ..render.render import render_avatar
+    from ..training.evaluate.evaluation_views import choose_evaluation_views
+    from ..training.optimize.flame_refinement import with_refined_tracking
+    from ..training.run.folder import AVATAR
+    from ..training.run.open_run import open_run
+
+    capture = with_refined_tracking(open_run(run).capture, run)
+    views = choose_evaluation_views(capture)
+    if not views:
+        return None
+    avatar, view = read_avatar(run / AVATAR), views[0]
+    red, green, blue = (round(255 * level) for level in avatar.background)
+    image = read_image(view, (red, green, blue))
+    rendered = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
+    pixels = np.round(255 * np.clip(rendered, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
+    return np.hstack([image, pixels])
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    from PIL import Image
+
+    picture, out = Image.fromarray(image), io.BytesIO()
+    height = min(2 * PICTURE_HEIGHT_PX, picture.height)
+    picture = picture.resize((round(picture.width * height / picture.height), height))
+    picture.save(out, "JPEG", quality=JPEG_QUALITY)
+    return out.getvalue()
+
+
+def _table(batch: Batch, runs: Iterable[Run]) -> str:
+    figures = {run[0].job.name: _figures(run) for run in runs}
+    names = ("job", "request", "state", "machine")
+    numbers = ("time", "forecast", "off by", "PSNR", "SSIM", "splats")
+    heads = "".join(f"<th>{name}</th>" for name in names) + "".join(f'<th class="n">{name}</th>' for name in numbers)
+    entries = list(batch.entries.values())
+    rows = "".join(_table_row(entry, figures.get(entry.job.name, {})) for entry in entries[:MAX_ROWS])
+    more = f"<p>… and {len(entries) - MAX_ROWS} more</p>" if len(entries) > MAX_ROWS else ""
+    return f"<h2>Jobs</h2><table><tr>{heads}</tr>{rows}</table>{more}"
+
+
+def _table_row(entry: Entry, figures: dict[str, Any]) -> str:
+    off = _forecast_error(entry)
+    texts = (entry.job.name, type(entry.job.request).__name__, str(entry.state), entry.machine)
+    numbers = (
+        format_duration(entry.seconds) if entry.seconds else "",
+        format_duration(entry.forecast_s) if entry.forecast_s else "",
+        "" if off is None else f"{off:+.0%}",
+        f"{figures['psnr']:.2f}" if "psnr" in figures else "",
+        f"{figures['ssim']:.4f}" if "ssim" in figures else "",
+        f"{figures['splats']:,}" if "splats" in figures else "",
+    )
+    kind = ' class="failed"' if entry.state in (JobState.FAILED, JobState.BLOCKED) else ""
+    cells = [f"<td>{html.escape(text)}</td>" for text in texts]
+    cells += [f'<td class="n">{number}</td>' for number in numbers]
+    return f"<tr{kind}>{''.join(cells)}</tr>"

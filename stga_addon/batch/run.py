@@ -1,0 +1,303 @@
+"""Running a batch: which jobs are to be done, what each comes after, and what became of it."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from ..errors import StgaError
+from ..worker.status import WorkerState, WorkerStatus, read_status, request_cancel
+from .engines.engine import Engine
+from .folder import is_done, is_running, prepare, read_record, write_record
+from .identity import job_digest
+from .job import Job
+from .lease import Lease
+from .plan import Plan
+
+MAX_RETRIES = 5
+"""How often a job whose worker was killed is tried again in one start of a batch."""
+SHOW_INTERVAL_S = 1.0
+MAX_BEGUN = 64
+"""Jobs that are begun before the next look at what has ended."""
+MAX_MISSES = 50
+"""Jobs that are asked for in vain, in a row, before the next look at what has ended."""
+Say = Callable[[str], None]
+
+
+class JobState(StrEnum):
+    """State of a job in this start of the batch."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    FINISHED = "finished"
+    KEPT = "finished before"
+    FAILED = "failed"
+    BLOCKED = "not started"
+    CANCELLED = "stopped"
+
+    @property
+    def is_done(self) -> bool:
+        return self in (JobState.FINISHED, JobState.KEPT)
+
+    @property
+    def is_over(self) -> bool:
+        return self not in (JobState.WAITING, JobState.RUNNING)
+
+
+@dataclass
+class Entry:
+    """A job and what is known of it.
+
+    status      the worker's latest; error: why it failed, or was not started
+    began_s     when it was started, by the monotonic clock; seconds: that its processes have taken
+    forecast_s  how long it was expected to take; 0: unknown
+    """
+
+    job: Job
+    digest: str = ""
+    state: JobState = JobState.WAITING
+    status: WorkerStatus = field(default_factory=WorkerStatus)
+    error: str = ""
+    machine: str = ""
+    began_s: float = 0.0
+    seconds: float = 0.0
+    forecast_s: float = 0.0
+    retries: int = 0
+
+    def left_s(self, now: float) -> float | None:
+        """Seconds until it is finished, from its share done, else from its forecast; None: unknown."""
+        if self.state.is_over:
+            return 0.0
+        spent = now - self.began_s if self.state == JobState.RUNNING else 0.0
+        if self.state == JobState.RUNNING and self.status.progress > 0.05:
+            return spent * (1 / self.status.progress - 1)
+        return max(self.forecast_s - spent, 0.0) if self.forecast_s else None
+
+
+class Batch:
+    """The jobs of a plan, in the order in which they can be done."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Find out what is finished already. Raises StgaError where an input cannot be read."""
+        self.plan = plan
+        self.entries = {job.name: Entry(job) for job in plan.jobs}
+        jobs = {job.name: job for job in plan.jobs}
+        digests: dict[str, str] = {}
+        for name, entry in self.entries.items():
+            entry.digest = digests[name] = job_digest(entry.job, jobs, digests)
+            kept = all(self.entries[other].state.is_done for other in entry.job.after)
+            if kept and is_done(entry.job, entry.digest):
+                entry.state = JobState.KEPT
+                self._recall(entry)
+
+    @property
+    def unfinished(self) -> list[Job]:
+        return [entry.job for entry in self.entries.values() if not entry.state.is_over]
+
+    @property
+    def finished(self) -> list[Job]:
+        return [entry.job for entry in self.entries.values() if entry.state.is_done]
+
+    @property
+    def failures(self) -> list[Entry]:
+        return [e for e in self.entries.values() if e.state in (JobState.FAILED, JobState.BLOCKED)]
+
+    def _recall(self, entry: Entry) -> None:
+        """Read what earlier starts of the batch left."""
+        record = read_record(entry.job)
+        entry.status = read_status(entry.job.request_folder) or entry.status
+        if record is not None:
+            entry.seconds, entry.forecast_s, entry.machine = record.seconds, record.forecast_s, record.machine
+
+    def set_forecasts(self, seconds: Mapping[str, float]) -> None:
+        for name, expected in seconds.items():
+            self.entries[name].forecast_s = expected
+
+
+def run_batch(batch: Batch, engine: Engine, lease: Lease, show: Callable[[Batch], None], say: Say) -> None:
+    """Carry out the jobs that are not finished; each that fails fails alone.
+
+    show: called now and then; say: told in lines what happened.
+    Raises KeyboardInterrupt after Ctrl-C when the running jobs have saved what they have, and StgaError where another
+    batch has taken the folder.
+    """
+    loop = _Loop(batch, engine, lease, show, say)
+    try:
+        loop.work()
+    except KeyboardInterrupt:
+        say("Stopping: the running jobs save what they have; Ctrl-C again leaves them to it")
+        loop.stop()
+        raise
+    finally:
+        engine.close()
+
+
+class _Loop:
+    def __init__(self, batch: Batch, engine: Engine, lease: Lease, show: Callable[[Batch], None], say: Say) -> None:
+        self._batch, self._engine, self._lease, self._show, self._say = batch, engine, lease, show, say
+        self._entries = batch.entries
+        self._shown_s = 0.0
+        self._position = {name: number for number, name in enumerate(self._entries)}
+        self._children: dict[str, list[str]] = {name: [] for name in self._entries}
+        self._waits_for: dict[str, int] = {}
+        for name, entry in self._entries.items():
+            open_ones = [other for other in entry.job.after if not self._entries[other].state.is_done]
+            self._waits_for[name] = len(open_ones)
+            for other in open_ones:
+                self._children[other].append(name)
+        waiting = [name for name, entry in self._entries.items() if entry.state == JobState.WAITING]
+        self._left = len(waiting)
+        takes_all = engine.takes_all
+        # A dictionary as an ordered set: jobs leave it from anywhere.
+        self._ready = dict.fromkeys(name for name in waiting if takes_all or not self._waits_for[name])
+
+    def work(self) -> None:
+        self._adopt()
+        while self._left:
+            if self._lease.is_lost:
+                raise StgaError(f"{self._batch.plan.out}: another batch has taken this folder; this one has ended")
+            begun = self._begin()
+            ended = self._collect()
+            self._look()
+            if not (begun or ended):
+                time.sleep(self._engine.interval_s)
+        self._look(now=True)
+
+    def stop(self) -> None:
+        """Ask the running jobs to stop, and wait until they have."""
+        for name in self._engine.withdraw():
+            self._over(self._entries[name], JobState.CANCELLED)
+        running = [entry for entry in self._entries.values() if entry.state == JobState.RUNNING]
+        for entry in running:
+            request_cancel(entry.job.request_folder)
+        while self._engine.running():
+            self._collect(retry=False)
+            self._look()
+            time.sleep(self._engine.interval_s)
+        self._collect(retry=False)
+        for entry in running:
+            if entry.state == JobState.RUNNING:  # Ctrl-C came between its end and the note of it
+                self._over(entry, JobState.CANCELLED)
+
+    def _adopt(self) -> None:
+        """Watch the workers that an earlier start of the batch left running."""
+        for name in list(self._ready):
+            entry = self._entries[name]
+            if is_running(entry.job, entry.digest):
+                self._mark_running(entry)
+                self._engine.adopt(entry.job)
+                self._say(f"{name}: goes on in the worker of an earlier start")
+
+    def _begin(self) -> bool:
+        """Submit what can start; whether there was something."""
+        fitting: list[Entry] = []
+        misses = 0
+        for name in list(self._ready):
+            entry = self._entries[name]
+            if misses > MAX_MISSES or (len(fitting) >= MAX_BEGUN and not self._engine.takes_all):
+                break
+            if name not in self._ready:  # what it comes after could not be prepared
+                continue
+            if not self._engine.has_room(entry.job):
+                misses += 1
+            elif self._prepare(entry):
+                if not self._engine.takes_all:
+                    self._submit([entry])
+                fitting.append(entry)
+        if self._engine.takes_all and fitting:
+            self._submit(fitting)
+        return bool(fitting)
+
+    def _prepare(self, entry: Entry) -> bool:
+        try:
+            moved = prepare(entry.job, entry.digest, entry.forecast_s)
+        except StgaError as error:
+            self._over(entry, JobState.FAILED, str(error))
+            return False
+        if moved is not None:
+            self._say(f"{entry.job.name}: has changed; what it wrote before is in {moved}")
+        return True
+
+    def _submit(self, entries: Sequence[Entry]) -> None:
+        try:
+            self._engine.submit([entry.job for entry in entries])
+        except StgaError as error:
+            for entry in entries:
+                self._over(entry, JobState.FAILED, str(error))
+            return
+        for entry in entries:
+            self._mark_running(entry)
+
+    def _mark_running(self, entry: Entry) -> None:
+        self._ready.pop(entry.job.name, None)
+        entry.state, entry.began_s, entry.status = JobState.RUNNING, time.monotonic(), WorkerStatus()
+
+    def _collect(self, retry: bool = True) -> bool:
+        """Take note of what has ended; whether something has."""
+        ended = self._engine.ended()
+        for name in sorted(ended, key=self._position.__getitem__):  # a job's end before that of those after it
+            entry, end = self._entries[name], ended[name]
+            entry.status = end.snapshot.status
+            self._add_seconds(entry)
+            missing = next((other for other in entry.job.after if not self._entries[other].state.is_done), None)
+            if end.snapshot.state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
+                self._over(entry, JobState.BLOCKED, f"it comes after {missing}, which is not finished")
+            elif retry and end.is_lost and end.snapshot.state in _LOST and entry.retries < MAX_RETRIES:
+                entry.retries += 1
+                entry.state = JobState.WAITING
+                self._ready[name] = None
+                self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
+            else:
+                self._over(entry, _OUTCOMES.get(end.snapshot.state, JobState.FAILED), end.snapshot.status.error)
+        return bool(ended)
+
+    def _add_seconds(self, entry: Entry) -> None:
+        """Add the time since the job began to its record."""
+        record = read_record(entry.job)
+        if record is None:
+            return
+        seconds = record.seconds + time.monotonic() - entry.began_s
+        entry.seconds = seconds
+        try:
+            write_record(entry.job, replace(record, seconds=round(seconds, 3), machine=entry.machine))
+        except StgaError as error:
+            self._say(f"warning: {error}")
+
+    def _over(self, entry: Entry, state: JobState, error: str = "") -> None:
+        """Take note of a job's end; those that come after it can start, or cannot any more."""
+        self._end(entry, state, error)
+        name = entry.job.name
+        if state == JobState.FINISHED:
+            for child in self._children[name]:
+                self._waits_for[child] -= 1
+                if not self._waits_for[child] and self._entries[child].state == JobState.WAITING:
+                    self._ready[child] = None
+            return
+        after = JobState.CANCELLED if state == JobState.CANCELLED else JobState.BLOCKED
+        left = [(child, name) for child in self._children[name]]
+        while left:
+            child, missing = left.pop()
+            if self._entries[child].state == JobState.WAITING:
+                self._end(self._entries[child], after, f"it comes after {missing}, which is not finished")
+                left += [(other, child) for other in self._children[child]]
+
+    def _end(self, entry: Entry, state: JobState, error: str) -> None:
+        self._ready.pop(entry.job.name, None)
+        entry.state, entry.error = state, error
+        self._left -= 1
+        self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
+
+    def _look(self, now: bool = False) -> None:
+        """Read the status of the running jobs, and show the batch, at most every SHOW_INTERVAL_S."""
+        if not now and time.monotonic() - self._shown_s < SHOW_INTERVAL_S:
+            return
+        for name, machine in self._engine.running().items():
+            entry = self._entries[name]
+            entry.machine = machine
+            entry.status = read_status(entry.job.request_folder) or entry.status
+        self._show(self._batch)
+        self._shown_s = time.monotonic()
+
+
+_LOST = (WorkerState.LOST, WorkerState.NONE, WorkerState.STARTING)
+_OUTCOMES = {WorkerState.FINISHED: JobState.FINISHED, WorkerState.CANCELLED: JobState.CANCELLED}

@@ -1,0 +1,156 @@
+"""Carry out a plan of many jobs, or train many captures: on this machine, or on the engine that is there."""
+
+import shutil
+import sys
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+
+from ..batch.engines.table import EMITTERS, ENGINES
+from ..batch.plan import Plan, plan_of_captures, read_plan
+from ..errors import StgaError
+from ..requests.open_head import OpenHead
+from ..training.settings import PRESETS
+from .arguments import add_device, add_principal_point, duration, usable_path, whole_number
+from .inputs import principal_point_of
+
+NAME, HELP = "batch", "carry out a plan of many jobs, or train many captures"
+PLAN_SUFFIX = ".toml"
+
+
+def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
+    parser.add_argument(
+        "sources", type=usable_path, nargs="+", metavar="PLAN.toml|CAPTURE", help="a plan (docs/batch.md), or captures"
+    )
+    parser.add_argument("--out", type=usable_path, metavar="RUNS", help="folder of the batch, where captures are given")
+    parser.add_argument("--preset", choices=tuple(PRESETS), help="quality and training time of captures")
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument("--budget", type=duration, metavar="TIME", help="training time of each capture")
+    budget.add_argument("--iterations", type=whole_number(1), help="number of iterations of each capture")
+    parser.add_argument("--seed", type=whole_number(0), help="fixes every random choice (default 0)")
+    parser.add_argument("--flame", type=usable_path, metavar="FILE", help="FLAME model file of the captures")
+    add_principal_point(parser)
+    add_device(parser)
+    parser.add_argument("--threads", type=whole_number(1), metavar="N", help="threads of each job that names none")
+    parser.add_argument("--dry-run", action="store_true", help="print the jobs, and how long they are expected to take")
+    what = "; ".join(f"{name}: {row.what}" for name, row in ENGINES.items())
+    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{what} (default local)")
+    files = "; ".join(f"{name}: {row.what}" for name, row in EMITTERS.items())
+    parser.add_argument(
+        "--emit", choices=tuple(EMITTERS), help=f"write a file by which a farm carries out the jobs: {files}"
+    )
+    parser.add_argument("--address", default="", help="of a running cluster (ray)")
+
+
+def run(options: Namespace) -> None:
+    plan = _with_threads(batch_plan(options), options)
+    if options.dry_run:
+        _print_plan(plan)
+        return
+    if options.emit is not None:
+        _emit(plan, options.emit)
+        return
+    _carry_out(plan, options)
+
+
+def batch_plan(options: Namespace) -> Plan:
+    """Raises StgaError for a mistake in the plan, and for options that would have no effect with one."""
+    if options.sources[0].suffix != PLAN_SUFFIX:
+        return _plan_of_captures(options)
+    if len(options.sources) > 1:
+        raise StgaError(f"{options.sources[1]}: cannot be given beside a plan")
+    given = {
+        "--out": options.out,
+        "--preset": options.preset,
+        "--budget": options.budget,
+        "--iterations": options.iterations,
+        "--seed": options.seed,
+        "--flame": options.flame,
+        "--principal-point": options.principal_point,
+        "--device": None if options.device == "auto" else options.device,
+    }
+    extra = next((name for name, value in given.items() if value is not None), None)
+    if extra is not None:
+        raise StgaError(f"{extra}: has no effect with a plan, which says that itself")
+    return read_plan(options.sources[0])
+
+
+def _plan_of_captures(options: Namespace) -> Plan:
+    if options.out is None:
+        raise StgaError("--out: is missing; expected the folder of the batch")
+    missing = next((path for path in options.sources if not path.is_dir()), None)
+    if missing is not None:
+        raise StgaError(f"{missing}: is not a folder; expected that of a capture, or a plan that ends in {PLAN_SUFFIX}")
+    chosen = {
+        "preset": options.preset,
+        "seconds": options.budget,
+        "iterations": options.iterations,
+        "seed": options.seed,
+    }
+    settings = {name: value for name, value in chosen.items() if value is not None}
+    if not {"preset", "seconds", "iterations"} & settings.keys():
+        raise StgaError("--preset: is missing; expected it, --budget or --iterations")
+    fields = {"device": options.device, "principal_point": principal_point_of(options)}
+    if options.flame is not None:
+        fields["flame"] = str(options.flame.absolute())
+    return plan_of_captures(options.sources, options.out, settings, fields)
+
+
+def _with_threads(plan: Plan, options: Namespace) -> Plan:
+    """The plan with threads for the jobs that name none: this machine's processors, shared among them."""
+    from ..batch.engines.local import processors
+
+    is_here = options.engine == "local" and options.emit is None
+    threads = options.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1)
+    jobs = [
+        job if job.resources.threads else replace(job, resources=replace(job.resources, threads=threads))
+        for job in plan.jobs
+    ]
+    return replace(plan, jobs=tuple(jobs))
+
+
+def _print_plan(plan: Plan) -> None:
+    from ..batch.engines.local import processors
+    from ..batch.forecast import forecast_seconds
+    from ..batch.run import Batch
+    from ..batch.table import plan_lines
+
+    batch = Batch(plan)
+    batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
+    print("\n".join(plan_lines(batch, processors())))
+
+
+def _emit(plan: Plan, name: str) -> None:
+    from ..batch.engines.table import emit
+    from ..batch.lease import hold_folder
+    from ..batch.run import Batch
+
+    with hold_folder(plan.out):
+        batch = Batch(plan)
+        if batch.unfinished:
+            print(f"{len(batch.unfinished)} jobs: {emit(name, batch)}")
+        else:
+            print("every job is finished")
+
+
+def _carry_out(plan: Plan, options: Namespace) -> None:
+    from ..batch.engines.table import make_engine
+    from ..batch.forecast import forecast_seconds
+    from ..batch.lease import hold_folder
+    from ..batch.report import write_report
+    from ..batch.run import Batch, run_batch
+    from ..batch.table import LiveTable, summary_line
+
+    with hold_folder(plan.out) as lease:
+        batch = Batch(plan)
+        engine = make_engine(options.engine, options.address)
+        batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
+        table = LiveTable(sys.stderr, shutil.get_terminal_size().columns)
+        try:
+            run_batch(batch, engine, lease, table, table.say)
+        finally:
+            path = write_report(batch)
+            print(f"{summary_line(batch, 0.0)}\nreport: {path}")
+    failures = batch.failures
+    if failures:
+        first = failures[0]
+        raise StgaError(f"{len(failures)} of {len(plan.jobs)} jobs failed; {first.job.name}: {first.error}")

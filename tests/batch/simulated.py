@@ -1,0 +1,77 @@
+"""An engine that does no work, and batches of jobs that ask for none."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from stga_addon.batch.engines.engine import Ended, Engine
+from stga_addon.batch.job import Job
+from stga_addon.batch.lease import hold_folder
+from stga_addon.batch.plan import Plan, make_plan
+from stga_addon.batch.run import Batch, run_batch
+from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
+
+Outcome = Callable[[Job], tuple[WorkerState | None, str]]
+
+
+def finished(job: Job) -> tuple[WorkerState | None, str]:
+    return WorkerState.FINISHED, ""
+
+
+class SimulatedEngine:
+    """Ends each job at the next question, with the state and error of `outcome`; None: its worker was killed."""
+
+    interval_s = 0.0
+
+    def __init__(self, outcome: Outcome = finished, room: int = 1 << 30, takes_all: bool = False) -> None:
+        self.outcome, self.room, self.takes_all = outcome, room, takes_all
+        self.submitted: list[str] = []
+        self.most = 0
+        self.jobs: dict[str, Job] = {}
+
+    def has_room(self, job: Job) -> bool:
+        return len(self.jobs) < self.room
+
+    def submit(self, jobs: Sequence[Job]) -> None:
+        self.submitted += [job.name for job in jobs]
+        self.jobs.update({job.name: job for job in jobs})
+        self.most = max(self.most, len(self.jobs))
+
+    def adopt(self, job: Job) -> None:
+        self.jobs[job.name] = job
+
+    def running(self) -> Mapping[str, str]:
+        return dict.fromkeys(self.jobs, "simulated")
+
+    def ended(self) -> Mapping[str, Ended]:
+        jobs, self.jobs = self.jobs, {}
+        return {name: self.end(job) for name, job in jobs.items()}
+
+    def end(self, job: Job) -> Ended:
+        state, error = self.outcome(job)
+        if state is not None:
+            StatusWriter(job.request_folder).finish(state, error)
+        return Ended(inspect_worker(job.request_folder), state is None)
+
+    def withdraw(self) -> Sequence[str]:
+        return ()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def empty_jobs(base: Path, count: int, tables: Mapping[str, Any] | None = None) -> Plan:
+    """A plan of `count` analyses, which write no file but their result; and of further tables."""
+    (base / "capture").mkdir(exist_ok=True)
+    cases = [{"name": f"{number:05d}"} for number in range(count)]
+    table = {"request": "analyze", "capture": "capture", "cases": cases}
+    return make_plan({"out": "runs", "job": {"look": table, **(tables or {})}}, base, "plan")
+
+
+def carry_out(plan: Plan, engine: Engine) -> tuple[Batch, list[str]]:
+    """The batch after its end, and what was said."""
+    said: list[str] = []
+    with hold_folder(plan.out) as lease:
+        batch = Batch(plan)
+        run_batch(batch, engine, lease, lambda batch: None, said.append)
+    return batch, said

@@ -1,0 +1,197 @@
+"""Plans: which jobs a table makes, what each comes after, and the sentence for each mistake."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stga_addon.batch.identity import _input_digest, job_digest
+from stga_addon.batch.plan import Plan, make_plan, plan_of_captures, read_plan
+from stga_addon.errors import StgaError
+from stga_addon.requests.values import Evaluate, Extend, Refine, Track, Train
+from stga_addon.training.settings import make_settings
+
+PLAN = """
+out = "runs"
+[resources]
+threads = 2
+[job.evaluate]
+request = "evaluate"
+run = "{train}"
+sweep = { split = ["val", "test"] }
+[job.track]
+request = "track"
+model = "head.npz"
+cases = [{ name = "anna", footage = "footage/anna" }, { name = "ben", footage = "footage/ben" }]
+[job.train]
+request = "train"
+capture = "{track}"
+settings = { iterations = 30, selection = { threshold = 0.02 }, sh_steps = [0.5] }
+resources = { memory_gb = 4.5, gpu = true }
+sweep = { "settings.seed" = [0, 7] }
+[job.smile]
+request = "extend"
+parent = "{train}"
+captures = ["footage/anna", "{track}"]
+iterations = 5
+minutes = 2
+after = ["evaluate"]
+"""
+
+
+@pytest.fixture
+def base(tmp_path: Path) -> Path:
+    for name in ("anna", "ben"):
+        (tmp_path / "footage" / name).mkdir(parents=True)
+    (tmp_path / "head.npz").touch()
+    return tmp_path
+
+
+def plan_of(base: Path, text: str = PLAN) -> Plan:
+    (base / "plan.toml").write_text(text)
+    return read_plan(base / "plan.toml")
+
+
+def test_jobs_of_a_plan(base: Path) -> None:
+    """Catches a combination that is lost or made twice, and a job that reads another actor's files."""
+    jobs = {job.name: job for job in plan_of(base).jobs}
+    heads, runs = base / "runs", [f"{actor}-seed{seed}" for actor in ("anna", "ben") for seed in (0, 7)]
+    assert {name for name in jobs if name.startswith("track")} == {"track-anna", "track-ben"}
+    assert {name for name in jobs if name.startswith("train")} == {f"train-{run}" for run in runs}
+    assert {name for name in jobs if name.startswith("evaluate")} == {
+        f"evaluate-{run}-{split}" for run in runs for split in ("val", "test")
+    }
+    assert {name for name in jobs if name.startswith("smile")} == {f"smile-{run}" for run in runs}
+    assert jobs["track-ben"].request == Track(base / "footage/ben", base / "head.npz", heads / "track-ben")
+    training = jobs["train-ben-seed7"]
+    default = make_settings(iterations=1).selection
+    settings = make_settings(
+        iterations=30, seed=7, effects={}, sh_steps=(0.5,), selection=replace(default, threshold=0.02)
+    )
+    assert training.request == Train(heads / "train-ben-seed7", heads / "track-ben", settings)
+    assert training.after == ("track-ben",)
+    assert training.resources.threads == 2
+    assert (training.resources.memory_gb, training.resources.gpu) == (4.5, True)
+    assert jobs["evaluate-anna-seed0-test"].request == Evaluate(heads / "train-anna-seed0", "test")
+    smile = jobs["smile-anna-seed7"]
+    takes = (base / "footage/anna", heads / "track-anna")
+    assert smile.request == Extend(heads / "smile-anna-seed7", heads / "train-anna-seed7", takes, iterations=5)
+    waits = {"train-anna-seed7", "track-anna", "evaluate-anna-seed7-val", "evaluate-anna-seed7-test"}
+    assert set(smile.after) == waits
+    assert smile.minutes == 2
+
+
+def test_jobs_follow_those_they_come_after(base: Path) -> None:
+    """Catches jobs in the order of the file, and a path into another job's folder that is not waited for."""
+    jobs = plan_of(base).jobs
+    names = [job.name for job in jobs]
+    assert all(names.index(other) < names.index(job.name) for job in jobs for other in job.after)
+    table = '[job.mouth]\nrequest = "refine"\nparent = "runs/train-ben-seed0"\nregion = "mouth"\niterations = 1\n'
+    found = {job.name: job for job in plan_of(base, PLAN + table).jobs}["mouth"]
+    assert found.after == ("train-ben-seed0",)
+    assert isinstance(found.request, Refine)
+
+
+def test_captures_make_a_plan(base: Path) -> None:
+    """Catches captures that do not come out as `stga train` would train them: with a preset, for the preset's time."""
+    captures = [base / "footage/anna", base / "footage/ben"]
+    plan = plan_of_captures(captures, base / "out", {"preset": "draft"}, {"device": "cpu"})
+    assert [job.name for job in plan.jobs] == ["train-anna", "train-ben"]
+    request = plan.jobs[1].request
+    assert isinstance(request, Train)
+    assert (request.preset_time, request.settings.preset, request.settings.lattice) == (True, "draft", 1)
+    assert request.settings.effects == {}
+    assert (request.run, request.capture, request.device) == (base / "out/train-ben", captures[1], "cpu")
+
+
+ONE = '[job.one]\nrequest = "train"\ncapture = "footage/anna"\nsettings = { iterations = 3 }\n'
+MISTAKES = {
+    "out = 3\n" + ONE: "out: expected the batch's folder",
+    'out = "r"\nworkers = 3\n' + ONE: "workers: is not a key of it",
+    'out = "r"\n': r"holds no job; expected a table \[job.NAME\]",
+    'out = "r"\n[job."a/b"]\n': r"\[job.'a/b'\]: expected a name",
+    'out = "r"\n[job.replaced]\n': "other than 'replaced'",
+    'out = "r"\n[job.a]\nrequest = "fly"\n': r"\[job.a\]: request: expected one of train, .*got 'fly'",
+    'out = "r"\n[job.a]\n': r"\[job.a\]: request: expected one of",
+    'out = "r"\n' + ONE + 'capturee = "x"\n': r"\[job.one\]: capturee: is not a key",
+    'out = "r"\n' + ONE + "device = 3\n": r"\[job.one\]: device: expected a text",
+    'out = "r"\n' + ONE + 'device = "abacus"\n': r"\[job.one\]: device: expected auto, cpu, gpu",
+    'out = "r"\n' + ONE + "flame = 3\n": r"\[job.one\]: flame: expected a path",
+    'out = "r"\n' + ONE + "flame = 1979-05-27\n": r"\[job.one\]: flame: expected a path",
+    'out = "r"\n' + ONE + 'flame = "none.pkl"\n': r"\[job.one\]: flame: .*none.pkl does not exist",
+    'out = "r"\n' + ONE.replace("iterations = 3", "iterations = 0"): r"\[job.one\]: settings.iterations: expected",
+    'out = "r"\n' + ONE.replace("iterations = 3", "iterations = inf"): r"\[job.one\]: settings.iterations",
+    'out = "r"\n' + ONE.replace("iterations = 3", "iteration = 3"): r"\[job.one\]: settings: iteration: is not a key",
+    'out = "r"\n' + ONE.replace("iterations = 3", ""): r"\[job.one\]: the budget must be given",
+    'out = "r"\n' + ONE.replace("{ iterations = 3 }", "3"): r"\[job.one\]: settings: expected a table",
+    'out = "r"\n' + ONE + 'after = ["two"]\n': r"\[job.one\]: refers to the job 'two', which the plan does not have",
+    'out = "r"\n' + ONE + 'after = "two"\n': r"\[job.one\]: after: expected a list",
+    'out = "r"\n' + ONE + 'after = ["one"]\n': "these jobs wait for each other: one → one",
+    'out = "r"\n' + ONE + "sweep = { seed = [] }\n": r"\[job.one\]: sweep: expected lists",
+    'out = "r"\n' + ONE + "cases = 3\n": r"\[job.one\]: cases: expected a list of tables",
+    'out = "r"\n' + ONE + 'cases = [{ flame = "x" }, { name = "a b" }]\n': r"\[job.one\]: cases.1.name: expected",
+    'out = "r"\n' + ONE + "resources = { threads = -1 }\n": r"\[job.one\]: resources: setting threads: expected",
+    'out = "r"\n' + ONE + "resources = { cpus = 1 }\n": r"\[job.one\]: resources: cpus: is not a key",
+    'out = "r"\n' + ONE + "minutes = 0\n": r"\[job.one\]: setting minutes: expected a number above 0",
+    'out = "r"\n' + ONE + 'sweep = { principal_point = ["opencv", "opencv"] }\n': "two of the jobs are called 'one",
+    'out = "r"\n[job.a]\nrequest = "evaluate"\n': r"\[job.a\]: run: is missing",
+    'out = "r': "is not valid TOML",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", MISTAKES, ids=lambda text: re.sub(r"\W+", "-", text)[-40:])
+def test_a_mistake_is_a_sentence(base: Path, text: str) -> None:
+    """Catches a mistake in a plan that is carried out, or ends in a traceback."""
+    with pytest.raises(StgaError, match=MISTAKES[text]) as caught:
+        plan_of(base, text)
+    assert str(caught.value).startswith(str(base / "plan.toml"))
+
+
+def test_jobs_that_wait_for_each_other_by_path(base: Path) -> None:
+    """Catches a circle through folders, which no table names."""
+    table = '[job.{0}]\nrequest = "evaluate"\nrun = "r/{1}"\n'
+    with pytest.raises(StgaError, match="wait for each other"):
+        plan_of(base, 'out = "r"\n' + table.format("a", "b") + table.format("b", "a"))
+
+
+def digests(plan: Plan) -> dict[str, str]:
+    _input_digest.cache_clear()
+    jobs, found = {job.name: job for job in plan.jobs}, dict[str, str]()
+    for job in plan.jobs:
+        found[job.name] = job_digest(job, jobs, found)
+    return found
+
+
+def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
+    assert before.keys() == after.keys()
+    return {name for name in before if before[name] != after[name]}
+
+
+def test_what_changed_is_done_again(base: Path) -> None:
+    """Catches work that is repeated although nothing changed, and results of old inputs or settings that are kept."""
+    before = digests(plan_of(base))
+    assert changed(before, digests(plan_of(base, PLAN.replace("threads = 2", "threads = 1")))) == set()
+    (base / "footage/ben/take.mp4").write_text("new")
+    bens = {name for name in before if "ben" in name}
+    assert changed(before, digests(plan_of(base))) == bens
+    (base / "footage/ben/take.mp4").unlink()
+    (base / "footage/anna/.cache").touch()  # hidden
+    assert changed(before, digests(plan_of(base))) == set()
+    after = digests(plan_of(base, PLAN.replace("iterations = 5", "iterations = 6")))
+    assert changed(before, after) == {name for name in before if name.startswith("smile")}
+
+
+def test_a_run_counts_by_its_content(base: Path) -> None:
+    """Catches an evaluation that is repeated because it wrote its figures into the run that it read."""
+    run = base / "run"
+    run.mkdir()
+    for name in ("run.json", "avatar.npz"):
+        (run / name).write_text("1")
+    values: dict[str, Any] = {"out": "r", "job": {"a": {"request": "evaluate", "run": "run"}}}
+    before = digests(make_plan(values, base, "plan"))
+    (run / "quality_val.json").touch()
+    assert changed(before, digests(make_plan(values, base, "plan"))) == set()
+    (run / "avatar.npz").write_text("2")
+    assert changed(before, digests(make_plan(values, base, "plan"))) == {"a"}

@@ -1,0 +1,253 @@
+"""Running batches on an engine that does no work: order, failures, kills, and what a second start does."""
+
+import errno
+import json
+import multiprocessing
+import resource
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stga_addon.batch import lease as leases
+from stga_addon.batch.engines.local import LocalEngine
+from stga_addon.batch.folder import is_done
+from stga_addon.batch.job import Job, Resources
+from stga_addon.batch.lease import LEASE, hold_folder
+from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
+from stga_addon.batch.table import plan_lines, table_lines
+from stga_addon.errors import StgaError
+from stga_addon.worker.status import WorkerState
+
+from .simulated import SimulatedEngine, carry_out, empty_jobs
+
+AFTER = {
+    "again": {"request": "analyze", "capture": "{look}"},
+    "last": {"request": "analyze", "capture": "capture", "after": ["again"]},
+}
+
+
+def states(batch: Batch) -> dict[str, JobState]:
+    return {name: entry.state for name, entry in batch.entries.items()}
+
+
+@pytest.mark.parametrize("takes_all", [False, True])
+def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) -> None:
+    """Catches work that is repeated, and work that is not although its input or its result has changed."""
+    plan = empty_jobs(tmp_path, 3, AFTER)
+    engine = SimulatedEngine(room=2 if not takes_all else 99, takes_all=takes_all)
+    batch, _ = carry_out(plan, engine)
+    assert set(states(batch).values()) == {JobState.FINISHED}
+    assert engine.submitted.index("last") == len(plan.jobs) - 1
+    assert engine.most == (7 if takes_all else 2)
+    second = SimulatedEngine(takes_all=takes_all)
+    batch, _ = carry_out(plan, second)
+    assert second.submitted == []
+    assert set(states(batch).values()) == {JobState.KEPT}
+    (tmp_path / "runs/look-00001/job/status.json").unlink()
+    third = SimulatedEngine(takes_all=takes_all)
+    carry_out(plan, third)
+    assert third.submitted == ["look-00001", "again-00001", "last"]
+    (tmp_path / "capture/new.png").touch()
+    from stga_addon.batch.identity import _input_digest
+
+    _input_digest.cache_clear()
+    fourth = SimulatedEngine(takes_all=takes_all)
+    _, said = carry_out(plan, fourth)
+    assert len(fourth.submitted) == len(plan.jobs)
+    moved = tmp_path / "runs/replaced/look-00001"
+    assert f"look-00001: has changed; what it wrote before is in {moved}" in said
+    assert (moved / "job/request.json").exists()
+
+
+@pytest.mark.parametrize("takes_all", [False, True])
+def test_a_failed_job_fails_alone(tmp_path: Path, takes_all: bool) -> None:
+    """Catches a failure that stops other actors' jobs, or is passed on as if the next job had failed by itself."""
+
+    def outcome(job: Job) -> tuple[WorkerState, str]:
+        failed = job.name == "look-00001" or (takes_all and job.name == "again-00001")
+        return (WorkerState.FAILED, "capture: is empty") if failed else (WorkerState.FINISHED, "")
+
+    plan = empty_jobs(tmp_path, 3, AFTER)
+    batch, said = carry_out(plan, SimulatedEngine(outcome, takes_all=takes_all))
+    found = states(batch)
+    assert found["look-00001"] == JobState.FAILED
+    assert batch.entries["look-00001"].error == "capture: is empty"
+    assert found["again-00001"] == JobState.BLOCKED
+    assert batch.entries["again-00001"].error == "it comes after look-00001, which is not finished"
+    assert Counter(found.values())[JobState.FINISHED] == (5 if takes_all else 4)
+    assert "look-00001: failed: capture: is empty" in said
+    engine = SimulatedEngine()
+    batch, _ = carry_out(plan, engine)
+    assert set(engine.submitted) >= {"look-00001", "again-00001"}
+    assert "look-00000" not in engine.submitted
+    assert all(state.is_done for state in states(batch).values())
+
+
+def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
+    """Catches a batch that ends because a machine died, and one that tries a job for ever."""
+    deaths = Counter({"look-00000": 2, "look-00001": 99})
+
+    def outcome(job: Job) -> tuple[WorkerState | None, str]:
+        deaths[job.name] -= 1
+        return (None, "") if deaths[job.name] >= 0 else (WorkerState.FINISHED, "")
+
+    engine = SimulatedEngine(outcome)
+    batch, _ = carry_out(empty_jobs(tmp_path, 3), engine)
+    assert states(batch)["look-00000"] == JobState.FINISHED
+    assert states(batch)["look-00001"] == JobState.FAILED
+    assert "Worker exited unexpectedly" in batch.entries["look-00001"].error
+    assert Counter(engine.submitted) == {"look-00000": 3, "look-00001": 1 + MAX_RETRIES, "look-00002": 1}
+
+
+def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
+    """Catches an interrupted batch that starts further jobs, or forgets those that were finished."""
+    plan = empty_jobs(tmp_path, 4)
+
+    def outcome(job: Job) -> tuple[WorkerState, str]:
+        if job.name == "look-00001":
+            raise KeyboardInterrupt
+        return WorkerState.FINISHED, ""
+
+    engine = SimulatedEngine(outcome, room=1)
+    with pytest.raises(KeyboardInterrupt):
+        carry_out(plan, engine)
+    assert engine.submitted == ["look-00000", "look-00001"]
+    second = SimulatedEngine()
+    carry_out(plan, second)
+    assert second.submitted == ["look-00001", "look-00002", "look-00003"]
+
+
+@pytest.mark.parametrize("takes_all", [False, True])
+def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
+    """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts the jobs after it."""
+    plan = empty_jobs(tmp_path, 2, {"again": AFTER["again"]})
+    own = tmp_path / "runs/look-00000/run.json"
+    own.parent.mkdir(parents=True)
+    own.write_text("mine")
+    engine = SimulatedEngine(takes_all=takes_all)
+    batch, _ = carry_out(plan, engine)
+    assert engine.submitted == ["look-00001", "again-00001"]
+    assert states(batch)["again-00000"] == JobState.BLOCKED
+    assert "holds files that no job of a batch wrote" in batch.entries["look-00000"].error
+    assert states(batch)["again-00001"] == JobState.FINISHED
+    assert own.read_text() == "mine"
+
+
+def test_a_damaged_record_is_no_result(tmp_path: Path) -> None:
+    """Catches a traceback, or a job that counts as finished, where its record is cut off."""
+    plan = empty_jobs(tmp_path, 1)
+    carry_out(plan, SimulatedEngine())
+    record = tmp_path / "runs/look-00000/job/job.json"
+    digest = json.loads(record.read_text())["digest"]
+    assert is_done(plan.jobs[0], digest)
+    record.write_text(record.read_text()[:20])
+    assert not is_done(plan.jobs[0], digest)
+    carry_out(plan, SimulatedEngine())
+    assert is_done(plan.jobs[0], digest)
+
+
+def test_room_on_this_machine(tmp_path: Path) -> None:
+    """Catches more workers than the machine has processors or memory for, and one that never fits."""
+    engine = LocalEngine(cores=4, memory_gb=8.0)
+
+    def job(name: str, **needs: float) -> Job:
+        found = empty_jobs(tmp_path, 1).jobs[0]
+        return Job(name, "look", found.request, tmp_path / name, resources=Resources(**{"threads": 1, **needs}))
+
+    assert engine.has_room(job("huge", threads=64, memory_gb=100.0))
+    engine.adopt(job("a", threads=2, memory_gb=3.0, gpu=True))
+    assert engine.has_room(job("b", threads=2, memory_gb=5.0))
+    assert not engine.has_room(job("b", threads=3))
+    assert not engine.has_room(job("b", memory_gb=5.1))
+    assert not engine.has_room(job("b", gpu=True))
+
+
+def test_tables(tmp_path: Path) -> None:
+    """Catches a table whose counts, shares or minutes are not those of the jobs."""
+    plan = empty_jobs(tmp_path, 30)
+    batch = Batch(plan)
+    batch.set_forecasts({entry.name: 60.0 for entry in plan.jobs[:10]})
+    assert plan_lines(batch, 5)[-1].startswith("30 jobs, 30 to do; 10 min of work, about 2 min on this machine; of 20 ")
+    entries = list(batch.entries.values())
+    for number, entry in enumerate(entries):
+        entry.state = JobState.FINISHED if number < 20 else JobState.RUNNING if number < 24 else JobState.FAILED
+    running = entries[20]
+    running.began_s, running.machine = 100.0, "node7"
+    running.status = type(running.status)(progress=0.25, message="Training", figures={"psnr": 31.25})
+    lines = table_lines(batch, 130.0)
+    assert lines[0].startswith("20 of 30 jobs finished, 4 running, 6 failed; about 90 s left")
+    assert "node7" in lines[1]
+    assert "[#####...............]  25%  31.25 dB  90 s left  Training" in lines[1]
+    assert len(lines) == 11
+
+
+# The lease
+
+
+def _hold(folder: str, held: Any) -> None:
+    with hold_folder(Path(folder)):
+        held.set()
+        time.sleep(120)
+
+
+@pytest.mark.parametrize("locks", ["work", "fail"])
+def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches two batches that write into each other's jobs, also where the storage knows no file locks."""
+    if locks == "fail":
+
+        def no_lock(path: Path) -> None:
+            raise OSError(errno.ENOLCK, "No locks available")
+
+        monkeypatch.setattr(leases, "hold_lock", no_lock)
+    monkeypatch.setattr(leases, "BEAT_S", 0.1)
+    monkeypatch.setattr(leases, "EXPIRY_S", 4.0)
+    context = multiprocessing.get_context("fork")
+    held = context.Event()
+    other = context.Process(target=_hold, args=(str(tmp_path), held))
+    other.start()
+    try:
+        assert held.wait(30)
+        with (
+            pytest.raises(StgaError, match=r"another batch is working in this folder \(process \d+"),
+            hold_folder(tmp_path),
+        ):
+            pass
+        other.kill()  # which leaves the lease behind
+        other.join()
+        assert (tmp_path / LEASE).exists()
+        with hold_folder(tmp_path) as lease:
+            assert not lease.is_lost
+    finally:
+        other.kill()
+        other.join()
+    assert not (tmp_path / LEASE).exists()
+
+
+def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a batch that goes on in a folder which another machine's batch took while this one was suspended."""
+    monkeypatch.setattr(leases, "BEAT_S", 0.05)
+    plan = empty_jobs(tmp_path, 1)
+
+    def outcome(job: Job) -> tuple[WorkerState | None, str]:
+        (plan.out / LEASE).write_text(json.dumps({"token": "another", "host": "other", "process": 1, "count": 5}))
+        time.sleep(0.5)
+        return None, ""
+
+    with pytest.raises(StgaError, match="another batch has taken this folder"):
+        carry_out(plan, SimulatedEngine(outcome))
+
+
+@pytest.mark.slow
+def test_ten_thousand_jobs(tmp_path: Path) -> None:
+    """Catches time or memory that grows faster than the number of jobs."""
+    begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    batch, _ = carry_out(empty_jobs(tmp_path, 10_000), SimulatedEngine())
+    seconds, peak_mb = time.monotonic() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    assert Counter(states(batch).values()) == {JobState.FINISHED: 10_000}
+    print(f"{seconds:.1f} s, {peak_mb:.0f} MB, {peak_mb - before / 1024:.0f} MB more", file=sys.stderr)
+    assert seconds < 600
+    assert peak_mb < 1000

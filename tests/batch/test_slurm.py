@@ -1,0 +1,99 @@
+"""The SLURM engine on a cluster of two nodes on this host; skipped by name where SLURM is not installed."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from stga_addon.batch.engines import slurm
+from stga_addon.batch.engines.local import LocalEngine
+from stga_addon.batch.engines.slurm import SlurmEngine
+from stga_addon.batch.engines.table import make_engine
+from stga_addon.batch.run import JobState
+from stga_addon.errors import StgaError
+from stga_addon.worker.lock import lock_owner
+from stga_addon.worker.status import LOCK_FILE
+
+from .simulated import carry_out, empty_jobs
+from .slurm_cluster import Cluster, missing_programs, running_cluster
+from .tiny import splats_of, tiny_plan
+
+pytest.importorskip("torch")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    if missing_programs():
+        pytest.skip(f"SLURM is not installed ({', '.join(missing_programs())}): apt-get install slurm-wlm munge")
+    with running_cluster(tmp_path_factory.mktemp("slurm")) as found:
+        yield found
+
+
+@pytest.fixture
+def on_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    for name in ("PATH", "SLURM_CONF"):
+        monkeypatch.setenv(name, cluster.variables[name])
+    return cluster
+
+
+def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
+    """Catches jobs that begin before those they come after, or train something else than on this machine; and a killed
+    worker whose job is lost."""
+    for name in ("local", "slurm"):
+        (tmp_path / name).mkdir()
+    here, there = (tiny_plan(tmp_path / name, iterations=200) for name in ("local", "slurm"))
+    carry_out(here, LocalEngine(2, 8.0))
+    machines: set[str] = set()
+    killed: list[int] = []
+
+    class Watched(SlurmEngine):
+        def ended(self):  # type: ignore[no-untyped-def]
+            found = super().ended()
+            machines.update(self.running().values())
+            folder = there.out / "train-seed0/job"
+            owner = lock_owner(folder / LOCK_FILE)
+            if owner and not killed and (there.out / "train-seed0/metrics.jsonl").exists():
+                os.kill(owner, signal.SIGKILL)
+                killed.append(owner)
+            return found
+
+    batch, _ = carry_out(there, Watched())
+    assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
+    assert killed
+    assert machines == {"one", "two"}
+    for seed in range(2):
+        assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+
+
+def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Path) -> None:
+    """Catches an array that one failed job takes down, and jobs after it that count as failed themselves."""
+    plan = tiny_plan(tmp_path, iterations=3)
+    name = "train-seed1"
+    (plan.out / name).mkdir(parents=True)
+    (plan.out / name / "run.json").write_text("{}")
+    batch, _ = carry_out(plan, SlurmEngine())
+    states = {name: entry.state for name, entry in batch.entries.items()}
+    assert states["train-seed0"] == states["evaluate-seed0"] == JobState.FINISHED
+    assert (states[name], states["evaluate-seed1"]) == (JobState.FAILED, JobState.BLOCKED)
+
+
+def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -> None:
+    """Catches a batch that waits for ever for jobs that no machine of the cluster can take."""
+    plan = empty_jobs(tmp_path, 2)
+    huge = {"resources": {"memory_gb": 1e6, "threads": 1}}
+    plan = empty_jobs(tmp_path, 1, {"huge": {"request": "analyze", "capture": "capture", **huge}})
+    batch, _ = carry_out(plan, SlurmEngine())
+    assert batch.entries["huge"].state == JobState.FAILED
+    assert "sbatch: " in batch.entries["huge"].error
+
+
+def test_without_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a traceback where SLURM is not installed, and an address that is silently ignored."""
+    monkeypatch.setattr(slurm.shutil, "which", lambda name: None)
+    with pytest.raises(StgaError, match="--engine slurm: the program sbatch was not found"):
+        make_engine("slurm")
+    with pytest.raises(StgaError, match="--address: has no effect with --engine slurm"):
+        make_engine("slurm", "host:1")
