@@ -15,7 +15,7 @@ numba = pytest.importorskip("numba")
 import llvmlite.binding as llvm  # noqa: E402
 from numba.core import config  # noqa: E402
 
-from stga_addon.raster.cpu import FASTMATH, blend  # noqa: E402
+from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer  # noqa: E402
 
 X86, ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"
 
@@ -45,8 +45,11 @@ PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m
 """LLVM prefers 256 bits on Sapphire Rapids, whose wider instructions lower the clock."""
 
 
-def unoptimized_ir(function: Callable, signature: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Numba's LLVM IR of a function, compiled as the kernels are but for the optimization."""
+def unoptimized_ir(function: Callable, signature: object, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Numba's LLVM IR of a function, compiled as the kernels are but for the optimization.
+
+    What it calls must be inlined by Numba (`inline_jit`): other functions would be kept, unoptimized, in the cache.
+    """
     monkeypatch.setattr(config, "OPT", type(config.OPT)(0))
     python = getattr(function, "py_func", function)
     compiled = numba.njit(signature, fastmath=FASTMATH, error_model="numpy", no_cpython_wrapper=True)(python)
@@ -77,6 +80,7 @@ def assembly(ir: str, cpu: str) -> str:
             passes.add_loop_rotate_pass()
             passes.add_instruction_combine_pass()
             passes.add_jump_threading_pass()
+        passes.add_refprune_pass()
         passes.run(module, builder)
     return str(machine.emit_assembly(module))
 
@@ -103,10 +107,10 @@ def faults(ir: str, cpu: str, loops: int, spills: int) -> str:
     kind = PROCESSORS[cpu]
     full = []
     for loop in inner_loops(assembly(ir, cpu)):
-        if count(kind.conditional, loop):
-            return f"{cpu}: a conditional load or store\n" + "\n".join(loop)
         if count(kind.packed, [line for line in loop if re.search(kind.vector, line)]):
             full.append(loop)
+            if count(kind.conditional, loop):
+                return f"{cpu}: a conditional load or store\n" + "\n".join(loop)
             if count(kind.scalar, loop):
                 return f"{cpu}: scalar arithmetic in a vectorized loop\n" + "\n".join(loop)
             if (found := count("Spill|Reload", loop)) > spills:
@@ -116,12 +120,29 @@ def faults(ir: str, cpu: str, loops: int, spills: int) -> str:
 
 STATE = "f4[::1]"
 PIXELS = "u8, u8"
+TABLE = np.zeros((2, 3), np.float32)
+ADAM = numba.types.void(
+    numba.typeof(np.zeros(2, np.int32)),
+    numba.typeof(optimizer.AdamTables(*[TABLE] * 5, TABLE[0])),
+    *[numba.types.Array(numba.float32, 1, "C")] * 3,
+    numba.typeof(optimizer.AdamOptions(*np.zeros(4, np.float32))),
+)
 LOOPS = {
     "falloff": (blend._falloff, f"void({PIXELS}, u8, {STATE}, {STATE})", 1, 4),
     "blend": (blend._blend_pair, f"void({PIXELS}, u8, f4, {STATE}, {STATE})", 2, 4),
     "unblend": (blend._unblend_pair, f"void({PIXELS}, u8, f4, {STATE}, {STATE})", 2, 4),
     "gradient of the falloff": (blend._sum_falloff_gradient, f"void({PIXELS}, u8, {STATE}, {STATE}, {STATE})", 1, 0),
     "gradient of the color": (blend._sum_color_gradient, f"void({PIXELS}, {STATE}, {STATE})", 1, 0),
+    "horizontal blur": (image_loss._blur_row, f"void({STATE}, i8, {STATE}, i8, i8)", 1, 0),
+    "vertical blur": (image_loss._blur_column, f"void({STATE}, i8, i8, i8, {STATE}, i8, i8)", 1, 0),
+    "SSIM": (image_loss._similarity_row, f"f4({STATE}, i8, i8, i8, i8, {STATE})", 1, 8),
+    "gradient of the loss": (
+        image_loss._gradient_row,
+        f"f4({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE})",
+        1,
+        4,
+    ),
+    "Adam": (optimizer._adam_block, ADAM, 2, 0),
 }
 """name -> function, signature, its vectorized loops, and the spills that each may have"""
 
