@@ -4,10 +4,10 @@
                                    [--repeats 30] [--out FILE.json]
 
 Splats of SH degree 3 on the demo's head (16,000 triangles, denser at eyes and mouth, as heads are), or on an evenly
-covered ellipsoid, for which a selection costs most. On the CPU: medians over repeats in one process; beside each
-stage the bytes it must at least move and the time that takes at this machine's measured copy bandwidth. On a GPU, whose
-queue is never waited for: means over all repeats, the same table by kernel, the dispatches, submits, waits and
-milliseconds that an iteration takes of the host, and the device's memory. Run it on an idle machine.
+covered ellipsoid, for which a selection costs most. On the CPU: the instruction set, and medians over repeats in one
+process; beside each stage the bytes it must at least move and the time that takes at this machine's measured copy
+bandwidth. On a GPU, whose queue is never waited for: means over all repeats, the same table by kernel, the dispatches,
+submits, waits and milliseconds that an iteration takes of the host, and the device's memory. Run it on an idle machine.
 """
 
 import argparse
@@ -21,6 +21,9 @@ from time import perf_counter
 
 import numpy as np
 import trimesh
+from llvmlite.binding import get_host_cpu_name
+from numba.core import config
+from numba.core.codegen import get_host_cpu_features
 
 from stga_addon.avatar.embedding import face_areas, face_frames
 from stga_addon.avatar.splats import Splats
@@ -227,10 +230,17 @@ def cpu_ms(backend: Backend, repeats: int, batch: Batch) -> float:
     return median_ms(lambda: backend.step(batch), repeats)
 
 
+def instruction_set() -> str:
+    """The processor that the kernels are compiled for, as LLVM calls it, and its vector instructions."""
+    features = get_host_cpu_features().split(",")
+    vectors = [f[1:] for f in features if f.startswith(("+avx", "+neon", "+sve", "+fma"))]
+    return f"{config.CPU_NAME or get_host_cpu_name()}: {' '.join(vectors)}"
+
+
 def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, float]:
     """Print the stages beside their floors; returns their times."""
     bandwidth = copy_bandwidth()
-    print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s")
+    print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s, {instruction_set()}")
     found = stages(splats, frames, target, repeats)
     print(f"{'stage':<22}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, (ms, moved) in found.items():

@@ -1,8 +1,9 @@
 """CPU rasterizer: Numba kernels and their driver; `layout.py` documents the arrays that they exchange.
 
 The kernels are written for speed. LLVM vectorizes an inner loop that runs over contiguous float32, has no branch
-(selects instead), uses float32 constants only, and addresses several per-pixel values as offsets into one flat array,
-so that no alias checks are needed at run time.
+(selects instead) and no store that may keep the old value, uses float32 constants only, and addresses several per-pixel
+values as offsets into one flat array, so that no alias checks are needed at run time. `tests/raster/test_assembly.py`
+reads the assembly for several processors.
 """
 
 import os

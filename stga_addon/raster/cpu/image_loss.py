@@ -69,6 +69,53 @@ def _blur_column(ring, plane, stride, row, out, at, count):
         )
 
 
+@inline_jit
+def _similarity_row(moments, stride, span, first, past, slopes):
+    """SSIM of a row of `span` pixels from its four blurred values, and its derivatives by three of them to `slopes`.
+
+    Both hold one value behind the other, `stride` apart; slopes from WINDOW_RADIUS_PX on. Returns the sum over the
+    pixels from `first` to `past`.
+    """
+    total = ZERO
+    for n in range(np.uint64(span)):
+        mx, my = moments[n], moments[np.uint64(stride) + n]
+        squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
+        mxy, mm = mx * my, mx * mx + my * my
+        # Differences of blurred squares: in bright, flat images rounding makes the variances negative and
+        # the covariance larger than their mean, which it can never be.
+        variance = max(ZERO, squares - mm)
+        covariance = min(variance, max(-variance, TWO * (product - mxy)))
+        over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
+        luminance, structure = (TWO * mxy + C1) * over_d, (covariance + C2) * over_e
+        ssim = luminance * structure
+        # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
+        by_product = TWO * luminance * over_e
+        by_squares = -ssim * over_e
+        by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
+        slopes[np.uint64(WINDOW_RADIUS_PX) + n] = by_mean
+        slopes[np.uint64(stride + WINDOW_RADIUS_PX) + n] = by_squares
+        slopes[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = by_product
+        total += ssim if (n >= np.uint64(first)) & (n < np.uint64(past)) else ZERO
+    return total
+
+
+@inline_jit
+def _gradient_row(image, wanted, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient):
+    """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`. Returns Σ |difference|.
+
+    image, gradient (W,): the row; wanted: the target's, from `keep` on; blurred: the three blurred slopes, `stride`
+    apart.
+    """
+    absolute = ZERO
+    for n in range(np.uint64(first), np.uint64(past)):
+        x, y = image[np.uint64(left) + n], wanted[np.uint64(keep) + n]
+        sign = ONE if x > y else (-ONE if x < y else ZERO)
+        absolute += abs(x - y)
+        slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
+        gradient[np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+    return absolute
+
+
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
 @jit
 def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scale, gradient, sums):
@@ -122,27 +169,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                 for plane in range(4):
                     _blur_column(first, plane, stride, middle, moments, plane * stride, span)
                 counted = y0 <= middle < y1
-                total = ZERO
-                for n in range(np.uint64(span)):
-                    mx, my = moments[n], moments[np.uint64(stride) + n]
-                    squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
-                    mxy, mm = mx * my, mx * mx + my * my
-                    # Differences of blurred squares: in bright, flat images rounding makes the variances negative and
-                    # the covariance larger than their mean, which it can never be.
-                    variance = max(ZERO, squares - mm)
-                    covariance = min(variance, max(-variance, TWO * (product - mxy)))
-                    over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
-                    luminance, structure = (TWO * mxy + C1) * over_d, (covariance + C2) * over_e
-                    ssim = luminance * structure
-                    # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
-                    by_product = TWO * luminance * over_e
-                    by_squares = -ssim * over_e
-                    by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
-                    slopes[np.uint64(WINDOW_RADIUS_PX) + n] = by_mean
-                    slopes[np.uint64(stride + WINDOW_RADIUS_PX) + n] = by_squares
-                    slopes[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = by_product
-                    held = (n + np.uint64(left) >= np.uint64(x0)) and (n + np.uint64(left) < np.uint64(x1))
-                    total += ssim if held else ZERO
+                total = _similarity_row(moments, stride, span, x0 - left, x1 - left, slopes)
                 if counted:
                     similarity += total
             for plane in range(3):
@@ -157,14 +184,11 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                 continue
             for plane in range(3):
                 _blur_column(second, plane, stride, out, blurred, plane * stride, span)
-            absolute = ZERO
             keep = (out % RING_ROWS) * stride
-            for n in range(np.uint64(x0 - left), np.uint64(x1 - left)):
-                x, y = image[c, out, np.uint64(left) + n], wanted[np.uint64(keep) + n]
-                sign = ONE if x > y else (-ONE if x < y else ZERO)
-                absolute += abs(x - y)
-                slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
-                gradient[c, out, np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+            absolute = _gradient_row(
+                image[c, out], wanted, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
+                gradient[c, out],
+            )  # fmt: skip
             difference += absolute
         sums[job, 0] = difference
         sums[job, 1] = similarity

@@ -57,6 +57,48 @@ def _unit(q0, q1, q2, q3):
 
 
 @part_jit
+def _camera_point(matrix, origin, f, xyz, i):
+    """Splat i, which lies on triangle f, in camera space."""
+    lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+    return (
+        matrix[f, 0, 0] * lx + matrix[f, 0, 1] * ly + matrix[f, 0, 2] * lz + origin[f, 0],
+        matrix[f, 1, 0] * lx + matrix[f, 1, 1] * ly + matrix[f, 1, 2] * lz + origin[f, 1],
+        matrix[f, 2, 0] * lx + matrix[f, 2, 1] * ly + matrix[f, 2, 2] * lz + origin[f, 2],
+    )
+
+
+@part_jit
+def _pixels_per_local(matrix, f, jx, jy, tx, ty):
+    """The affine map U from triangle f's local frame to pixels, row by row: the projection's Jacobian times `matrix`.
+
+    jx, jy: focal lengths over depth; tx, ty: x and y over depth.
+    """
+    return (
+        jx * (matrix[f, 0, 0] - tx * matrix[f, 2, 0]), jx * (matrix[f, 0, 1] - tx * matrix[f, 2, 1]),
+        jx * (matrix[f, 0, 2] - tx * matrix[f, 2, 2]),
+        jy * (matrix[f, 1, 0] - ty * matrix[f, 2, 0]), jy * (matrix[f, 1, 1] - ty * matrix[f, 2, 1]),
+        jy * (matrix[f, 1, 2] - ty * matrix[f, 2, 2]),
+    )  # fmt: skip
+
+
+@part_jit
+def _row_times_matrix(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22):
+    return a0 * r00 + a1 * r10 + a2 * r20, a0 * r01 + a1 * r11 + a2 * r21, a0 * r02 + a1 * r12 + a2 * r22
+
+
+@part_jit
+def _view_direction(to_world, x, y, z):
+    """Unit vector in world space from the camera to (x, y, z) in camera space, and 1 / distance."""
+    rd = ONE / math.sqrt(x * x + y * y + z * z)
+    return (
+        (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd,
+        (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd,
+        (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd,
+        rd,
+    )
+
+
+@part_jit
 def _basis(degree, x, y, z, b):
     """Real spherical harmonics of the unit direction (x, y, z), written to b (16,)."""
     b[0] = SH_CONSTANTS[0]
@@ -164,29 +206,18 @@ def project_forward(
         i = rows[n]
         rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = 0
         f = face[i]
-        lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        x = matrix[f, 0, 0] * lx + matrix[f, 0, 1] * ly + matrix[f, 0, 2] * lz + origin[f, 0]
-        y = matrix[f, 1, 0] * lx + matrix[f, 1, 1] * ly + matrix[f, 1, 2] * lz + origin[f, 1]
-        z = matrix[f, 2, 0] * lx + matrix[f, 2, 1] * ly + matrix[f, 2, 2] * lz + origin[f, 2]
+        x, y, z = _camera_point(matrix, origin, f, xyz, i)
         if z < NEAR_M:
             continue
         rz = ONE / z
         tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
         q0, q1, q2, q3, _ = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
-        # U = J · matrix, the affine map from the local frame to pixels.
-        jx, jy = fx * rz, fy * rz
-        u00 = jx * (matrix[f, 0, 0] - tx * matrix[f, 2, 0])
-        u01 = jx * (matrix[f, 0, 1] - tx * matrix[f, 2, 1])
-        u02 = jx * (matrix[f, 0, 2] - tx * matrix[f, 2, 2])
-        u10 = jy * (matrix[f, 1, 0] - ty * matrix[f, 2, 0])
-        u11 = jy * (matrix[f, 1, 1] - ty * matrix[f, 2, 1])
-        u12 = jy * (matrix[f, 1, 2] - ty * matrix[f, 2, 2])
+        turn = _rotation(q0, q1, q2, q3)
+        u00, u01, u02, u10, u11, u12 = _pixels_per_local(matrix, f, fx * rz, fy * rz, tx, ty)
         s0, s1, s2 = math.exp(log_scale[i, 0]), math.exp(log_scale[i, 1]), math.exp(log_scale[i, 2])
-        a00, a01 = (u00 * r00 + u01 * r10 + u02 * r20) * s0, (u00 * r01 + u01 * r11 + u02 * r21) * s1
-        a02 = (u00 * r02 + u01 * r12 + u02 * r22) * s2
-        a10, a11 = (u10 * r00 + u11 * r10 + u12 * r20) * s0, (u10 * r01 + u11 * r11 + u12 * r21) * s1
-        a12 = (u10 * r02 + u11 * r12 + u12 * r22) * s2
+        w00, w01, w02 = _row_times_matrix(u00, u01, u02, *turn)
+        w10, w11, w12 = _row_times_matrix(u10, u11, u12, *turn)
+        a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
         xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS_PX2
         xy = a00 * a10 + a01 * a11 + a02 * a12
         yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS_PX2
@@ -213,10 +244,7 @@ def project_forward(
         y1 = np.int32(min(limit_y, max(ZERO, np.ceil((mean_y + ey) / size_))))
         if not _any_rendered(rendered, x0, y0, x1, y1):
             continue
-        rd = ONE / math.sqrt(x * x + y * y + z * z)
-        dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
-        dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
-        dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
+        dx, dy, dz, _ = _view_direction(to_world, x, y, z)
         _basis(degree, dx, dy, dz, basis)
         red = green = blue = HALF
         for k in range((degree + 1) * (degree + 1)):
@@ -324,31 +352,21 @@ def project_backward(
         if (n - begin) % SUM_BLOCK_SPLATS == 0:
             _sum_pairs(visible[n : min(end, n + SUM_BLOCK_SPLATS)], lists, pair_gradients, sums)
         g = sums[(n - begin) % SUM_BLOCK_SPLATS]
-        v_sh[i, :, :] = ZERO
         v_strain_color[i, :, :] = ZERO
         half_x, half_y = HALF * np.float32(size[0]) * g[MEAN_X], HALF * np.float32(size[1]) * g[MEAN_Y]
         screen_gradient[i] = math.sqrt(half_x * half_x + half_y * half_y)
         f = face[i]
-        lx, ly, lz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        c00, c01, c02 = matrix[f, 0, 0], matrix[f, 0, 1], matrix[f, 0, 2]
-        c10, c11, c12 = matrix[f, 1, 0], matrix[f, 1, 1], matrix[f, 1, 2]
-        c20, c21, c22 = matrix[f, 2, 0], matrix[f, 2, 1], matrix[f, 2, 2]
-        x = c00 * lx + c01 * ly + c02 * lz + origin[f, 0]
-        y = c10 * lx + c11 * ly + c12 * lz + origin[f, 1]
-        z = c20 * lx + c21 * ly + c22 * lz + origin[f, 2]
+        x, y, z = _camera_point(matrix, origin, f, xyz, i)
         rz = ONE / z
         slope_x, slope_y = x * rz, y * rz
         tx, ty = min(high_x, max(low_x, slope_x)), min(high_y, max(low_y, slope_y))
         q0, q1, q2, q3, rn = _unit(rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3])
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
         jx, jy = fx * rz, fy * rz
-        u00, u01, u02 = jx * (c00 - tx * c20), jx * (c01 - tx * c21), jx * (c02 - tx * c22)
-        u10, u11, u12 = jy * (c10 - ty * c20), jy * (c11 - ty * c21), jy * (c12 - ty * c22)
+        u00, u01, u02, u10, u11, u12 = _pixels_per_local(matrix, f, jx, jy, tx, ty)
         s0, s1, s2 = math.exp(log_scale[i, 0]), math.exp(log_scale[i, 1]), math.exp(log_scale[i, 2])
-        w00, w01 = u00 * r00 + u01 * r10 + u02 * r20, u00 * r01 + u01 * r11 + u02 * r21
-        w02 = u00 * r02 + u01 * r12 + u02 * r22
-        w10, w11 = u10 * r00 + u11 * r10 + u12 * r20, u10 * r01 + u11 * r11 + u12 * r21
-        w12 = u10 * r02 + u11 * r12 + u12 * r22
+        w00, w01, w02 = _row_times_matrix(u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        w10, w11, w12 = _row_times_matrix(u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22)
         a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
 
         # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0 − shear·a1,
@@ -395,6 +413,7 @@ def project_backward(
         d02 = v00 * r20 + v01 * r21 + v02 * r22
         d10, d11 = v10 * r00 + v11 * r01 + v12 * r02, v10 * r10 + v11 * r11 + v12 * r12
         d12 = v10 * r20 + v11 * r21 + v12 * r22
+        c20, c21, c22 = matrix[f, 2, 0], matrix[f, 2, 1], matrix[f, 2, 2]
         from_row_0 = d00 * c20 + d01 * c21 + d02 * c22
         vtx = -jx * from_row_0
         vty = -jy * (d10 * c20 + d11 * c21 + d12 * c22 - shear * from_row_0)
@@ -408,21 +427,18 @@ def project_backward(
         # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
         v_opacity[i] = g[OPACITY] * projected[i, OPACITY] / (ONE + math.exp(opacity[i]))
         if depth_as_color:
+            v_sh[i, :, :] = ZERO
             vz += g[RED]
         else:
-            rd = ONE / math.sqrt(x * x + y * y + z * z)
-            dx = (to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z) * rd
-            dy = (to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z) * rd
-            dz = (to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z) * rd
+            dx, dy, dz, rd = _view_direction(to_world, x, y, z)
             _basis(degree, dx, dy, dz, basis)
             gr = g[RED] if projected[i, RED] > ZERO else ZERO
             gg = g[GREEN] if projected[i, GREEN] > ZERO else ZERO
             gb = g[BLUE] if projected[i, BLUE] > ZERO else ZERO
             for k in range((degree + 1) * (degree + 1)):
-                v_sh[i, k, 0] += basis[k] * gr
-                v_sh[i, k, 1] += basis[k] * gg
-                v_sh[i, k, 2] += basis[k] * gb
+                v_sh[i, k, 0], v_sh[i, k, 1], v_sh[i, k, 2] = basis[k] * gr, basis[k] * gg, basis[k] * gb
                 weight[k] = gr * sh[i, k, 0] + gg * sh[i, k, 1] + gb * sh[i, k, 2]
+            v_sh[i, (degree + 1) * (degree + 1) :, :] = ZERO
             for k in range(strains):
                 v_strain_color[i, k, 0] += strain[f, k] * gr
                 v_strain_color[i, k, 1] += strain[f, k] * gg
@@ -433,6 +449,5 @@ def project_backward(
             vx += to_world[0, 0] * ex + to_world[1, 0] * ey + to_world[2, 0] * ez
             vy += to_world[0, 1] * ex + to_world[1, 1] * ey + to_world[2, 1] * ez
             vz += to_world[0, 2] * ex + to_world[1, 2] * ey + to_world[2, 2] * ez
-        v_xyz[i, 0] = c00 * vx + c10 * vy + c20 * vz
-        v_xyz[i, 1] = c01 * vx + c11 * vy + c21 * vz
-        v_xyz[i, 2] = c02 * vx + c12 * vy + c22 * vz
+        for c in range(3):
+            v_xyz[i, c] = matrix[f, 0, c] * vx + matrix[f, 1, c] * vy + matrix[f, 2, c] * vz

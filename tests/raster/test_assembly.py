@@ -1,0 +1,175 @@
+"""The assembly of the kernels' inner loops on processors of several kinds, none of which has to be at hand.
+
+Numba's unoptimized IR of a loop is given to LLVM for another processor, through the passes that Numba runs.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+numba = pytest.importorskip("numba")
+
+import llvmlite.binding as llvm  # noqa: E402
+from numba.core import config  # noqa: E402
+
+from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer  # noqa: E402
+
+X86, ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"
+
+
+@dataclass(frozen=True)
+class Processor:
+    """triple: LLVM's name of the architecture; vector: what only an instruction of full width names; packed: an
+    arithmetic instruction on packed floats; scalar: one on a single float; conditional: a masked or scattered access.
+    """
+
+    triple: str
+    vector: str
+    packed: str
+    scalar: str
+    conditional: str
+
+
+PACKED_X86, SCALAR_X86 = (
+    r"\sv(add|sub|mul|div|sqrt|min|max|fn?m\w+)ps\s",
+    r"\sv(add|sub|mul|div|sqrt|min|max|fn?m\w+)ss\s",
+)
+MASKED_X86 = r"\svp?maskmov|\sv\w*(gather|scatter)|\sv\w*mov\w*\s.*\(.*\{%k"
+AVX2 = Processor(X86, "%ymm", PACKED_X86, SCALAR_X86, MASKED_X86)
+AVX512 = Processor(X86, "%zmm", PACKED_X86, SCALAR_X86, MASKED_X86)
+NEON = Processor(ARM, r"\.4s", r"\sf\w+\s+v.*\.4s", r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d", r"\s(ld|st)\d\s")
+PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m1": NEON}
+"""LLVM prefers 256 bits on Sapphire Rapids, whose wider instructions lower the clock."""
+
+
+def unoptimized_ir(function: Callable, signature: object, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Numba's LLVM IR of a function, compiled as the kernels are but for the optimization.
+
+    What it calls must be inlined by Numba (`inline_jit`): other functions would be kept, unoptimized, in the cache.
+    """
+    monkeypatch.setattr(config, "OPT", type(config.OPT)(0))
+    python = getattr(function, "py_func", function)
+    compiled = numba.njit(signature, fastmath=FASTMATH, error_model="numpy", no_cpython_wrapper=True)(python)
+    return next(iter(compiled.inspect_llvm().values()))
+
+
+def assembly(ir: str, cpu: str) -> str:
+    """The IR compiled for a processor; the passes are those of `numba.core.codegen.CPUCodegen`."""
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    triple = PROCESSORS[cpu].triple
+    try:
+        target = llvm.Target.from_triple(triple)
+    except RuntimeError:
+        pytest.skip(f"{cpu}: this llvmlite was built without {triple}")
+    machine = target.create_target_machine(cpu=cpu, opt=3)
+    machine.set_asm_verbosity(True)  # spills are comments
+    ir = re.sub(r'target triple = ".*"', f'target triple = "{triple}"', ir)
+    module = llvm.parse_assembly(
+        re.sub(r'target datalayout = ".*"', f'target datalayout = "{machine.target_data}"', ir)
+    )
+    for level in (0, 3):
+        tuning = llvm.create_pipeline_tuning_options(speed_level=level)
+        tuning.loop_vectorization, tuning.slp_vectorization = level > 0, False
+        builder = llvm.create_pass_builder(machine, tuning)
+        passes = builder.getModulePassManager()
+        if level == 0:
+            passes.add_loop_rotate_pass()
+            passes.add_instruction_combine_pass()
+            passes.add_jump_threading_pass()
+        passes.add_refprune_pass()
+        passes.run(module, builder)
+    return str(machine.emit_assembly(module))
+
+
+def inner_loops(text: str) -> list[list[str]]:
+    """The instructions of each loop that holds no other loop."""
+    lines = text.splitlines()
+    labels = {found[1]: n for n, line in enumerate(lines) if (found := re.match(r"(\.L\w+):", line))}
+    jumps = (re.match(r"\s+(?:j\w+|b\.?\w*|cbn?z|tbn?z)\s+(?:.*,\s*)?(\.L\w+)", line) for line in lines)
+    spans = [(labels[j[1]], n) for n, j in enumerate(jumps) if j and labels.get(j[1], n) < n]
+    inner = [s for s in spans if not any(s != o and s[0] <= o[0] and o[1] <= s[1] for o in spans)]
+    return [[line for line in lines[a : b + 1] if re.match(r"\s+[a-z]", line)] for a, b in inner]
+
+
+def count(pattern: str, loop: list[str]) -> int:
+    return sum(bool(re.search(pattern, line)) for line in loop)
+
+
+def faults(ir: str, cpu: str, loops: int, spills: int) -> str:
+    """What is wrong with a function that should have so many vectorized inner loops, or nothing.
+
+    spills: how many values, at most, each of them may keep in memory for want of registers.
+    """
+    kind = PROCESSORS[cpu]
+    full = []
+    for loop in inner_loops(assembly(ir, cpu)):
+        if count(kind.packed, [line for line in loop if re.search(kind.vector, line)]):
+            full.append(loop)
+            if count(kind.conditional, loop):
+                return f"{cpu}: a conditional load or store\n" + "\n".join(loop)
+            if count(kind.scalar, loop):
+                return f"{cpu}: scalar arithmetic in a vectorized loop\n" + "\n".join(loop)
+            if (found := count("Spill|Reload", loop)) > spills:
+                return f"{cpu}: {found} values in memory for want of registers\n" + "\n".join(loop)
+    return "" if len(full) >= loops else f"{cpu}: {len(full)} of {loops} loops are vectorized at full width"
+
+
+STATE = "f4[::1]"
+PIXELS = "u8, u8"
+TABLE = np.zeros((2, 3), np.float32)
+ADAM = numba.types.void(
+    numba.typeof(np.zeros(2, np.int32)),
+    numba.typeof(optimizer.AdamTables(*[TABLE] * 5, TABLE[0])),
+    *[numba.types.Array(numba.float32, 1, "C")] * 3,
+    numba.typeof(optimizer.AdamOptions(*np.zeros(4, np.float32))),
+)
+LOOPS = {
+    "falloff": (blend._falloff, f"void({PIXELS}, u8, {STATE}, {STATE})", 1, 4),
+    "blend": (blend._blend_pair, f"void({PIXELS}, u8, f4, {STATE}, {STATE})", 2, 4),
+    "unblend": (blend._unblend_pair, f"void({PIXELS}, u8, f4, {STATE}, {STATE})", 2, 4),
+    "gradient of the falloff": (blend._sum_falloff_gradient, f"void({PIXELS}, u8, {STATE}, {STATE}, {STATE})", 1, 0),
+    "gradient of the color": (blend._sum_color_gradient, f"void({PIXELS}, {STATE}, {STATE})", 1, 0),
+    "horizontal blur": (image_loss._blur_row, f"void({STATE}, i8, {STATE}, i8, i8)", 1, 0),
+    "vertical blur": (image_loss._blur_column, f"void({STATE}, i8, i8, i8, {STATE}, i8, i8)", 1, 0),
+    "SSIM": (image_loss._similarity_row, f"f4({STATE}, i8, i8, i8, i8, {STATE})", 1, 8),
+    "gradient of the loss": (
+        image_loss._gradient_row,
+        f"f4({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE})",
+        1,
+        4,
+    ),
+    "Adam": (optimizer._adam_block, ADAM, 2, 0),
+}
+"""name -> function, signature, its vectorized loops, and the spills that each may have"""
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_inner_loops_are_vectorized_on_every_processor(name, monkeypatch):
+    """Catches a change that leaves a hot loop scalar, half as wide, with masked stores or with spills on a processor
+    other than the one that it was tuned on."""
+    function, signature, loops, spills = LOOPS[name]
+    ir = unoptimized_ir(function, signature, monkeypatch)
+    found = [fault for cpu in PROCESSORS if (fault := faults(ir, cpu, loops, spills))]
+    assert not found, f"{name}\n" + "\n".join(found)
+
+
+def with_conditional_store(s, order, limit):
+    for p in range(np.uint64(256)):
+        t = s[p] * order
+        s[p + np.uint64(256)] = order if t > limit else s[p + np.uint64(256)]
+
+
+def with_call(s, order, limit):
+    for p in range(np.uint64(256)):
+        s[p] = np.exp(s[p] * order)
+
+
+@pytest.mark.parametrize("function", [with_conditional_store, with_call])
+@pytest.mark.parametrize("cpu", ["znver3", "apple-m1"])
+def test_the_check_finds_what_it_looks_for(function, cpu, monkeypatch):
+    """Catches a check that passes whatever the assembly holds: these loops had the faults that it is there for."""
+    assert faults(unoptimized_ir(function, f"void({STATE}, f4, f4)", monkeypatch), cpu, 1, 0)
