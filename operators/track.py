@@ -49,6 +49,22 @@ def detector_property() -> Any:
     return path_property("Detector", "Google's face_landmarker.task; empty: the network that comes with mediapipe")
 
 
+def mattes_property() -> Any:
+    return bpy.props.EnumProperty(
+        name="Mattes",
+        description="Masks that tell the person from the background",
+        items=(
+            ("auto", "Auto", "Made for frames without a mask"),
+            ("none", "None", "Only those of the footage"),
+            ("folder", "Folder", "Those of a folder, named as the images"),
+        ),
+    )
+
+
+def matte_folder_property() -> Any:
+    return path_property("Matte Folder", "Folder of masks, named as the images of the footage", "DIR_PATH")
+
+
 def focal_property() -> Any:
     return bpy.props.FloatProperty(
         name="Focal Length", description="In pixels, of a single camera without calibration; 0: a guess", min=0.0
@@ -89,6 +105,8 @@ class TrackFootage(bpy.types.Operator):
     start: start_property()
     stop: stop_property()
     step: step_property()
+    mattes: mattes_property()
+    matte_folder: matte_folder_property()
     python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that tracks; empty: the training environment of the preferences",
@@ -124,6 +142,7 @@ class TrackFootage(bpy.types.Operator):
             self.start,
             self.stop or None,
             self.step,
+            mattes=str(file_path(self.matte_folder, "mattes").resolve()) if self.mattes == "folder" else self.mattes,
         )
         return start_tracking(self, context, out, request, python)
 

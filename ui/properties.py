@@ -72,6 +72,8 @@ class SceneSettings(bpy.types.PropertyGroup):
     )
     detector: track.detector_property()
     focal: track.focal_property()
+    mattes: track.mattes_property()
+    matte_folder: track.matte_folder_property()
     footage_start: track.start_property()
     footage_stop: track.stop_property()
     footage_step: track.step_property()

@@ -54,8 +54,11 @@ class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        for name in ("footage_start", "footage_stop", "footage_step", "focal", "detector"):
-            self.layout.prop(scene_settings(context), name)
+        settings = scene_settings(context)
+        for name in ("footage_start", "footage_stop", "footage_step", "focal", "detector", "mattes"):
+            self.layout.prop(settings, name)
+        if settings.mattes == "folder":
+            self.layout.prop(settings, "matte_folder")
 
 
 class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
@@ -100,6 +103,7 @@ def _draw_button(layout: Any, settings: Any) -> None:
     track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
     track.footage, track.model, track.directory = settings.footage, settings.head_model, settings.capture_folder
     track.cameras, track.detector, track.focal = settings.footage_cameras, settings.detector, settings.focal
+    track.mattes, track.matte_folder = settings.mattes, settings.matte_folder
     track.start, track.stop, track.step = settings.footage_start, settings.footage_stop, settings.footage_step
 
 

@@ -13,6 +13,9 @@ from ..render.device import EXPECTED_DEVICE, is_device
 from ..schema import MAX_COUNT, setting
 from ..training.settings import MAX_GROWTH, TrainingSettings
 
+MATTES = ("auto", "none")
+"""What `Track.mattes` may be but a folder."""
+
 
 def device_field() -> Any:
     """A field for a device as `choose_device` takes it; "auto" continues a run on the device that trained it."""
@@ -143,6 +146,8 @@ class Track:
     start, stop, step   timesteps, `stop` excluded
     offset          camera -> frames by which its recording is later
     meshes          write an OBJ per timestep as well
+    mattes          "auto": frames without a mask are given a matte; "none": they stay without; else a folder of masks
+                    in place of the footage's (`open_footage`)
     """
 
     footage: Path
@@ -157,6 +162,7 @@ class Track:
     step: int = setting(1, 1)
     offset: Mapping[str, int] | None = None
     meshes: bool = False
+    mattes: str = "auto"
 
 
 @dataclass(frozen=True)
