@@ -42,6 +42,7 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
     from PIL import Image, ImageDraw  # Blender lacks it, and needs `rasterize` alone
 
     pixels, depth = camera.project(vertices)
+    pixels -= 0.5  # Pillow's pixel centers lie at whole numbers
     picture = Image.new("1", (camera.width, camera.height))
     draw = ImageDraw.Draw(picture)
     for corners in pixels[faces[(depth > MIN_DEPTH_M)[faces].all(1)]].reshape(-1, 6).tolist():

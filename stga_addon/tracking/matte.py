@@ -72,7 +72,7 @@ def _cut(cv2: Any, image: np.ndarray, probability: np.ndarray, head: np.ndarray,
     possibly = _grown(cv2, (probability > UNLIKELY) | head, 2 * margin) & _reach(cv2, head, size)
     marks = np.where(probability > LIKELY, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     marks[~possibly], marks[surely] = cv2.GC_BGD, cv2.GC_FGD
-    if surely.any() and not possibly.all():
+    if 0 < np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).mean() < 1:  # it learns the colors of both
         cv2.setRNGSeed(0)  # of the clusters that the color models begin with
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(np.ascontiguousarray(image[..., ::-1]), marks, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
