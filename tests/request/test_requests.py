@@ -76,7 +76,7 @@ REQUESTS: tuple[Request, ...] = (
     Refine(Path("r_2"), Path("r"), weights=np.arange(4, dtype=np.float32) / 4, iterations=3, seed=2),
     Extend(Path("r_2"), Path("r"), (Path("/smile"), Path("/frown")), iterations=3),
     SelectForTake(Path("r"), Path("/smile")),
-    Track(Path("f"), Path("m.glb"), Path("o"), focal=900.0, stop=9, step=3, offset={"left": -3}, meshes=True),
+    Track(Path("f"), Path("m.glb"), Path("o"), focal=900.0, stop=9, step=3, offset={"left": -3}, meshes=True, mattes="none"),
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
