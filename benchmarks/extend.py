@@ -34,7 +34,7 @@ from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
 from stga_addon.training.evaluate.match_exposure import known_exposure
 from stga_addon.training.evaluate.metrics import evaluate
-from stga_addon.training.optimize.exposure import exposure_correction
+from stga_addon.training.optimize.image_preparation import image_preparation
 from stga_addon.training.optimize.precompile import precompile_kernels
 from stga_addon.training.optimize.strategies import ExtendStrategy, GlobalStrategy, Strategy
 from stga_addon.training.optimize.trainer import Trainer
@@ -219,9 +219,8 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     spent, due, budget = 0.0, 0.0, options.seconds * (ANEW_BUDGET if arm.anew else 1)
     lines: list[Line] = []
     background = tuple(round(255 * level) for level in arm.settings.background)
-    with ViewLoader(
-        arm.views, background=background, correct=exposure_correction(arm.settings), mesh=capture.mesh
-    ) as loader:
+    prepare = image_preparation(capture, arm.settings)
+    with ViewLoader(arm.views, background=background, prepare=prepare, mesh=capture.mesh) as loader:
         while True:
             if spent >= due:
                 share = min(1.0, spent / budget) if arm.anew else 1.0

@@ -58,7 +58,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     footage = open_footage(options.capture, frames=FrameRange(stop=options.timesteps))
     true, file = open_capture(options.capture, options.flame), head_file(options.model, folder)
     begin = perf_counter()
-    result = track(footage, file, folder / "out", options.landmarks)
+    result = track(footage, file, folder / "out", options.landmarks, mattes=False)
     seconds = perf_counter() - begin
     found = open_capture(folder / "out", file)
     places, used = read_places((options.landmarks or folder / "out" / LANDMARKS_FOLDER) / PLACES_FILE, len(found.faces))

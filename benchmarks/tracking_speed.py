@@ -57,7 +57,7 @@ def measure(folder: Path, options: argparse.Namespace) -> None:
         write_exact_landmarks(folder / "points", cameras, meshes, model, options.timesteps)
     footage, stages = open_footage(folder / "footage"), Stages()
     points = folder / "points" if options.landmarks else None
-    track(footage, folder / "head.npz", folder / "out", points, report=stages.report)
+    track(footage, folder / "head.npz", folder / "out", points, mattes=False, report=stages.report)
     stages.end()
     print("| stage | seconds |\n| --- | --- |")
     for stage, seconds in stages.seconds.items():

@@ -43,6 +43,16 @@ class TrackOptions:
     start: bpy.props.IntProperty(name="Start", description="First frame of the footage, counted from 0", min=0)
     stop: bpy.props.IntProperty(name="Stop", description="Frame to stop before; 0: all", min=0)
     step: bpy.props.IntProperty(name="Step", description="Use every nth frame", min=1, default=1)
+    mattes: bpy.props.EnumProperty(
+        name="Mattes",
+        description="Masks that tell the person from the background",
+        items=(
+            ("auto", "Auto", "Made for frames without a mask"),
+            ("none", "None", "Only those of the footage"),
+            ("folder", "Folder", "Those of a folder, named as the images"),
+        ),
+    )
+    matte_folder: path_property("Matte Folder", "Folder of masks, named as the images of the footage", "DIR_PATH")
 
 
 class TrackFootage(bpy.types.Operator, TrackOptions):
@@ -93,6 +103,7 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
             self.start,
             self.stop or None,
             self.step,
+            mattes=str(file_path(self.matte_folder, "mattes").resolve()) if self.mattes == "folder" else self.mattes,
         )
         return start_tracking(self, context, request, python)
 

@@ -53,8 +53,11 @@ class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        for name in ("start", "stop", "step", "focal", "detector"):
-            self.layout.prop(scene_settings(context).track, name)
+        settings = scene_settings(context).track
+        for name in ("start", "stop", "step", "focal", "detector", "mattes"):
+            self.layout.prop(settings, name)
+        if settings.mattes == "folder":
+            self.layout.prop(settings, "matte_folder")
 
 
 class TrackCheckPanel(SidebarPanel, bpy.types.Panel):

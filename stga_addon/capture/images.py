@@ -17,6 +17,8 @@ from .color import is_srgb, to_srgb, with_gamma
 from .model import View
 
 WHITE = (255, 255, 255)
+WHITE_LEVEL = 247
+"""Of all channels, from which a pixel without a mask counts as a white background."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 BAND_PIXELS = 1 << 20

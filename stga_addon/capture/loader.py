@@ -13,6 +13,9 @@ import numpy as np
 from .images import WHITE, read_view
 from .model import View
 
+Preparation = Callable[[View, np.ndarray, np.ndarray | None], tuple[np.ndarray, np.ndarray | None]]
+"""(view, image (H, W, 3) uint8, mask (H, W) uint8 or None) -> image and mask."""
+
 
 class LoadedView(NamedTuple):
     """A view with its image (H, W, 3) uint8, mask (H, W) uint8 and mesh (V, 3), which are None if there is none."""
@@ -32,7 +35,7 @@ class ViewLoader:
 
     views    consumed in the thread, only as far ahead as the queue allows; may be endless, must not block
     scale    position in `views` -> image scale in (0, 1], for coarse-to-fine; the yielded view's camera is scaled too
-    correct  (view, image, mask) -> the image to yield instead, applied once per image read; None leaves images as read
+    prepare  (view, image, mask) -> image and mask to yield instead, applied once per image read; None: those read
     mesh     timestep -> mesh (V, 3), read in the thread as well; None yields no meshes
     queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded images that are kept for
              later epochs; memory does not depend on the length of the sequence
@@ -49,11 +52,11 @@ class ViewLoader:
         background: tuple[int, int, int] = WHITE,
         queue_bytes: int = 16 << 20,
         cache_bytes: int = 224 << 20,
-        correct: Callable[[View, np.ndarray, np.ndarray | None], np.ndarray] | None = None,
+        prepare: Preparation | None = None,
         mesh: Callable[[int], np.ndarray] | None = None,
     ) -> None:
         self.waited_s = 0.0
-        self._scale, self._background, self._correct, self._mesh = scale, background, correct, mesh
+        self._scale, self._background, self._prepare, self._mesh = scale, background, prepare, mesh
         self._queue_bytes = queue_bytes
         self._cache = _Cache(cache_bytes)
         self._ready: deque[LoadedView] = deque()
@@ -133,8 +136,8 @@ class ViewLoader:
         kept = self._cache.get(key)
         if kept is None:
             kept = LoadedView(*read_view(view, scale, self._background))
-            if self._correct is not None:
-                kept = kept._replace(image=self._correct(kept.view, kept.image, kept.mask))
+            if self._prepare is not None:
+                kept = LoadedView(kept.view, *self._prepare(kept.view, kept.image, kept.mask))
             for array in (kept.image, kept.mask):
                 if array is not None:
                     array.setflags(write=False)

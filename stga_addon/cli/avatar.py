@@ -25,7 +25,9 @@ from .train import add_training, training_request, training_settings
 NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a report and a .blend file"
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
 """Files and folders of OUT."""
-TRACKING_OPTIONS = ("footage", "model", "cameras", "landmarks", "detector", "focal", "start", "stop", "step", "offset")
+TRACKING_OPTIONS = (
+    "footage", "model", "cameras", "landmarks", "detector", "focal", "start", "stop", "step", "offset", "mattes",
+)  # fmt: skip
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:

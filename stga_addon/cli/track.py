@@ -1,12 +1,13 @@
 """Track a head through footage of one or more cameras, and write a capture."""
 
+import os
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
-from ..requests.values import SYNC, WORLDS, Track
+from ..requests.values import MATTES, SYNC, WORLDS, Track
 from .arguments import real_number, usable_path, whole_number
 from .carry_out import carry_out
 
@@ -62,6 +63,13 @@ def add_footage(parser: ArgumentParser) -> None:
         help="the capture's: in meters with the head near the origin, or the cameras' own (default: the cameras' where "
         "they were exported from a Blender scene)",
     )
+    parser.add_argument(
+        "--mattes",
+        type=_mattes,
+        default="auto",
+        metavar="auto|none|FOLDER",
+        help="masks of the person: made where the footage has none (default), only the footage's, or a folder's",
+    )
     parser.add_argument("--meshes", action="store_true", help="write an OBJ per timestep as well")
 
 
@@ -81,8 +89,12 @@ def tracking_request(options: Namespace, out: Path) -> Track:
     return Track(
         options.footage, options.model, out, options.cameras, options.landmarks, options.detector, options.focal,
         options.start, options.stop, options.step, dict(options.offset), options.meshes,
-        options.world, options.sync,
+        options.world, options.sync, options.mattes,
     )  # fmt: skip
+
+
+def _mattes(text: str) -> str:
+    return text if text in MATTES else os.path.abspath(usable_path(text))
 
 
 def _offset(text: str) -> tuple[str, int]:

@@ -1,10 +1,11 @@
 """Tracking as requests ask for it."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from ..progress import Cancelled, Progress, Report, Say
 from ..requests.results import Written
-from ..requests.values import SolveAgain, Track
+from ..requests.values import MATTES, SolveAgain, Track
 from ..tracking.correct import correct_capture
 from ..tracking.footage.open import open_footage
 from ..tracking.footage.sequences import FrameRange
@@ -15,8 +16,9 @@ STAGES = {
     "Head model": (0.0, 0.05),
     "Landmarks": (0.05, 0.6),
     "Fit": (0.6, 0.75),
-    "Surface": (0.75, 0.9),
-    "Contact sheet": (0.9, 0.92),
+    "Surface": (0.75, 0.85),
+    "Mattes": (0.85, 0.91),
+    "Contact sheet": (0.91, 0.92),
     "Images": (0.92, 0.97),
     "Heads": (0.97, 1.0),
 }
@@ -29,10 +31,12 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     steps = _steps(report)
     steps("Opening the footage", 0, 1)
     frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}), request.sync)
-    footage = open_footage(request.footage, request.cameras, frames, request.focal)
+    given = None if request.mattes in MATTES else Path(request.mattes)
+    footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
     found = track(
-        footage, request.model, request.out, request.landmarks, request.detector, request.meshes, request.world, steps
-    )
+        footage, request.model, request.out, request.landmarks, request.detector, request.meshes, request.world,
+        request.mattes == "auto", steps,
+    )  # fmt: skip
     error = f"Reprojection error {found.median_px:.1f} px (median)"
     report(Progress(1.0, "Tracked", error))
     lines = [

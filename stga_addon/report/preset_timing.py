@@ -13,6 +13,7 @@ from ..capture.model import Capture, View
 from ..errors import StgaError
 from ..selection import select_capture
 from ..training.effects.plan import plan_effects
+from ..training.optimize.image_preparation import image_preparation
 from ..training.optimize.precompile import precompile_kernels
 from ..training.optimize.trainer import Trainer
 from ..training.schedule import image_scale, view_order
@@ -75,7 +76,7 @@ def seconds_per_iteration(
     order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
     scales = {image_scale(settings, 0.0), settings.scale}
-    loaded = {scale: cycle([_load(capture, view, scale, settings.background) for view in views]) for scale in scales}
+    loaded = {scale: cycle([_load(capture, view, scale, settings) for view in views]) for scale in scales}
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
@@ -86,10 +87,14 @@ def seconds_per_iteration(
     return float(np.mean(times[WARM_UP_ITERATIONS:]))
 
 
-def _load(capture: Capture, view: View, scale: float, background: tuple[float, ...]) -> LoadedView:
+def _load(capture: Capture, view: View, scale: float, settings: TrainingSettings) -> LoadedView:
     """A view as the loader yields it: with read-only arrays, for which the kernels are compiled."""
-    red, green, blue = (round(255 * c) for c in background)
-    loaded = LoadedView(*read_view(view, scale, (red, green, blue)), capture.mesh(view.timestep))
+    red, green, blue = (round(255 * c) for c in settings.background)
+    small, image, mask = read_view(view, scale, (red, green, blue))
+    prepare = image_preparation(capture, settings)
+    if prepare is not None:
+        image, mask = prepare(small, image, mask)
+    loaded = LoadedView(small, image, mask, capture.mesh(view.timestep))
     for array in (loaded.image, loaded.mask):
         if array is not None:
             array.setflags(write=False)

@@ -18,6 +18,9 @@ from ..schema import MAX_COUNT, setting
 from ..selection import SelectionOptions
 from ..training.settings import MAX_GROWTH, TrainingSettings
 
+MATTES = ("auto", "none")
+"""What `Track.mattes` may be but a folder."""
+
 
 def device_field() -> Any:
     """A field for a device as `choose_device` takes it; "auto" continues a run on the device that trained it."""
@@ -156,6 +159,8 @@ class Track:
     meshes          write an OBJ per timestep as well
     world           the capture's: "head": in meters, y up, the head near the origin; "keep": the cameras'; "auto": as
                     the calibration says, else "head"
+    mattes          "auto": frames without a mask are given a matte; "none": they stay without; else a folder of masks
+                    in place of the footage's (`open_footage`)
     """
 
     footage: Path
@@ -172,6 +177,7 @@ class Track:
     meshes: bool = False
     world: str = setting("auto", choices=WORLDS)
     sync: str = setting("none", choices=SYNC)
+    mattes: str = "auto"
 
 
 @dataclass(frozen=True)

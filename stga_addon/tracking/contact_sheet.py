@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ..capture.camera import Camera
 from ..capture.mesh_raster import rasterize
 from ..files import replacing
-from .footage.model import Footage
+from .footage.model import Footage, FootageCamera
 from .mesh_image import vertex_normals
 
 COLUMNS, ROWS = 4, 5
@@ -22,6 +22,8 @@ NAME_WIDTH, CELL_HEIGHT, MAX_CHART_ROWS = 130, 12, 48
 HEAD_MARGIN = 0.08
 """Of the head's box in the image, on every side."""
 MESH_OPACITY = 0.6
+MATTE_COLOR, MATTE_OPACITY = (0, 150, 60), 0.75
+"""Drawn over what lies outside a view's matte."""
 BACKGROUND, TEXT, NO_FACE = (24, 26, 30), (225, 228, 232), (70, 74, 80)
 ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
 """Of no error, half of the color scale and its end."""
@@ -40,7 +42,8 @@ def write_contact_sheet(
     faces: np.ndarray,
     errors: Errors,
 ) -> None:
-    """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views with the mesh.
+    """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views with the mesh. What
+    lies outside a view's mask is green.
 
     cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3).
     Raises StgaError where the file cannot be written or a frame cannot be read.
@@ -49,8 +52,12 @@ def write_contact_sheet(
     shown = ranked[: COLUMNS * ROWS]
     by_name = {camera.name: camera for camera in footage.cameras}
     median = float(np.median([px for px, _, _ in ranked])) if ranked else 0.0
+
+    def picture(camera: FootageCamera, timestep: int) -> np.ndarray:
+        return _without_outside(camera.image(timestep), camera.mask(timestep))
+
     tiles = [
-        _tile(by_name[name].image(t), cameras[name], mesh(t), faces, f"{name}, timestep {t}: {px:.1f} px")
+        _tile(picture(by_name[name], t), cameras[name], mesh(t), faces, f"{name}, timestep {t}: {px:.1f} px")
         for px, name, t in shown
     ]
     with replacing(path) as partial:
@@ -116,6 +123,14 @@ def _tile(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.nda
     tile.paste(Image.fromarray(_with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0))
     _write(tile, (0, PICTURE[1] + 2), caption)
     return tile
+
+
+def _without_outside(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """The image (H, W, 3) uint8 with MATTE_COLOR over what lies outside the mask (H, W) uint8."""
+    if mask is None:
+        return image
+    opacity = MATTE_OPACITY * (1 - mask[..., None].astype(np.float32) / 255)
+    return np.asarray(image + opacity * (np.array(MATTE_COLOR) - image) + 0.5).astype(np.uint8)
 
 
 def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:

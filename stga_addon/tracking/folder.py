@@ -4,13 +4,19 @@ from pathlib import Path
 
 from ..capture.flame_capture import CANONICAL_NAME
 
-REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE = (
+REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE, MATTES_FILE = (
     "tracking.json",
     "contact_sheet.png",
     "landmarks",
     "head_model.npz",
+    "mattes.json",
 )
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+
+
+def mask_name(timestep: int, camera: int) -> str:
+    """Path of a view's mask below the capture; camera: its number."""
+    return f"fg_masks/{timestep:05d}_{camera:02d}.png"
 
 
 def is_written(out: Path) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.mesh_raster import silhouette
 from ..errors import StgaError
 from ..files import read_json, write_json
 from .camera_scale import scale_warnings
@@ -41,6 +42,7 @@ from .landmarks import (
     write_landmarks,
     write_places,
 )
+from .mattes import with_mattes
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
@@ -82,14 +84,17 @@ def track(
     task: Path | None = None,
     meshes: bool = False,
     world: str = "auto",
+    mattes: bool = True,
     report: Report = lambda stage, done, total: None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
     landmarks: folder of landmark files in place of a detector; task: MediaPipe's .task file (`make_detector`).
-    What was detected is kept in OUT/landmarks: called again after an interruption, those cameras are not detected
-    again. world: "head": meters as the head's size says, y up, the head near the origin; "keep": that of the cameras,
-    which is scaled about its origin where it is not in meters; "auto": as the calibration says, else "head".
+    mattes: whether they are made for frames without a mask (`with_mattes`).
+    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks: called again after an interruption, those
+    cameras and frames are not worked on again. world: "head": meters as the head's size says, y up, the head near the
+    origin; "keep": that of the cameras, which is scaled about its origin where it is not in meters; "auto": as the
+    calibration says, else "head".
     Raises StgaError.
     """
     if is_written(out):
@@ -105,7 +110,7 @@ def track(
         detector = make_detector(task)
         report("Head model", 0, 1)
         places, reliable = calibrate(head.model, detector, str(head_file))
-        _begin(out, footage, head_file, task)
+        _begin(out, _source(footage, head_file, task))
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
@@ -129,15 +134,25 @@ def track(
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
+    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
+    matte_warnings: tuple[str, ...] = ()
+    if mattes:
+
+        def head_pixels(timestep: int, camera: FootageCamera) -> np.ndarray:
+            return silhouette(posed_mesh(fit, parameters[timestep]), fit.head.model.faces, cameras[camera.name])
+
+        source = _source(footage, head_file, task if landmarks is None else landmarks)
+        footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, found, fit, keep and not metric) + scale_warnings(fit, places, reliable, footage, found),
+        _warnings(footage, found, fit, keep and not metric)
+        + scale_warnings(fit, places, reliable, footage, found)
+        + matte_warnings,
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
-    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
     write_contact_sheet(
         out / SHEET_FILE,
         footage,
@@ -185,16 +200,20 @@ def reprojection_errors(
     return errors
 
 
-def _begin(out: Path, footage: Footage, head_file: Path, task: Path | None) -> None:
-    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
-    path = out / LANDMARKS_FOLDER / "footage.json"
-    source = {
+def _source(footage: Footage, head_file: Path, detector: Path | None) -> dict[str, Any]:
+    """What landmarks and mattes are of; detector: file of the network, or folder of its landmarks."""
+    return {
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
         "head_model": str(head_file.resolve()),
-        "detector": None if task is None else realpath(task),
+        "detector": None if detector is None else realpath(detector),
     }
+
+
+def _begin(out: Path, source: dict[str, Any]) -> None:
+    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
+    path = out / LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
         raise StgaError(f"{out}: holds landmarks of other footage or detector; give another --out, or delete it")
     write_json(path, source)

@@ -14,7 +14,7 @@ from ..files import replacing, write_json, write_npz
 from ..flame.forward import FlameFrame, flame_forward
 from ..flame.sequence import FRAME_FIELDS
 from .fit import HeadFit
-from .folder import SPLIT_FILES
+from .folder import SPLIT_FILES, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 from .posed_points import RIGID_SIZE
@@ -96,7 +96,7 @@ def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera:
     }
     mask = source.mask(timestep)
     if mask is not None:
-        entry["fg_mask_path"] = f"fg_masks/{timestep:05d}_{number:02d}.png"
+        entry["fg_mask_path"] = mask_name(timestep, number)
         with replacing(out / entry["fg_mask_path"]) as partial:
             Image.fromarray(mask).save(partial, format="PNG")
     return entry

@@ -10,6 +10,7 @@ from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
+from .backdrop import BACKDROPS
 from .effects.catalog import EFFECT_NAMES
 from .effects.decisions import CHOICES
 
@@ -82,6 +83,8 @@ class TrainingSettings:
     background     color behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put a random color behind the head in every iteration, so that splats
                    of the background's color cannot hide in it and alpha is learned
+    backdrop       what is behind the head in the images, one of `backdrop.BACKDROPS`: but for "plain", training and
+                   evaluations see the head over the color `background`
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
                    `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
@@ -131,6 +134,7 @@ class TrainingSettings:
     growth: float = setting(0.25, 0, MAX_GROWTH)
     background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
     random_background: bool = True
+    backdrop: str = setting("plain", choices=BACKDROPS)
     scale: float = setting(1.0, 0.05, 1)
     coarse_share: float = setting(0.0, 0, 1)
     target_psnr: float | None = setting(None, maximum=200, above=0)

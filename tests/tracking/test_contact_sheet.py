@@ -1,5 +1,7 @@
 """The contact sheet: which views it shows, and where the mesh lies in them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -76,6 +78,18 @@ def test_mesh_lies_on_the_head(tmp_path):
         y, x = (int(np.mean(axis)) for axis in np.nonzero(head))
         assert drawn[y, x, 2] > drawn[y, x, 0]  # where the surface faces the camera, its color is blue
         assert drawn[head.any(axis=1).argmax() + 12, x, 1] > drawn[y + (y - head.any(axis=1).argmax()) - 12, x, 1]
+
+
+def test_what_a_matte_leaves_out_is_green(tmp_path):
+    """Catches mattes that cannot be checked on the sheet, and a head that is painted over."""
+    take = footage(tmp_path, 1, 1)
+    half = np.zeros((SIZE, SIZE), np.uint8)
+    half[:, : SIZE // 2] = 255
+    Image.fromarray(half).save(tmp_path / "matte.png")
+    matted = replace(take, cameras=(replace(take.cameras[0], mattes={0: tmp_path / "matte.png"}),))
+    plain, shown = (next(iter(pictures(write(tmp_path, each, {"cam0": {0: 1.0}}), 1)))[0] for each in (take, matted))
+    np.testing.assert_array_equal(shown[:180, :85], plain[:180, :85])
+    assert (shown[:180, 115:190, 1] > shown[:180, 115:190, 0] + 40).all()
 
 
 @pytest.mark.parametrize("cameras", [1, 60])

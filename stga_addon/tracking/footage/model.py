@@ -1,13 +1,15 @@
 """Footage: the cameras of a rig and their synchronized frames, undistorted and decoded on request."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from ...capture.camera import Camera
+from ...capture.images import read_image, read_mask
+from ...capture.model import View
 from .undistort import Undistortion
 
 
@@ -39,12 +41,16 @@ class FootageCamera:
     camera     of the undistorted images, with OpenCV axes; its world has the scale and orientation of the calibration
     frames     as recorded
     undistortion  from the recorded frames to those of `camera`; None where the lens has no distortion
+    plate      image file of what the camera records without the person
+    mattes     timestep -> mask file of the undistorted frame, which stands in for the recorded mask
     """
 
     name: str
     camera: Camera
     frames: Frames
     undistortion: Undistortion | None = None
+    plate: Path | None = None
+    mattes: Mapping[int, Path] = field(default_factory=dict)
 
     @property
     def timesteps(self) -> tuple[int, ...]:
@@ -62,8 +68,17 @@ class FootageCamera:
 
     def mask(self, timestep: int) -> np.ndarray | None:
         """The undistorted foreground mask (H, W) uint8, 255 inside; None where there is none. Raises as `image`."""
+        if timestep in self.mattes:
+            return read_mask(View(timestep, 0, self.camera, self.name, Path(self.name), self.mattes[timestep]))
         mask = self.frames.mask(timestep)
         return mask if mask is None or self.undistortion is None else self.undistortion(mask)
+
+    def clean_plate(self) -> np.ndarray | None:
+        """The undistorted plate (H, W, 3) uint8 sRGB; None where there is none. Raises as `image`."""
+        if self.plate is None:
+            return None
+        plate = read_image(View(0, 0, self.camera, self.name, self.plate))
+        return plate if self.undistortion is None else self.undistortion(plate)
 
     def source(self, timestep: int) -> str:
         """What a message calls the frame: its file, in a video with the number of the frame."""

@@ -15,6 +15,7 @@ from ...errors import StgaError
 from . import video
 from .calibrations import EXPECTED, find_calibration, read_calibration
 from .clocks import clock_offsets
+from .given_masks import with_masks
 from .image_frames import ImageFrames
 from .lens import Lens
 from .model import Footage, FootageCamera, Frames
@@ -42,6 +43,7 @@ def open_footage(
     frames: FrameRange = ALL_FRAMES,
     focal: float | None = None,
     principal_point: str | None = None,
+    mattes: Path | None = None,
 ) -> Footage:
     """Open footage: cameras and file names now, frames when they are asked for.
 
@@ -49,10 +51,22 @@ def open_footage(
     cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
     focal    focal length in pixels of a single camera without a calibration; None: a guess, and not `calibrated`
     principal_point  what `cy` means in transforms files, as in `read_transforms`; None: by the file's author
+    mattes   folder of masks that stand in for the footage's own, named as its images; those of a video's frames by
+             camera and number, counted from 0, as in left/00012.png
     Cameras with a folder or video show sequences; where all have one image, it shows one timestep.
     Raises StgaError in one sentence naming file, field and what was expected, also for a missing image.
     """
     sources, root = _sources(path)
+    footage = _open(path, root, sources, cameras, frames, focal, principal_point)
+    plated = tuple(replace(camera, plate=sources.plates.get(camera.name)) for camera in footage.cameras)
+    footage = replace(footage, cameras=plated)
+    return footage if mattes is None else with_masks(footage, sources, mattes)
+
+
+def _open(
+    path: Path, root: Path, sources: Sources, cameras: Path | None, frames: FrameRange, focal: float | None,
+    principal_point: str | None,
+) -> Footage:  # fmt: skip
     calibration = cameras if cameras is not None else find_calibration(root) if isdir(path) else None
     if calibration is None:
         return _single_camera(root, sources, frames, focal)

@@ -13,6 +13,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's."""
 MASK_FOLDERS = ("masks", "fg_masks")
+PLATE_FOLDER = "plates"
+"""Holds an image without the person for each camera, of its name."""
 MAX_DEPTH = 4
 MAX_FILES = 1_000_000
 
@@ -24,6 +26,7 @@ class Sources:
     images   "cam01/0001" -> files
     folders  "cam01" -> its images, in natural order; "" for those that lie at the top
     videos   "cam01" -> files
+    plates   "cam01" -> file
     masks    as `images`; COLMAP's names ("0001.jpg.png") are "0001.jpg"
     """
 
@@ -32,6 +35,7 @@ class Sources:
     folders: dict[str, list[Path]] = field(default_factory=dict)
     videos: dict[str, list[Path]] = field(default_factory=dict)
     masks: dict[str, list[Path]] = field(default_factory=dict)
+    plates: dict[str, Path] = field(default_factory=dict)
 
     def name_of(self, image: Path) -> str:
         """Path below the footage, without suffix and without a leading "images/" and the like."""
@@ -67,6 +71,9 @@ def _enter(sources: Sources, path: Path) -> None:
         first, _, rest = path.relative_to(sources.root).as_posix().partition("/")
         if first in MASK_FOLDERS:
             sources.masks.setdefault(_without_container(rest.rpartition(".")[0]), []).append(path)
+            return
+        if first == PLATE_FOLDER:
+            sources.plates.setdefault(rest.rpartition(".")[0], path)
             return
         sources.images.setdefault(key, []).append(path)
         sources.folders.setdefault(key.rpartition("/")[0], []).append(path)

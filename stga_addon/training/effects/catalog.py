@@ -28,9 +28,9 @@ EFFECTS = (
     Effect("antialiasing", "a root a splat", on={"antialiased": True}, off={"antialiased": False}),
     Effect(
         "background",
-        "a pass over the image in every iteration",
-        on={"random_background": True},
-        off={"random_background": False},
+        "a pass over the image in every iteration, and one when it is read where the backdrop is not of one color",
+        on={"random_background": True, "backdrop": "plain"},
+        off={"random_background": False, "backdrop": "plain"},
     ),
     Effect(
         "hull-points",

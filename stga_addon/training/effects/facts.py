@@ -28,6 +28,8 @@ from .samples import Samples, take_samples
 
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
+MIN_WHITE_SHARE = 0.1
+"""Share of the pixels beside the mesh that a white background is: hair and shoulders leave more than that of it."""
 MAX_VIEW_ERROR_RATIO = 4.0
 """Errors above this multiple of the median come from lids, lips and teeth, not from the direction of view."""
 
@@ -128,6 +130,16 @@ class CaptureFacts:
     def outside(self) -> float:
         """Share of the mesh outside of the foreground by two pixels or more; NaN without masks."""
         return float(self.samples.outside.sum() / max(self.samples.mesh.sum(), 1))
+
+    @cached_property
+    def unmasked(self) -> int:
+        """How many of the sampled views have no mask."""
+        return int(np.isnan(self.samples.foreground).sum())
+
+    @cached_property
+    def shows_backdrop(self) -> bool:
+        """Whether sampled views without a mask show something else than white behind the head."""
+        return bool((self.samples.white[np.isnan(self.samples.foreground)] < MIN_WHITE_SHARE).any())
 
     @cached_property
     def sampled_timesteps(self) -> tuple[int, ...]:

@@ -31,6 +31,10 @@ MAX_BACKGROUND_SPREAD_LEVELS = 6.0
 """Root mean square deviation of a uniform background, in levels of 255."""
 BACKGROUND_TOLERANCE_LEVELS = 3.0
 """Largest difference, in levels of 255, between the background and the color in the settings."""
+MESH_AS_MASK = (
+    "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` makes masks)"
+)
+"""What becomes of images without a mask."""
 MIN_UNCOVERED_SHARE = 0.003
 """Share of the foreground that the mesh does not cover, from which splats are added for it."""
 MIN_PIXELS_PER_SPLAT = 0.5
@@ -96,13 +100,21 @@ def antialiasing(facts: CaptureFacts) -> Verdict:
 
 def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
-    backgrounds = samples.background
-    if np.isnan(backgrounds).any():
+    if facts.shows_backdrop:
+        count, total = facts.unmasked, len(samples.white)
+        reason = (
+            f"{count} of {total} sampled images have no mask, and show more than white behind the head: {MESH_AS_MASK}"
+        )
+        return Verdict(True, reason, changes={"backdrop": "mesh"})
+    known = ~np.isnan(samples.background_spread)
+    if facts.unmasked or not known.any():
         return Verdict(False, "not every image has a mask or transparency that shows where the head ends", only=True)
-    color, spread = backgrounds.mean(0), float(samples.background_spread.max())
+    backgrounds = samples.background[known]
+    color, spread = backgrounds.mean(0), float(samples.background_spread[known].max())
     spread = max(spread, float(abs(backgrounds - color).max()))
     if spread > MAX_BACKGROUND_SPREAD_LEVELS:
-        return Verdict(False, f"behind the head the images vary by {spread:.0f} of 255 levels", only=True)
+        reason = f"every image has a mask; what lies outside, which varies by {spread:.0f} of 255 levels, is replaced"
+        return Verdict(True, reason, changes={"backdrop": "masked"})
     named = bool(abs(color - 255 * np.array(facts.settings.background)).max() < BACKGROUND_TOLERANCE_LEVELS)
     changes = {} if named else {"background": tuple((color / 255).round(4).tolist())}
     red, green, blue = color.round().astype(int).tolist()
@@ -112,6 +124,8 @@ def background(facts: CaptureFacts) -> Verdict:
 
 
 def hull_points(facts: CaptureFacts) -> Verdict:
+    if facts.shows_backdrop:
+        return Verdict(False, "without masks, it is not known what beside the mesh belongs to the head", only=True)
     if np.isnan(facts.uncovered):
         return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
     reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, unif
 
 from ...avatar.strain import color_range, face_strain, smoothed_strain, strain_basis
 from ...capture.camera import Camera
-from ...capture.images import read_view
+from ...capture.images import WHITE_LEVEL, read_view
 from ...capture.model import Capture, View, evenly_spread
 
 MAX_VIEWS = 48
@@ -47,6 +47,7 @@ class Samples:
     outside    (S,) those of them that lie outside the mask
     background (S, 3) mean color outside the mask
     background_spread  (S,) root mean square deviation from it in levels of 255
+    white      (S,) share of the pixels beside the mesh that are white, with or without a mask
     Pixels are those of the image at its own size.
     """
 
@@ -65,6 +66,7 @@ class Samples:
     outside: np.ndarray
     background: np.ndarray
     background_spread: np.ndarray
+    white: np.ndarray
 
     @property
     def seen(self) -> np.ndarray:
@@ -184,10 +186,11 @@ def _areas(corners: np.ndarray) -> np.ndarray:
 def _coverage(image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, area: float) -> dict[str, np.ndarray]:
     """How mesh (H, W) bool and mask cover each other, and the background; area: of a pixel, in original pixels."""
     unknown = np.array(np.nan)
+    near = binary_dilation(mesh, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
+    white = np.array((image >= WHITE_LEVEL).all(axis=2)[~near].mean() if not near.all() else 1.0)
     if mask is None:
         names = ("foreground", "uncovered", "mesh", "outside", "background_spread")
-        return {"background": np.full(3, np.nan), **dict.fromkeys(names, unknown)}
-    near = binary_dilation(mesh, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
+        return {"background": np.full(3, np.nan), "white": white, **dict.fromkeys(names, unknown)}
     foreground = mask > 127
     clear = image[binary_erosion(mask == 0, iterations=MASK_EDGE_PIXELS, border_value=1)].astype(np.float64)
     background = clear.mean(0) if len(clear) else np.full(3, np.nan)
@@ -198,4 +201,5 @@ def _coverage(image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, area
         "outside": np.array(area * (mesh & ~binary_dilation(foreground, np.ones((3, 3)))).sum()),
         "background": background,
         "background_spread": np.array(np.sqrt(((clear - background) ** 2).mean())) if len(clear) else unknown,
+        "white": white,
     }

@@ -10,6 +10,7 @@ from scipy.ndimage import binary_erosion
 from ...capture.images import read_image, read_mask
 from ...capture.model import Capture, View, evenly_spread
 from ...selection import SelectionOptions, select_capture
+from ..backdrop import without_backdrop
 
 MAX_EVALUATION_VIEWS = 16
 """Held-out views that an evaluation during training renders."""
@@ -45,15 +46,18 @@ def choose_evaluation_views(capture: Capture) -> Sequence[View]:
 
 
 def read_evaluation_view(
-    capture: Capture, view: View, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    capture: Capture, view: View, background: tuple[float, float, float] = (1.0, 1.0, 1.0), backdrop: str = "plain"
 ) -> EvaluationView:
-    """Read a view's image and mask and find its regions; background (0…1): behind transparent pixels, as in training.
+    """Read a view's image and mask and find its regions.
+
+    background (0…1): behind transparent pixels; backdrop: see `TrainingSettings`, both as in training.
 
     "moving" is by the default selection whatever a run's settings are, so that runs are comparable.
     Raises StgaError if a file cannot be read.
     """
     red, green, blue = (round(255 * level) for level in background)
     target, mask = read_image(view, (red, green, blue)), read_mask(view)
+    target, mask = without_backdrop(capture, view, target, mask, backdrop, background)
     target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
     selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
     regions = {"moving": visible_pixels(capture, view, selection[view.timestep])}

@@ -91,11 +91,12 @@ def evaluate_avatar(
     matched: whether to apply the exposure of each view, known or fitted; None: where the avatar was trained so.
     """
     rows, exposure = avatar.settings.get("exposure") or (), None
+    backdrop = str(avatar.settings.get("backdrop", "plain"))
     if rows if matched is None else matched:
         exposure = known_exposure(rows, capture.views.get("train", ()))
     return evaluate(
         lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
-        (read_evaluation_view(capture, view, avatar.background) for view in capture.views[split]),
+        (read_evaluation_view(capture, view, avatar.background, backdrop) for view in capture.views[split]),
         perceptual,
         exposure,
     )

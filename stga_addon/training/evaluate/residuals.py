@@ -9,10 +9,10 @@ from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0
 from ...capture.camera import Camera
 from ...capture.images import read_view
+from ...capture.loader import Preparation
 from ...capture.model import Capture, View
 from ...raster.cpu.layout import CameraFrames, Parameters
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
-from ..optimize.exposure import Correction
 
 RESIDUAL_SCALE = 0.5
 """Size of the images in which the residuals of a run are measured: an error that matters is larger than a pixel."""
@@ -40,9 +40,9 @@ class Residuals:
 
 
 def triangle_residuals(
-    avatar: Avatar, capture: Capture, views: Iterable[View], correct: Correction | None = None, scale: float = 1.0
+    avatar: Avatar, capture: Capture, views: Iterable[View], prepare: Preparation | None = None, scale: float = 1.0
 ) -> Residuals:
-    """Residuals of the avatar in the views; correct: as in training; scale: size of the images compared.
+    """Residuals of the avatar in the views; prepare: as in training; scale: size of the images compared.
 
     A pixel's error is divided among the splats that it shows, by their blending weights.
     """
@@ -51,8 +51,8 @@ def triangle_residuals(
     red, green, blue = (round(255 * level) for level in avatar.background)
     for view in views:
         scaled, image, mask = read_view(view, scale, (red, green, blue))
-        if correct is not None:
-            image = correct(view, image, mask)
+        if prepare is not None:
+            image, _ = prepare(scaled, image, mask)
         total = total + probe.residuals(np.asarray(capture.mesh(view.timestep)), scaled.camera, image)
     return total
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
@@ -11,7 +10,8 @@ from ...avatar.embedding import face_frames, to_local
 from ...avatar.lattice import lattice_weights
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
-from ...capture.images import read_image, read_mask
+from ...capture.images import WHITE_LEVEL, read_image, read_mask
+from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
 from ...capture.model import Capture, View
 
 VOXEL_SIZE_M = 0.004
@@ -29,8 +29,6 @@ MIN_EXPOSED_SHARE = 0.125
 contradicts would become floaters in other views."""
 SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
-MIN_DEPTH_M = 0.01
-"""Points nearer to the camera's plane are not visible."""
 
 
 def hull_points(capture: Capture, views: Sequence[View], convention: str, sh_degree: int) -> Splats:
@@ -115,14 +113,8 @@ def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], vo
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) bool: pixels that the mesh covers, dilated by the tolerance."""
-    pixels, depth = camera.project(mesh)
-    picture = Image.new("1", (camera.width, camera.height))
-    draw = ImageDraw.Draw(picture)
-    for corners in pixels[faces[(depth > MIN_DEPTH_M)[faces].all(1)]].reshape(-1, 6).tolist():
-        draw.polygon(corners, fill=1)
-    return np.asarray(
-        binary_dilation(np.asarray(picture), iterations=max(1, round(SILHOUETTE_TOLERANCE_SHARE * camera.height)))
-    )
+    tolerance = max(1, round(SILHOUETTE_TOLERANCE_SHARE * camera.height))
+    return np.asarray(binary_dilation(silhouette(mesh, faces, camera), iterations=tolerance))
 
 
 def _foreground(view: View) -> np.ndarray:
@@ -130,7 +122,7 @@ def _foreground(view: View) -> np.ndarray:
     mask = read_mask(view)
     if mask is not None:
         return np.asarray(mask > 127)
-    return np.asarray((read_image(view) < 247).any(axis=2))
+    return np.asarray((read_image(view) < WHITE_LEVEL).any(axis=2))
 
 
 def in_image(points: np.ndarray, camera: Camera) -> np.ndarray:

@@ -23,7 +23,7 @@ from ..evaluate.evaluation_views import (
     visible_pixels,
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, Residuals, triangle_residuals
-from ..optimize.exposure import exposure_correction
+from ..optimize.image_preparation import image_preparation
 from ..optimize.state import (
     TrainState,
     new_state,
@@ -63,11 +63,11 @@ def select_for_takes(
     the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
     """
     views = capture.views["train"]
-    avatar, correct = read_avatar(continuation.parent / AVATAR), exposure_correction(settings)
+    avatar, prepare = read_avatar(continuation.parent / AVATAR), image_preparation(capture, settings)
     parts = [[view for view in views if continuation.includes(view.timestep) is new] for new in (False, True)]
     old_views, new_views = (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
-    old = triangle_residuals(avatar, capture, old_views, correct, RESIDUAL_SCALE)
-    by_view = [triangle_residuals(avatar, capture, [view], correct, RESIDUAL_SCALE) for view in new_views]
+    old = triangle_residuals(avatar, capture, old_views, prepare, RESIDUAL_SCALE)
+    by_view = [triangle_residuals(avatar, capture, [view], prepare, RESIDUAL_SCALE) for view in new_views]
     new = reduce(add, by_view)
     known, now = np.nan_to_num(old.mean()), np.nan_to_num(new.mean())
     differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
@@ -183,7 +183,8 @@ def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | 
     for name, members in groups.items():
         group = name if len(groups) > 1 else ""
         for view in evenly_spread(members, limit):
-            found = replace(read_evaluation_view(capture, view, run.settings.background), group=group)
+            found = read_evaluation_view(capture, view, run.settings.background, run.settings.backdrop)
+            found = replace(found, group=group)
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= MIN_REGION_PIXELS:
                 found = replace(found, regions={**found.regions, "region": pixels})

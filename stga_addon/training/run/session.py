@@ -22,8 +22,8 @@ from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views,
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
 from ..evaluate.match_exposure import known_exposure
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
-from ..optimize.exposure import exposure_correction
 from ..optimize.flame_refinement import with_refined_tracking, write_tracking
+from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
@@ -84,10 +84,10 @@ class Session:
         else:
             region = _refined_region(self.run, self.trainer)
             order = continued_order(self.run.continuation, self.capture, region, settings.seed, first)
-        correct = exposure_correction(settings)
+        prepare = image_preparation(self.capture, settings)
         mesh = self.capture.mesh if self.trainer.tracking is None else None  # refined meshes change with every step
         return ViewLoader(
-            order, lambda position: self._scale(first + position), (red, green, blue), correct=correct, mesh=mesh
+            order, lambda position: self._scale(first + position), (red, green, blue), prepare=prepare, mesh=mesh
         )
 
     def step(self, loader: ViewLoader, clock: Callable[[], float]) -> None:
@@ -166,7 +166,7 @@ class Session:
         capture = with_refined_tracking(self.capture, self.folder) if refined else self.capture
         residuals = triangle_residuals(
             read_avatar(self.folder / AVATAR), capture, evenly_spread(views, RESIDUAL_VIEWS),
-            exposure_correction(self.settings), RESIDUAL_SCALE,
+            image_preparation(capture, self.settings), RESIDUAL_SCALE,
         )  # fmt: skip
         write_residuals(self.folder, residuals.mean())
 
@@ -256,8 +256,8 @@ def _strain_range(folder: Path, capture: Capture, run: Run, report: Report) -> n
 def _evaluation_views(capture: Capture, run: Run, trainer: Trainer) -> list[EvaluationView]:
     if run.continuation is not None:
         return continued_evaluation_views(run, capture, _refined_region(run, trainer))
-    background = run.settings.background
-    return [read_evaluation_view(capture, view, background) for view in choose_evaluation_views(capture)]
+    background, backdrop = run.settings.background, run.settings.backdrop
+    return [read_evaluation_view(capture, view, background, backdrop) for view in choose_evaluation_views(capture)]
 
 
 def _exposure(capture: Capture, run: Run) -> dict[int, np.ndarray] | None:

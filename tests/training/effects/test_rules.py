@@ -17,6 +17,7 @@ from stga_addon.training.effects.evidence import fit_cameras, stable_colors
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.samples import MAX_VIEWS, sample_views, take_samples
+from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.settings import TrainingSettings, make_settings
 
 from .scenes import gloss, sliding, wrinkles
@@ -136,11 +137,23 @@ def test_background(painted):
 
 
 def test_a_room_behind_the_head(painted):
-    """Catches a background of many colors that is exchanged as if it had one."""
+    """Catches masks that are not used, and a background of many colors that is exchanged as if it had one."""
     facts = CaptureFacts(painted(), make_settings(iterations=1))
     facts.samples = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
     verdict = rules.background(facts)
-    assert (verdict.on, verdict.only) == (False, True)
+    assert (verdict.on, verdict.changes["backdrop"]) == (True, "masked")
+    assert "varies by 40 of 255 levels, is replaced" in verdict.reason
+
+
+def test_a_room_without_masks(painted):
+    """Catches a run that makes splats of the wall behind the head, or that does not say what it leaves out."""
+    capture = painted(masks=False, background=(90, 110, 70))
+    plan, settings = planned(capture)
+    assert (settings.backdrop, settings.hull_points, settings.random_background) == ("mesh", False, True)
+    assert "sampled images have no mask" in plan["background"].reason
+    with pytest.raises(StgaError, match="hull-points=on: is not possible, because without masks"):
+        planned(capture, hull_points="on")
+    assert len(initial_splats(capture, settings)) == len(capture.faces) * 6
 
 
 def test_something_beside_the_mesh(painted):

@@ -1,0 +1,118 @@
+"""The matte of one image, against true coverage."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, shift
+
+from stga_addon.capture.images import read_image, read_mask
+from stga_addon.capture.mesh_raster import silhouette
+from stga_addon.capture.open import open_capture
+from stga_addon.tracking.matte import find_matte, probability_by_plate
+from stga_addon.tracking.person import make_segmenter
+
+pytest.importorskip("cv2")
+
+WIDTH, HEIGHT = 200, 260
+
+
+def room(height=HEIGHT, width=WIDTH, seed=0):
+    """A wall in shades with blurred things before it, and noise: levels (height, width, 3)."""
+    rng = np.random.default_rng(seed)
+    x = np.linspace(-0.5, 0.5, width)[None, :, None]
+    things = gaussian_filter(rng.normal(size=(height, width)), width / 12)[..., None]
+    shades = rng.uniform(90, 190, 3) + 50 * x + 25 * things / things.std()
+    return np.clip(shades + rng.normal(0, 3, shades.shape), 0, 255)
+
+
+def person(softness=3.0):
+    """Coverage (HEIGHT, WIDTH) in 0…1 of a head on shoulders, (H, W) bool of the head alone, and their colors."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    head = 1 - np.hypot((x - 100) / 48, (y - 100) / 62)
+    body = 1 - np.hypot((x - 100) / 90, (y - 262) / 120)
+    coverage = np.clip(0.5 + 48 * np.maximum(head, 1.9 * body) / softness, 0, 1)
+    skin = np.stack([40 + 0.3 * x, 30 + 0.1 * y, 25 + 0 * x], -1)
+    return coverage, head > 0.1, skin + np.random.default_rng(1).normal(0, 4, skin.shape)
+
+
+def filmed(coverage, colors, backdrop):
+    alpha = coverage[..., None]
+    return np.clip(alpha * colors + (1 - alpha) * backdrop, 0, 255).round().astype(np.uint8)
+
+
+def overlap(found, true):
+    """Intersection over union of masks (H, W) in 0…1, at half coverage."""
+    return ((found > 0.5) & (true > 0.5)).sum() / ((found > 0.5) | (true > 0.5)).sum()
+
+
+def test_an_outline_that_is_off_is_drawn_to_the_person():
+    """Catches a network's coarse outline, six pixels off, that is taken for the person's."""
+    coverage, head, colors = person()
+    image = filmed(coverage, colors, room())
+    coarse = gaussian_filter(shift(coverage, (4, 5), order=1, mode="nearest"), 4).astype(np.float32)
+    matte = find_matte(image, coarse, head) / 255
+    assert overlap(coarse, coverage) < 0.95
+    assert overlap(matte, coverage) > 0.985
+
+
+def test_hair_is_soft():
+    """Catches a hard edge where hair lets the wall through: within the edge, nearer to the truth than a hard mask."""
+    coverage, head, colors = person(softness=4.0)
+    matte = find_matte(filmed(coverage, colors, room()), coverage.astype(np.float32), head) / 255
+    edge = (coverage > 0.1) & (coverage < 0.9)
+    hard = np.abs((coverage > 0.5) - coverage)[edge].mean()
+    assert np.abs(matte - coverage)[edge].mean() < 0.6 * hard
+
+
+def test_clean_plate():
+    """Catches a plate that is not used: the matte is found without any network."""
+    coverage, head, colors = person()
+    wall = room().round().astype(np.uint8)
+    noisy = np.clip(filmed(coverage, colors, wall) + np.random.default_rng(2).normal(0, 2, wall.shape), 0, 255)
+    image = noisy.round().astype(np.uint8)
+    assert overlap(find_matte(image, probability_by_plate(image, wall), head) / 255, coverage) > 0.985
+
+
+def test_somebody_else_in_the_room():
+    """Catches a second person who becomes part of the first: only what hangs together with the tracked head is kept."""
+    coverage, head, colors = person()
+    other = np.zeros_like(coverage)
+    other[20:70, 4:34] = 1
+    both = np.maximum(coverage, other)
+    matte = find_matte(filmed(both, colors, room()), both.astype(np.float32), head)
+    assert matte[:75, :36].max() < 30
+    assert overlap(matte / 255, coverage) > 0.97
+
+
+@pytest.mark.parametrize("likely", [0.0, 1.0])
+def test_a_network_that_sees_nobody_or_everybody(likely):
+    """Catches an error of GrabCut without one of its two sides; the tracked head stays."""
+    coverage, head, colors = person()
+    matte = find_matte(filmed(coverage, colors, room()), np.full((HEIGHT, WIDTH), likely, np.float32), head)
+    assert matte[70:120, 80:120].min() == 255
+
+
+@pytest.mark.slow
+def test_a_rendered_head_before_a_wall(shared_data, tmp_path):
+    """Catches a network that is asked wrongly: true masks of a path-traced head before generated walls."""
+    pytest.importorskip("mediapipe")
+    capture = open_capture(shared_data / "studio_head")
+    network, found = make_segmenter(), []
+    for number, view in enumerate(capture.views["train"][2:80:13]):
+        image, mask = with_a_body(read_image(view), read_mask(view))
+        alpha = mask[..., None] / 255
+        filmed_head = (
+            np.clip(image + (room(*mask.shape, seed=number) - 255) * (1 - alpha), 0, 255).round().astype(np.uint8)
+        )
+        head = silhouette(np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera)
+        found.append(overlap(find_matte(filmed_head, network.probability(filmed_head), head) / 255, mask / 255))
+    assert np.mean(found) > 0.97, found
+
+
+def with_a_body(image, mask):
+    """The bust's lower edge continued to the image's: nobody ends in the air."""
+    image, mask = image.copy(), mask.copy()
+    for x in range(mask.shape[1]):
+        rows = np.flatnonzero(mask[:, x] > 127)
+        if len(rows) and rows[-1] > 0.75 * len(mask):
+            image[rows[-1] - 3 :, x], mask[rows[-1] - 3 :, x] = image[rows[-1] - 3, x], 255
+    return image, mask

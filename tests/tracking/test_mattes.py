@@ -1,0 +1,170 @@
+"""Mattes of a take: made, read from a folder, kept and continued."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.cli.main import main
+from stga_addon.errors import StgaError
+from stga_addon.tracking import mattes, person
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.mattes import with_mattes
+
+from .scenes import HEIGHT, WIDTH, write_image, write_video
+
+pytest.importorskip("cv2")
+
+
+class Halves:
+    """Takes the left half of each image for the person, and counts."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def probability(self, image):
+        self.asked += 1
+        left = np.arange(image.shape[1]) < image.shape[1] // 2
+        return np.repeat(left[None].astype(np.float32), len(image), axis=0)
+
+
+@pytest.fixture
+def halves(monkeypatch):
+    segmenter = Halves()
+    monkeypatch.setattr(mattes, "make_segmenter", lambda: segmenter)
+    return segmenter
+
+
+def head(timestep, camera):
+    found = np.zeros((HEIGHT, WIDTH), bool)
+    found[8:20, 4:16] = True
+    return found
+
+
+def take(folder, frames=3):
+    """A camera's images: dark on the left, bright on the right."""
+    for number in range(frames):
+        path = folder / "footage/left" / f"{number:04d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.full((HEIGHT, WIDTH, 3), 220, np.uint8)
+        pixels[:, : WIDTH // 2] = (60, 40, 30)
+        Image.fromarray(pixels).save(path)
+    return open_footage(folder / "footage", focal=50.0)
+
+
+def silent(stage, done, total):
+    pass
+
+
+def test_made_once_and_kept(tmp_path, halves):
+    """Catches mattes that an interrupted tracking makes again, and those of another head that are kept."""
+    footage = take(tmp_path)
+    found, warnings = with_mattes(footage, head, tmp_path / "out", {"head": "a"}, silent)
+    assert (halves.asked, warnings) == (3, ())
+    files = sorted(path.name for path in (tmp_path / "out/fg_masks").iterdir())
+    assert files == ["00000_00.png", "00001_00.png", "00002_00.png"]
+    mask = found.cameras[0].mask(1)
+    assert mask[:, : WIDTH // 2 - 2].min() == 255
+    assert mask[:, WIDTH // 2 + 2 :].max() == 0
+    (tmp_path / "out/fg_masks/00001_00.png").unlink()
+    with_mattes(footage, head, tmp_path / "out", {"head": "a"}, silent)
+    assert halves.asked == 4
+    with_mattes(footage, head, tmp_path / "out", {"head": "b"}, silent)
+    assert halves.asked == 7
+
+
+def test_masks_of_the_footage_stay(tmp_path, halves):
+    """Catches a user's masks that are replaced, and a network that is loaded for nothing."""
+    for number in range(3):
+        write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
+    footage = take(tmp_path)
+    found, _ = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    assert halves.asked == 0
+    assert not (tmp_path / "out/fg_masks").exists()
+    assert found.cameras[0].mask(0).max() == 90
+
+
+def test_clean_plate_of_a_camera(tmp_path, monkeypatch):
+    """Catches a plate that is taken for a camera, or not found; no network is asked."""
+
+    def refuse():
+        raise AssertionError("asked for the network")
+
+    monkeypatch.setattr(mattes, "make_segmenter", refuse)
+    (tmp_path / "footage/plates").mkdir(parents=True)
+    Image.new("RGB", (WIDTH, HEIGHT), (220, 220, 220)).save(tmp_path / "footage/plates/left.png")
+    footage = take(tmp_path)
+    assert [camera.name for camera in footage.cameras] == ["left"]
+    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    assert warnings == ()
+    assert found.cameras[0].mask(2)[:, : WIDTH // 2 - 2].min() == 255
+    assert found.cameras[0].mask(2)[:, WIDTH // 2 + 2 :].max() == 0
+
+
+def test_a_plate_of_another_size(tmp_path):
+    """Catches a plate of another size that ends in OpenCV's error."""
+    write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
+    with pytest.raises(StgaError, match=r"left\.png: the image has 7 x 5 pixels"):
+        with_mattes(take(tmp_path), head, tmp_path / "out", {}, silent)
+
+
+def test_without_the_network(tmp_path, monkeypatch):
+    """Catches tracking that fails, or says nothing, where mediapipe is missing or has no network."""
+    monkeypatch.setitem(__import__("sys").modules, "mediapipe", None)
+    with pytest.raises(
+        StgaError, match="give a folder of mattes with --mattes, a clean plate of each camera, or masks"
+    ):
+        person.make_segmenter()
+    found, warnings = with_mattes(take(tmp_path), head, tmp_path / "out", {}, silent)
+    assert found.cameras[0].mask(0) is None
+    assert len(warnings) == 1
+    assert "no mattes were made: mattes need mediapipe==0.10.21" in warnings[0]
+
+
+def test_a_folder_of_mattes(tmp_path):
+    """Catches mattes of other frames, and a frame without one that is not said."""
+    take(tmp_path)
+    for number in range(3):
+        write_image(tmp_path / f"mattes/left/{number:04d}.png", 10 * number)
+    footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
+    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(3)] == [0, 10, 20]
+    (tmp_path / "mattes/left/0001.png").unlink()
+    with pytest.raises(StgaError, match=r"has no matte of .*0001\.png; expected left/0001\.png"):
+        open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
+
+
+def test_mattes_of_a_video(tmp_path):
+    """Catches mattes that are counted from 1, or by timestep where frames are left out."""
+    pytest.importorskip("av")
+    write_video(tmp_path / "footage/left.mp4", [20, 60, 100, 140])
+    for number in range(4):
+        write_image(tmp_path / f"mattes/left/{number:05d}.png", 10 * number)
+    footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
+    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(4)] == [0, 10, 20, 30]
+
+
+def test_a_folder_that_is_none(tmp_path, capsys):
+    """Catches a traceback for a folder that does not exist."""
+    take(tmp_path)
+    more = [
+        "--model",
+        str(tmp_path / "none.npz"),
+        "--out",
+        str(tmp_path / "out"),
+        "--mattes",
+        str(tmp_path / "nowhere"),
+    ]
+    assert main(["track", str(tmp_path / "footage"), *more]) == 2
+    assert "nowhere: is not a folder; expected one of mattes" in capsys.readouterr().err
+
+
+def test_undistorted_mattes_are_not_undistorted_again(tmp_path, halves):
+    """Catches made mattes, which are of the undistorted frame, that are resampled by the lens once more."""
+    footage = take(tmp_path, 1)
+
+    def refuse(mask):
+        raise AssertionError("resampled")
+
+    found, _ = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    assert replace(found.cameras[0], undistortion=refuse).mask(0) is not None

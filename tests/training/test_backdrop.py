@@ -1,0 +1,118 @@
+"""Images without what lies behind the head: by masks, and by the mesh."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.images import read_view
+from stga_addon.capture.mesh_raster import rasterize, silhouette
+from stga_addon.capture.model import Capture
+from stga_addon.training.backdrop import over_color, without_backdrop
+from stga_addon.training.evaluate.evaluation_views import read_evaluation_view
+from stga_addon.training.optimize.image_preparation import image_preparation
+from stga_addon.training.settings import make_settings
+
+SIZE = 80
+GREEN = (0.0, 1.0, 0.0)
+
+
+def room() -> np.ndarray:
+    """(SIZE, SIZE, 3) levels of a wall in shades and colors."""
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    return np.stack([60 + 120 * x, 200 - 100 * y, 90 + 60 * np.sin(3 * x + 2 * y)], -1)
+
+
+def person() -> tuple[np.ndarray, np.ndarray]:
+    """Levels (SIZE, SIZE, 3), and coverage (SIZE, SIZE) in 0…1 with an edge of six pixels, as hair has."""
+    y, x = np.mgrid[:SIZE, :SIZE]
+    distance = np.hypot(x - 38, y - 42)
+    return np.stack([70 + x, 40 + 0.5 * y, 30 + 0 * x], -1), np.clip((26 - distance) / 6, 0, 1)
+
+
+def test_soft_edge_keeps_no_wall() -> None:
+    """Catches a rim of the wall's color: compared with the true foreground over the color; plain blending has a rim."""
+    colors, cover = person()
+    alpha, mask = cover[..., None], (255 * cover).round().astype(np.uint8)
+    image = (alpha * colors + (1 - alpha) * room()).round().astype(np.uint8)
+    expected = alpha * colors + (1 - alpha) * 255 * np.array(GREEN)
+    error = np.abs(over_color(image, mask, GREEN) - expected)
+    blended = np.abs(alpha * image + (1 - alpha) * 255 * np.array(GREEN) - expected)
+    assert error.max() < 6
+    assert blended.max() > 25
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_masks_of_one_value(level: int) -> None:
+    """Catches a division by zero where a mask shows nothing or everything."""
+    image = room().astype(np.uint8)
+    expected = image if level else np.broadcast_to(255 * np.array(GREEN), image.shape)
+    np.testing.assert_array_equal(over_color(image, np.full((SIZE, SIZE), level, np.uint8), GREEN), expected)
+
+
+def same_but_for_the_edge(found: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether both are the same but for two pixels outside of the outline, or one inside."""
+    near, core = binary_dilation(expected, np.ones((5, 5))), binary_erosion(expected, np.ones((3, 3)))
+    return bool(core.any() and not near.all() and (found <= near).all() and (found >= core).all())
+
+
+def in_a_room(capture: Capture, folder: Path, keeps_masks: bool) -> Capture:
+    """The capture with stripes in place of its background."""
+
+    def repaint(view):
+        _, image, mask = read_view(view)
+        stripes = Image.new("RGB", image.shape[1::-1], (200, 40, 90))
+        for x in range(0, image.shape[1], 6):
+            ImageDraw.Draw(stripes).rectangle((x, 0, x + 2, image.shape[0]), fill=(20, 160, 180))
+        name = f"{view.timestep}_{view.camera_index}.png"
+        alpha = mask[..., None] / 255
+        picture = image - (1 - alpha) * 255 + (1 - alpha) * np.asarray(stripes)
+        Image.fromarray(np.clip(picture, 0, 255).round().astype(np.uint8)).save(folder / name)
+        Image.fromarray(mask).save(folder / f"mask_{name}")
+        return replace(view, image=folder / name, mask=folder / f"mask_{name}" if keeps_masks else None)
+
+    views = {split: tuple(repaint(view) for view in members) for split, members in capture.views.items()}
+    return replace(capture, views=views)
+
+
+def test_what_is_trained_and_evaluated_is_what_masks_show(toy: Capture, tmp_path: Path) -> None:
+    """Catches a wall in training images, in evaluations, or in one of both only: the same as of the plain capture."""
+    walled = in_a_room(toy, tmp_path, keeps_masks=True)
+    settings = make_settings(iterations=1, backdrop="masked")
+    prepare = image_preparation(walled, settings)
+    assert prepare is not None
+    for plain, view in zip(toy.views["val"], walled.views["val"], strict=True):
+        _, expected, mask = read_view(plain)
+        trained, kept = prepare(*read_view(view))
+        inside = (mask == 0) | (mask == 255)
+        assert np.abs(trained.astype(int) - expected)[inside].max() <= 1
+        np.testing.assert_array_equal(kept, mask)
+        np.testing.assert_array_equal(read_evaluation_view(walled, view, backdrop="masked").target, trained)
+    assert image_preparation(walled, replace(settings, backdrop="plain")) is None
+
+
+def test_without_masks_the_mesh_is_the_mask(toy: Capture, tmp_path: Path) -> None:
+    """Catches a wall beside the mesh, and a head taken away with it: compared with the depth buffer's pixels."""
+    walled = in_a_room(toy, tmp_path, keeps_masks=False)
+    view = walled.views["train"][0]
+    small, image, mask = read_view(view, 0.7)
+    found, made = without_backdrop(walled, small, image, mask, "mesh", GREEN)
+    assert made is not None
+    mesh = rasterize(np.asarray(walled.mesh(view.timestep)), walled.faces, small.camera)[0] >= 0
+    assert same_but_for_the_edge(made > 0, mesh)
+    np.testing.assert_array_equal(found[made == 0], np.broadcast_to([0, 255, 0], found[made == 0].shape))
+    np.testing.assert_array_equal(found[made == 255], image[made == 255])
+
+
+def test_silhouette_is_what_the_depth_buffer_shows(toy: Capture) -> None:
+    """Catches triangles behind the camera that are drawn, and pixels that are shifted."""
+    camera = toy.views["train"][0].camera
+    mesh = np.asarray(toy.mesh(toy.timesteps[0]))
+    seen = rasterize(mesh, toy.faces, camera)[0] >= 0
+    assert same_but_for_the_edge(silhouette(mesh, toy.faces, camera), seen)
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera
+    assert not silhouette(mesh, toy.faces, Camera(**{**vars(camera), "world_to_camera": turned})).any()
