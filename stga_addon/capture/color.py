@@ -80,7 +80,7 @@ def _linear(transfer: int, levels: int) -> np.ndarray:
         light = signal ** GAMMAS[transfer]
     else:
         light = decode_srgb(signal)
-    return light.astype(np.float32)
+    return np.asarray(light, np.float32)
 
 
 def _displayed(scene: np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ def _displayed(scene: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _to_bt709(primaries: int) -> np.ndarray:
     """(3, 3) from linear light of these primaries to that of BT.709."""
-    return (np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(primaries)).astype(np.float32)
+    return np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(primaries), np.float32)
 
 
 def _to_xyz(primaries: int) -> np.ndarray:
