@@ -86,7 +86,8 @@ def _linear(transfer: int, levels: int) -> np.ndarray:
 def _displayed(scene: np.ndarray) -> np.ndarray:
     """HLG's light of the scene (…, 3), BT.2020, as that of a display, 1 being diffuse white (BT.2100's OOTF)."""
     luminance = np.maximum(scene @ BT2020_LUMINANCE.astype(scene.dtype), 1e-6)
-    return HLG_PEAK_CD_M2 / REFERENCE_WHITE_CD_M2 * luminance[..., None] ** (HLG_SYSTEM_GAMMA - 1) * scene
+    gain = HLG_PEAK_CD_M2 / REFERENCE_WHITE_CD_M2 * luminance ** (HLG_SYSTEM_GAMMA - 1)
+    return np.asarray(gain[..., None] * scene)
 
 
 @lru_cache(maxsize=8)

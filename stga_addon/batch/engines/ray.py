@@ -4,6 +4,7 @@ A task runs `stga perform` on the job's folder, so that only the command and the
 store. https://docs.ray.io/en/latest/ray-core/tasks.html
 """
 
+import logging
 import os
 import secrets
 from collections.abc import Callable, Mapping, Sequence
@@ -42,9 +43,9 @@ class RayEngine:
 
         try:
             if address:
-                ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             else:
-                ray.init(num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+                ray.init(num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
         self._ray = ray
