@@ -29,6 +29,7 @@ WORK: dict[type[Any], tuple[str, str]] = {
     values.Track: (".tracking", "perform_tracking"),
     values.SolveAgain: (".tracking", "solve_again"),
     values.Render: (".render", "render"),
+    values.ConvertMotion: (".conversion", "convert_motion"),
     values.RenderRecording: (".recording", "render_recording"),
     values.Export: (".export", "export"),
     values.Analyze: (".analysis", "analyze"),

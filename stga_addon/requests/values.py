@@ -18,6 +18,7 @@ from ..schema import MAX_COUNT, setting
 from ..selection import SelectionOptions
 from ..training.settings import MAX_GROWTH, TrainingSettings
 
+SHAPES_SUFFIX = ".csv"
 MATTES = ("auto", "none")
 """What `Track.mattes` may be but a folder."""
 
@@ -297,6 +298,36 @@ class Export:
 
 
 @dataclass(frozen=True)
+class ConvertMotion:
+    """Convert a performance in ARKit's shapes to a FLAME motion, or a motion to a performance.
+
+    source   a performance, FLAME parameters (.npz), or the folder of a capture tracked with FLAME
+    output   ARKit's shapes (.csv) or FLAME parameters (.npz)
+    flame    FLAME model file of the head
+    head     folder of the capture whose identity a performance moves; None: the model's average head
+    fps      frames per second of the result; None: as recorded
+    """
+
+    source: Path
+    output: Path
+    flame: Path | None = None
+    head: Path | None = None
+    fps: float | None = setting(None, above=0)
+    options: MotionOptions = field(default_factory=MotionOptions)
+
+    @property
+    def writes_shapes(self) -> bool:
+        return self.output.suffix.lower() == SHAPES_SUFFIX
+
+    def check(self) -> None:
+        """Raise StgaError for a file name of another format, and an option that needs an avatar."""
+        if not self.writes_shapes and self.output.suffix.lower() != ".npz":
+            raise StgaError(f"{self.output}: expected a name that ends in {SHAPES_SUFFIX} or .npz")
+        if self.options.stay_trained is not None:
+            raise StgaError("--stay-trained: has no effect here, where there is no avatar")
+
+
+@dataclass(frozen=True)
 class RenderRecording:
     """Render the images that Blender has recorded, and encode them.
 
@@ -370,7 +401,7 @@ class Evaluate:
 
 Request = (
     Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderRecording | Export
-    | Analyze | TimePresets | Evaluate
+    | ConvertMotion | Analyze | TimePresets | Evaluate
 )  # fmt: skip
 
 

@@ -35,6 +35,7 @@ from stga_addon.report import preset_timing
 from stga_addon.requests.folder import write_request
 from stga_addon.requests.values import (
     Analyze,
+    ConvertMotion,
     Evaluate,
     Export,
     Extend,
@@ -203,6 +204,7 @@ def requests_about(case: Path) -> dict[str, Request]:
         Evaluate(run),
         Render(avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture),
         Export(avatar, case / "asked.stga", "web", capture, played=played),
+        ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
         Select(capture),
         TimePresets(capture),
     )

@@ -18,6 +18,7 @@ from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
+from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
 from stga_addon.perform import perform as performing
@@ -41,6 +42,7 @@ from stga_addon.requests.open_head import FOLDER
 from stga_addon.requests.results import Analyzed, Result, Selected, Written
 from stga_addon.requests.values import (
     Analyze,
+    ConvertMotion,
     Evaluate,
     Export,
     Extend,
@@ -106,6 +108,7 @@ REQUESTS: tuple[Request, ...] = (
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
     Evaluate(Path("r"), "test", capture=HEAD),
+    ConvertMotion(Path("take.csv"), Path("m.npz"), HEAD, options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None)),
 )
 RESULTS: tuple[Result, ...] = (
     Written(Path("a.npz"), ("PSNR 30 dB", "avatar: a.npz")),

@@ -45,7 +45,9 @@ class RayEngine:
             if address:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             else:
-                ray.init(num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+                ray.init(
+                    num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+                )
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
         self._ray = ray

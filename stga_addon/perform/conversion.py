@@ -1,0 +1,71 @@
+"""Conversion between motions of FLAME heads and performances in ARKit's 52 blend shapes."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.flame_capture import flame_model
+from ..capture.open import open_capture
+from ..driving.head_map import person_of
+from ..driving.inverse import captured_performance, write_performance
+from ..driving.open_motion import NEEDS_FLAME, performed, prepared_performance
+from ..driving.read_performance import is_performance, read_performance
+from ..errors import StgaError
+from ..export.playback import playback_fps
+from ..files import write_npz
+from ..flame.sequence import FRAME_FIELDS, FlameSequence
+from ..progress import Progress, Report, Say
+from ..requests.results import Written
+from ..requests.values import SHAPES_SUFFIX, ConvertMotion
+from .motion import findings
+
+
+def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
+    """Write the motion or the performance. Raises StgaError."""
+    report(Progress(stage="Converting"))
+    if not is_performance(request.source):
+        _write_shapes(request)
+        return Written(request.output)
+    performance = read_performance(request.source)
+    if request.writes_shapes:
+        write_performance(request.output, prepared_performance(performance, request.options, request.fps))
+        return Written(request.output)
+    motion = performed(performance, _person(request), str(request.flame), request.options, fps=request.fps)
+    write_motion(request.output, motion.sequence)
+    written = f"{request.output}: {len(motion.sequence.timesteps)} timesteps at {motion.fps:g} frames per second"
+    return Written(request.output, (*findings(motion), written))
+
+
+def _write_shapes(request: ConvertMotion) -> None:
+    """The CSV of a FLAME motion or capture."""
+    if not request.writes_shapes:
+        raise StgaError(
+            f"{request.source}: holds FLAME parameters already; --out takes a {SHAPES_SUFFIX} of ARKit's shapes"
+        )
+    if request.head is not None:
+        raise StgaError(f"--head: has no effect on {request.source}, which has its own identity")
+    capture = open_capture(request.source, request.flame)
+    if capture.flame is None:
+        raise StgaError(f"{request.source}: was not tracked with FLAME, so it has no parameters of expression and pose")
+    performance = captured_performance(capture.flame, str(request.source), playback_fps(capture, numbered=True))
+    write_performance(request.output, prepared_performance(performance, request.options, request.fps))
+
+
+def _person(request: ConvertMotion) -> FlameSequence:
+    """The head of --head, or the model's average one."""
+    if request.head is not None:
+        capture = open_capture(request.head, request.flame)
+        if capture.flame is None:
+            raise StgaError(f"{request.head}: was not tracked with FLAME, so it has no identity")
+        return capture.flame
+    if request.flame is None:
+        raise StgaError(f"{request.source}: {NEEDS_FLAME}; give it with --flame")
+    model = flame_model(request.flame)
+    return person_of(model, model.v_template)
+
+
+def write_motion(path: Path, sequence: FlameSequence) -> None:
+    """Write a sequence as FLAME parameters that `read_motion` takes."""
+    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    arrays = {name: np.stack([getattr(frame, name) for frame in frames]).astype(np.float32) for name in FRAME_FIELDS}
+    write_npz(path, {**arrays, "shape": sequence.shape, "timesteps": np.array(sequence.timesteps)}, compressed=True)
