@@ -494,6 +494,27 @@ def drive(rng: random.Random, case: Path) -> list[str]:
     return arguments + option(rng, 0.2, "--gain", "jaw=2", "x=1", "jaw=nan", *TEXTS)
 
 
+BATCH_PLANS = (
+    'out = "{new}"\n[job.a]\nrequest = "train"\ncapture = "mesh"\nsettings = {{ preset = "draft" }}\n'
+    'sweep = {{ "settings.seed" = [0, 1] }}\n[job.b]\nrequest = "evaluate"\nrun = "{{a}}"\nsplit = {value}\n',
+    'out = "{new}"\n[resources]\nthreads = {value}\n[job.a]\nrequest = "track"\nminutes = {value}\n',
+    "[job.a]\nrequest = {value}\ncases = [{{ name = {value} }}]\n",
+    "{value}",
+)
+
+
+def batch(rng: random.Random, case: Path) -> list[str]:
+    """Plans, and what a farm is given: jobs themselves are requests, which `perform` is tried with."""
+    value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"{b}"', '"../x"', '""', "true"])
+    new = some_path(rng, case, "new")
+    (case / "plan.toml").write_text(rng.choice(BATCH_PLANS).format(new=new, value=value), encoding="utf-8")
+    arguments = ["--dry-run"] if rng.random() < 0.7 else ["--emit", rng.choice(["openjd", "flamenco"])]
+    if rng.random() < 0.6:
+        return [str(case / "plan.toml"), *arguments, *option(rng, 0.3, "--threads", *NUMBERS)]
+    arguments += ["--iterations", rng.choice(["3", *NUMBERS]), *option(rng, 0.3, "--seed", *NUMBERS)]
+    return [some_path(rng, case, "mesh", "flame"), *arguments, *option(rng, 0.8, "--out", new)]
+
+
 def environment(rng: random.Random, case: Path) -> list[str]:
     action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
     return ["--folder", some_path(rng, case, "new"), *action]
@@ -512,6 +533,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "track": (1, track),
     "avatar": (0.5, avatar),
     "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{name}" for name in REQUESTS))]),
+    "batch": (1, batch),
     "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark),
     "demo": (0.2, demo),
