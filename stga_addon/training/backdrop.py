@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from ..capture.mesh_raster import silhouette
 from ..capture.model import Capture, View
@@ -66,6 +65,8 @@ def _around(where: np.ndarray, margin: int) -> tuple[slice, slice]:
 def _backdrop(image: np.ndarray, clear: np.ndarray, height: int) -> np.ndarray:
     """(H, W, 3) mean color of the pixels `clear` (H, W) bool around each pixel of an image (H, W, 3) float32; height:
     of the whole image."""
+    from scipy.ndimage import gaussian_filter
+
     total, weight = np.zeros_like(image), np.full((*clear.shape, 1), 1e-12, np.float32)
     shown = np.where(clear[..., None], image, 0)
     for share, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):

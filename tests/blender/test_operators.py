@@ -141,6 +141,8 @@ SET_BY_PANEL = {
         "start",
         "stop",
         "step",
+        "mattes",
+        "matte_folder",
     },
     "view_footage": set(),
     "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "adapter", "effects"},
