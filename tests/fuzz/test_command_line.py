@@ -213,7 +213,7 @@ def requests_about(case: Path) -> dict[str, Request]:
 
 @pytest.fixture(autouse=True)
 def _without_what_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_: 1e-5)
+    monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_, **__: 1e-5)
     monkeypatch.setattr("stga_addon.development.benchmark.benchmark.run_benchmark", lambda *_: "")
     monkeypatch.setattr("stga_addon.development.demo.command.run", lambda _: None)
 
