@@ -1,7 +1,7 @@
 """Compiles LLVM IR for processors, none of which has to be at hand.
 
-A process of its own, because LLVM ends the process that it finds an error in. Standard input: JSON of `ir` and `targets`, processor -> triple; output: processor -> assembly,
-null where this llvmlite was built without the triple.
+A process of its own, because LLVM ends the process that it finds an error in. Standard input: JSON of `ir` and
+`targets`, processor -> triple; output: processor -> assembly, null where this llvmlite was built without the triple.
 """
 
 import json
