@@ -310,7 +310,7 @@ def _request(where: str, kind: type[Any], values: Mapping[str, Any], base: Path,
         values[name] = _resolved(folder if name == output else base, values.get(name))
     if "settings" in specs:
         _set_training(where, values)
-    plain = {name: values[name] if values.get(name) is not None else _default(spec) for name, spec in specs.items()}
+    plain = {name: _completed(spec, values.get(name)) for name, spec in specs.items()}
     missing = next((name for name, value in plain.items() if value is MISSING), None)
     if missing is not None:
         raise StgaError(f"{where}: {missing}: is missing")
@@ -321,8 +321,13 @@ def _request(where: str, kind: type[Any], values: Mapping[str, Any], base: Path,
     return request
 
 
-def _default(spec: Any) -> Any:
-    """A field's default as JSON has it; MISSING without one."""
+def _completed(spec: Any, value: Any) -> Any:
+    """A field's value or default as JSON has it, MISSING without either; a table is completed by the defaults."""
+    if spec.default_factory is not MISSING:
+        default = to_json(spec.default_factory())
+        return default if value is None else {**default, **value} if isinstance(value, dict) else value
+    if value is not None:
+        return value
     return list(spec.default) if isinstance(spec.default, tuple) else spec.default
 
 

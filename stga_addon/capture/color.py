@@ -1,4 +1,4 @@
-"""Conversion of recorded colors to sRGB, by the code points of ITU-T H.273 (videos, PNG's cICP)."""
+"""sRGB and linear light, and conversion of recorded colors to sRGB by the codes of ITU-T H.273 (videos, PNG's cICP)."""
 
 from functools import lru_cache
 
@@ -43,23 +43,23 @@ def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
         light = table[pixels[start : start + step]]
         if transfer == HLG:
             light = _displayed(light)
-        found[start : start + step] = 255 * encode_srgb(np.clip(light @ matrix.T, 0, 1)) + 0.5
+        found[start : start + step] = 255 * linear_to_srgb(np.clip(light @ matrix.T, 0, 1)) + 0.5
     return found
 
 
-def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """sRGB's signal of linear light, both 0 to 1 (IEC 61966-2-1)."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
+    """sRGB to linear light, both 0…1 (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def decode_srgb(signal: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB's signal, both 0 to 1 (IEC 61966-2-1)."""
-    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear light to sRGB, both 0…1 (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def with_gamma(pixels: np.ndarray, gamma: float) -> np.ndarray:
     """uint8 pixels whose file says that they are light to the power of `gamma` (PNG's gAMA), as sRGB."""
-    levels = encode_srgb((np.arange(256) / 255) ** (1 / gamma))
+    levels = linear_to_srgb((np.arange(256) / 255) ** (1 / gamma))
     return np.asarray((255 * levels + 0.5).astype(np.uint8)[pixels])
 
 
@@ -79,7 +79,7 @@ def _linear(transfer: int, levels: int) -> np.ndarray:
     elif transfer in GAMMAS:
         light = signal ** GAMMAS[transfer]
     else:
-        light = decode_srgb(signal)
+        light = srgb_to_linear(signal)
     return np.asarray(light, np.float32)
 
 

@@ -10,6 +10,7 @@ from ..flame.forward import FlameFrame
 from ..flame.model import JOINTS, FlameModel
 from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
+from ..tracking.fit import similarity
 from ..tracking.posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
 from .correspondence import face_points
 from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
@@ -147,7 +148,8 @@ class _Fit:
         self.posed = PosedPoints(person, points)
         self.count = person.n_expression
         self.neutral = self.posed.positions(np.zeros(self.count), np.zeros(RIGID_SIZE))
-        self.targets = source.shapes[:, used] @ _similarity(source.points[used], self.neutral).T
+        placed = similarity(source.points[used], self.neutral)
+        self.targets = source.shapes[:, used] @ (placed.scale * placed.rotation).T
         self.ridge = RIDGE_M**2 * len(self.neutral)
         self.jaw = self._jaw()
 
@@ -207,14 +209,6 @@ def _combinations(pose: tuple[float, float, float], rng: np.random.Generator) ->
     weights[:, [COLUMN[name] for name in OPTIONAL]] = 0
     weights[:, [COLUMN[name] for name in JAW_SHAPES]] = pose
     return np.asarray(weights)
-
-
-def _similarity(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation times scale that best lays centered points (N, 3) over others (Umeyama 1991)."""
-    first, second = source - source.mean(axis=0), target - target.mean(axis=0)
-    left, values, right = np.linalg.svd(second.T @ first)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return np.asarray(left @ sign @ right * (values @ np.diag(sign)) / (first**2).sum())
 
 
 def _gaze() -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..avatar.splats import SH_C0, Splats
+from ..capture.color import srgb_to_linear
 from ..files import replacing
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -74,8 +75,7 @@ def _attributes(world: Splats) -> dict[str, np.ndarray]:
 def _fallback_color(base: np.ndarray, opacity: np.ndarray) -> np.ndarray:
     """(N, 4) uint8: linear red, green, blue of the degree-0 coefficients (N, 3), and the opacity (N,)."""
     color = np.clip(0.5 + SH_C0 * base, 0, 1)
-    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
-    return np.asarray(np.round(np.column_stack([linear, opacity]) * 255), np.uint8)
+    return np.asarray(np.round(np.column_stack([srgb_to_linear(color), opacity]) * 255), np.uint8)
 
 
 def _accessor(view: int, name: str, array: np.ndarray) -> dict[str, Any]:

@@ -6,8 +6,8 @@ import numpy as np
 
 from ..avatar.embedding import FaceFrames
 from ..avatar.splats import SH_C0, Splats
+from ..capture.color import linear_to_srgb
 from ..raster.posed_splats import PosedSplats
-from .display.colors import linear_to_srgb
 
 FROZEN_COLOR = (0.25, 0.25, 0.25, 1.0)  # linear; splats that the current frame does not train
 FROZEN_COLOR_SRGB = tuple(float(channel) for channel in linear_to_srgb(np.array(FROZEN_COLOR[:3])))

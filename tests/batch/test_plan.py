@@ -9,8 +9,9 @@ import pytest
 
 from stga_addon.batch.identity import _input_digest, job_digest
 from stga_addon.batch.plan import Plan, make_plan, plan_of_captures, read_plan
+from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.errors import StgaError
-from stga_addon.requests.values import Evaluate, Extend, Refine, Track, Train
+from stga_addon.requests.values import Evaluate, Export, Extend, Refine, Render, Track, Train
 from stga_addon.training.settings import make_settings
 
 PLAN = """
@@ -195,3 +196,32 @@ def test_a_run_counts_by_its_content(base: Path) -> None:
     assert changed(before, digests(make_plan(values, base, "plan"))) == set()
     (run / "avatar.npz").write_text("2")
     assert changed(before, digests(make_plan(values, base, "plan"))) == {"a"}
+
+
+def test_options_inside_a_request(tmp_path):
+    """Catches renderings and exports that a plan cannot ask for, because their options of a motion have no plain
+    default; and options that are left out counted as missing."""
+    text = """
+out = "runs"
+[job.film]
+request = "render"
+source = "a.npz"
+output = "film.mp4"
+video = true
+motion = "take.csv"
+motion_options = { neutral = "quiet" }
+[job.page]
+request = "export"
+source = "a.npz"
+output = "a.html"
+file_format = "web"
+"""
+    for name in ("a.npz", "take.csv"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    film, page = (job.request for job in read_plan(tmp_path / "plan.toml").jobs)
+    assert isinstance(film, Render)
+    assert film.motion_options == MotionOptions(neutral="quiet")
+    assert film.motion == tmp_path / "take.csv"
+    assert isinstance(page, Export)
+    assert page.motion_options == MotionOptions()

@@ -12,10 +12,10 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.avatar.embedding import WORLD  # noqa: E402
 from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
+from stga_addon.capture.color import linear_to_srgb, srgb_to_linear  # noqa: E402
 from stga_addon.raster.cpu.compose import compose  # noqa: E402
 from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.colors import linear_to_srgb, srgb_to_linear  # noqa: E402
 from stga_addon.scene.display.display_modes import ELLIPSOIDS, QUADS  # noqa: E402
 from stga_addon.scene.display.hints import use_transparent_bounces  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402

@@ -20,9 +20,9 @@ from PIL import Image
 
 from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.camera import Camera
+from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
-from stga_addon.scene.display.colors import linear_to_srgb, srgb_to_linear
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))

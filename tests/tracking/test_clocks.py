@@ -79,7 +79,7 @@ def test_recordings_that_share_nothing(tmp_path):
 
 
 def test_sound_that_is_asked_for_and_missing(tmp_path):
-    """Catches a traceback, or motion used instead without a word; a given offset comes before a found one."""
+    """Catches a traceback, motion used where sound was asked for, and a given offset that is replaced."""
     footage(tmp_path, (20, 33), silent="b")
     with pytest.raises(StgaError, match=r"b.mkv: has no sound; expected it for --sync sound"):
         open_footage(tmp_path, frames=FrameRange(sync="sound"))

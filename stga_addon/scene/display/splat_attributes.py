@@ -11,9 +11,9 @@ from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
+from ...capture.color import srgb_to_linear
 from .. import tags
 from ..arrays import flat_floats, read_values
-from .colors import srgb_to_linear
 
 # On the vertices of a splat object.
 XYZ = "stga_xyz"

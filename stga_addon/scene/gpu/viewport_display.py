@@ -13,11 +13,11 @@ import gpu
 import numpy as np
 from bpy.app.handlers import persistent
 
+from ...capture.color import linear_to_srgb
 from ...errors import StgaError
 from .. import tags
 from ..compat import world_nodes
 from ..display import splat_nodes
-from ..display.colors import linear_to_srgb
 from ..display.display_modes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
 from ..render.camera import viewport_camera

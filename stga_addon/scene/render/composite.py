@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..display.colors import linear_to_srgb, srgb_to_linear
+from ...capture.color import linear_to_srgb, srgb_to_linear
 from ..gpu.viewport_display import world_color
 from .view_transform import InverseView
 
