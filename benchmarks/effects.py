@@ -30,7 +30,7 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.development.benchmark.statistics import Spread, spread_of
-from stga_addon.training.effects.catalog import EFFECT_NAMES, EFFECTS
+from stga_addon.training.effects.catalog import EFFECTS
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.rules import RULES
@@ -108,7 +108,7 @@ def captures(root: Path, folder: Path, names: Sequence[str]) -> dict[str, Path]:
 def possible(capture: Capture, iterations: int) -> list[str]:
     """The effects that can be on."""
     facts = CaptureFacts(capture, make_settings(iterations=iterations))
-    looked = {effect.name: RULES[effect.name](facts) for effect in EFFECTS if effect.name not in LEFT_TO_AUTO}
+    looked = {effect.name: RULES[effect.name](facts) for effect in EFFECTS.values() if effect.name not in LEFT_TO_AUTO}
     return [name for name, verdict in looked.items() if verdict is not None and (verdict.on or not verdict.only)]
 
 
@@ -163,7 +163,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=(*DIFFERING, "uneven"))
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--each", action="store_true")
-    what.add_argument("--switch", nargs="+", choices=EFFECT_NAMES, metavar="EFFECT")
+    what.add_argument("--switch", nargs="+", choices=tuple(EFFECTS), metavar="EFFECT")
     options = parser.parse_args()
     table = each if options.each else switch if options.switch else auto_and_all
     names = options.only or (DIFFERING if table is auto_and_all else ("full",))
@@ -212,7 +212,8 @@ def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
 
 def changes(effect: str) -> bool:
     """Whether the effect changes training; those of Blender's rig do not."""
-    return next(known for known in EFFECTS if known.name == effect).off != {} or effect == "exposure"
+    known = EFFECTS[effect]
+    return known.off != {} or known.offset is not None or effect == "exposure"
 
 
 def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:

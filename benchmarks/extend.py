@@ -162,8 +162,8 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
     parent = read_run(continuation.parent).settings
-    before = {"strain_color": parent.strain_color, "strain_position": parent.strain_position}
-    now = {"strain_color": settings.strain_color, "strain_position": settings.strain_position}
+    before = {"strain_color": parent.strain_color, "driven_offsets": parent.driven_offsets}
+    now = {"strain_color": settings.strain_color, "driven_offsets": settings.driven_offsets}
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]

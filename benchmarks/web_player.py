@@ -87,7 +87,7 @@ MEASURE = """(async (repeats) => {
   const block = new Float32Array(1 << 21);
   const copy = new Float32Array(1 << 21);
   const bytes = (...arrays) => arrays.reduce((sum, array) => sum + array.byteLength, 0);
-  const { nearby, strain } = faceFrames;
+  const { strain, offsets: [{ signal: smoothed, components, coefficients }] } = faceFrames;
   const still = faceFrames.world.slice(); // moved again and again, triangles would leave the head
   const frame = () => {
     moment = (moment + 0.37) % (motion.frames - 1);
@@ -100,10 +100,13 @@ MEASURE = """(async (repeats) => {
       bytes(rig.vertices, faceFrames.faces, faceFrames.world)],
     ['strain', computed(() => strain.update(rig.vertices)),
       bytes(rig.vertices, strain.faces, strain.gram, strain.toTensor, strain.toPlane, strain.atVertex, strain.values)],
-    ['nearby strain', computed(() => nearby.update()),
-      bytes(strain.values, nearby.rest, ...Array(3).fill([nearby.values, nearby.edges, nearby.edgeSum]).flat())],
-    ['positions that follow strain', computed(() => (faceFrames.world.set(still), faceFrames.moveOrigins())),
-      bytes(faceFrames.world, still, faceFrames.strainPosition, nearby.values)],
+    ['smoothed strain', computed(() => smoothed.update()),
+      bytes(strain.values, smoothed.rest,
+        ...Array(3).fill([smoothed.values, smoothed.edges, smoothed.edgeSum]).flat())],
+    ['driven offsets', computed(() => {
+      faceFrames.world.set(still);
+      faceFrames.moveOrigins(smoothed.values, components, coefficients);
+    }), bytes(faceFrames.world, still, coefficients, smoothed.values)],
     ['in camera space', computed(() => (faceFrames.compose(camera.matrix, values), faceFrames.annotate(null, values))),
       bytes(faceFrames.world, strain.values, values)],
     ['sort', computed(() => depthSort.sort(values)),
@@ -165,7 +168,9 @@ def head_page(count: int) -> str:
         strain_color=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
     )
     moves = rng.normal(0, 1e-3, (len(faces), 3, 3)).astype(np.float32)
-    avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces, antialiased=True, strain_position=moves)
+    avatar = Avatar(
+        splats, "stga", vertices.astype(np.float32), faces, antialiased=True, driven_offsets={"strain_position": moves}
+    )
     views = {"Front": look_at((0, 0, 1), (0, 0, 0), *WINDOW_PX, 2000.0)}
     return page("Benchmark", "", data_file(avatar, head_rig(vertices), Playback(views=views)))
 

@@ -7,14 +7,11 @@ from threading import Thread
 from typing import Any
 
 from ..stga_addon.export.formats import Meshes
+from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.timeline import iterate_frames
 
 MAX_WAITING_MESHES = 2
-
-
-class _Cancelled(Exception):
-    """Ends the writing thread, which removes its unfinished file."""
 
 
 class RangeExport:
@@ -49,9 +46,9 @@ class RangeExport:
             with suppress(Empty):
                 while True:
                     self._queue.get_nowait()
-            self._queue.put(_Cancelled())
+            self._queue.put(Cancelled())
         self._thread.join()
-        if self._error is not None and not isinstance(self._error, _Cancelled):
+        if self._error is not None and not isinstance(self._error, Cancelled):
             raise self._error
         return self._error is None
 
@@ -63,6 +60,6 @@ class RangeExport:
 
     def _meshes(self) -> Meshes:
         while (item := self._queue.get()) is not None:
-            if isinstance(item, _Cancelled):
+            if isinstance(item, Cancelled):
                 raise item
             yield item

@@ -94,11 +94,6 @@ def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
     return replace(frames, origin=frames.origin + moved)
 
 
-def strain_offset(strain_position: np.ndarray, smoothed: np.ndarray) -> np.ndarray:
-    """(F, 3) for `shifted_frames`: strain_position (F, 3 components, 3 axes) times `smoothed_strain` (F, 3)."""
-    return np.asarray(np.einsum("fk,fkc->fc", smoothed, strain_position))
-
-
 def frame_backward(
     vertices: np.ndarray,
     faces: np.ndarray,

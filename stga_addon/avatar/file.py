@@ -12,13 +12,14 @@ import numpy as np
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
-from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames, shifted_frames, strain_offset
-from .splats import MAX_SH_DEGREE, Splats
-from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain, strain_basis
+from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
+from .offsets.offset import moved_frames
+from .offsets.table import OFFSETS
+from .splats import ADDED, ARRAYS, Splats
+from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 
 FORMAT = "stga-avatar"
 VERSION = 2
-SH_SIZES = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class Avatar:
     principal_point  convention of the capture that it was trained on (`read_transforms`)
     strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and positions follow
                 (`avatar.strain`); None: the same for all, ±MAX_STRAIN
-    strain_position  (F, 3, 3) float32 how far a triangle's splats move with its `smoothed_strain`: for each component
-                a vector in the triangle's frame; None where positions follow the mesh alone
+    driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of that name in
+                `offsets.table`, for each of its S components a vector in the triangle's frame
     """
 
     splats: Splats
@@ -50,20 +51,21 @@ class Avatar:
     antialiased: bool = False
     principal_point: str = DEFAULT_PRINCIPAL_POINT
     strain_range: np.ndarray | None = None
-    strain_position: np.ndarray | None = None
+    driven_offsets: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def follows_strain(self) -> bool:
         """Whether colors or positions depend on the strain of the mesh."""
-        return self.splats.strain_color.shape[1] > 0 or self.strain_position is not None
+        return self.splats.strain_color.shape[1] > 0 or bool(self.driven_offsets)
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
-        """The triangles' local frames on a posed mesh (V, 3), with strain, and moved by it, where splats follow it."""
+        """The triangles' local frames on a posed mesh (V, 3), with strain where splats follow it, and moved by the
+        driven offsets."""
         basis = self._strain
         frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
-        if self.strain_position is None or basis is None:
+        if basis is None:
             return frames
-        return shifted_frames(frames, strain_offset(self.strain_position, smoothed_strain(basis, frames.strain)))
+        return moved_frames(frames, self.driven_offsets, lambda name: OFFSETS[name].signal(basis, frames))
 
     @cached_property
     def _areas(self) -> np.ndarray:
@@ -90,12 +92,12 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
         "regions": list(avatar.regions),
         "settings": dict(avatar.settings),
     }
-    arrays = {name: getattr(avatar.splats, name) for name in _SPLAT_FIELDS}
+    arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
     arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
     arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
-    for name in _STRAIN_FIELDS:
-        if getattr(avatar, name) is not None:
-            arrays[name] = getattr(avatar, name)
+    if avatar.strain_range is not None:
+        arrays["strain_range"] = avatar.strain_range
+    arrays.update(avatar.driven_offsets)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -104,15 +106,15 @@ def read_avatar(path: Path) -> Avatar:
     """Read an avatar file. Raises StgaError naming the file and the field that is missing or malformed."""
     arrays = read_npz(path)
     header = _read_header(path, arrays)
-    needed = (*_SPLAT_FIELDS, "neutral", "faces", "region_faces")
-    missing = [name for name in needed if name not in arrays and name != "strain_color"]
+    needed = (*(name for name in ARRAYS if name not in ADDED), "neutral", "faces", "region_faces")
+    missing = [name for name in needed if name not in arrays]
     if missing:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
     names, masks = header["regions"], arrays["region_faces"]
     if masks.ndim != 2 or len(masks) != len(names):
         raise StgaError(f"{path}: region_faces has shape {masks.shape}, expected ({len(names)}, faces)")
     avatar = Avatar(
-        splats=Splats(**{name: arrays[name] for name in _SPLAT_FIELDS if name in arrays}),
+        splats=Splats(**{name: arrays[name] for name in ARRAYS if name in arrays}),
         convention=header["convention"],
         neutral=arrays["neutral"],
         faces=arrays["faces"],
@@ -121,25 +123,11 @@ def read_avatar(path: Path) -> Avatar:
         background=tuple(header["background"]),
         antialiased=header["antialiased"],
         principal_point=header["principal_point"],
-        **{name: arrays.get(name) for name in _STRAIN_FIELDS},
+        strain_range=arrays.get("strain_range"),
+        driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
     )
     _check(path, avatar)
     return avatar
-
-
-# field -> dtype and the shape after the number of splats
-_SPLAT_FIELDS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "xyz": ("float32", (3,)),
-    "rotation": ("float32", (4,)),
-    "log_scale": ("float32", (3,)),
-    "opacity": ("float32", ()),
-    "sh": ("float32", (-1, 3)),
-    "face": ("int32", ()),
-    "unbound": ("bool", ()),
-    "strain_color": ("float32", (-1, 3)),
-}
-_STRAIN_FIELDS = {"strain_range": (2, STRAIN_COMPONENTS), "strain_position": (STRAIN_COMPONENTS, 3)}
-"""Arrays by triangle that an avatar may lack: the shape after the number of triangles."""
 
 
 def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -183,16 +171,15 @@ def _check(path: Path, avatar: Avatar) -> None:
     _check_array(path, "faces", avatar.faces, "int32", (-1, 3))
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
     count = len(avatar.splats.xyz) if avatar.splats.xyz.ndim else 0
-    for name, (dtype, tail) in _SPLAT_FIELDS.items():
-        _check_array(path, name, getattr(avatar.splats, name), dtype, (count, *tail))
-    if avatar.splats.sh.shape[1] not in SH_SIZES:
-        raise StgaError(f"{path}: sh has {avatar.splats.sh.shape[1]} coefficients, expected one of {SH_SIZES}")
-    if avatar.splats.strain_color.shape[1] not in (0, STRAIN_COMPONENTS):
-        size = avatar.splats.strain_color.shape[1]
-        raise StgaError(f"{path}: strain_color has {size} coefficients, expected 0 or {STRAIN_COMPONENTS}")
-    for name, tail in _STRAIN_FIELDS.items():
-        if getattr(avatar, name) is not None:
-            _check_array(path, name, getattr(avatar, name), "float32", (len(avatar.faces), *tail))
+    for name, kind in ARRAYS.items():
+        array = getattr(avatar.splats, name)
+        _check_array(path, name, array, kind.dtype, (count, *kind.shape))
+        if kind.sizes and array.shape[1] not in kind.sizes:
+            raise StgaError(f"{path}: {name} has {array.shape[1]} coefficients, expected one of {kind.sizes}")
+    if avatar.strain_range is not None:
+        _check_array(path, "strain_range", avatar.strain_range, "float32", (len(avatar.faces), 2, STRAIN_COMPONENTS))
+    for name, coefficients in avatar.driven_offsets.items():
+        _check_array(path, name, coefficients, "float32", (len(avatar.faces), OFFSETS[name].signals, 3))
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))

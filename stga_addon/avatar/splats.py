@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..flame.quaternions import normalized
+from .strain import STRAIN_COMPONENTS
 
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
@@ -63,6 +64,35 @@ class Splats:
     def rows(self, index: np.ndarray) -> "Splats":
         """The splats at `index` (a boolean mask or integer array)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class SplatArray:
+    """A row of ARRAYS: type of a field of `Splats`, and its shape after N; sizes: those allowed where that has −1."""
+
+    dtype: str = "float32"
+    shape: tuple[int, ...] = ()
+    sizes: tuple[int, ...] = ()
+
+    def shape_at(self, size: int) -> tuple[int, ...]:
+        """The shape after N where −1 stands for `size`."""
+        return tuple(size if axis < 0 else axis for axis in self.shape)
+
+
+ARRAYS = {
+    "xyz": SplatArray(shape=(3,)),
+    "rotation": SplatArray(shape=(4,)),
+    "log_scale": SplatArray(shape=(3,)),
+    "opacity": SplatArray(),
+    "sh": SplatArray(shape=(-1, 3), sizes=tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))),
+    "face": SplatArray("int32"),
+    "unbound": SplatArray("bool"),
+    "strain_color": SplatArray(shape=(-1, 3), sizes=(0, STRAIN_COMPONENTS)),
+}
+"""The fields of `Splats`, by which files and checkpoints are read."""
+ADDED = {name: max(array.sizes) for name, array in ARRAYS.items() if 0 in array.sizes}
+"""Arrays that an effect adds, which have no coefficients without it -> how many with it. A field of the same name
+switches them in `TrainingSettings`, and one in `Rates` trains them."""
 
 
 def no_strain_color(count: int) -> np.ndarray:

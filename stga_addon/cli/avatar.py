@@ -156,7 +156,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     capture, avatar = open_capture(out / CAPTURE, flame), read_avatar(out / RUN / AVATAR)
     empty_file()
     head = set_up_head(refine(capture), flame)
-    show_on_head(avatar, head, f"//{RUN}/avatar.npz", playback_fps(capture, numbered=True))
+    show_on_head(avatar, head, f"//{RUN}/{AVATAR}", playback_fps(capture, numbered=True))
     finish(head)
     save_file(out / BLEND)
     return Path(out / BLEND)

@@ -44,8 +44,7 @@ def sh_degree(settings: TrainingSettings, progress: float) -> int:
 
 def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
     """Exponential decay from the initial rates to their ends."""
-    names = ("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest", "strain_color")
-    initial = {name: getattr(rates, name) for name in names}
+    initial = {name: rate for name, rate in vars(rates).items() if name not in ("position_end", "end")}
     ends = {name: rates.position_end if name == "xyz" else rates.end for name in initial}
     return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}
 

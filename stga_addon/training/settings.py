@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..avatar.embedding import CONVENTIONS
-from ..avatar.splats import MAX_SH_DEGREE
+from ..avatar.offsets.table import OFFSETS
+from ..avatar.splats import ADDED, MAX_SH_DEGREE
 from ..errors import StgaError
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
 from .backdrop import BACKDROPS
-from .effects.catalog import EFFECT_NAMES
+from .effects.catalog import EFFECTS
 from .effects.decisions import CHOICES
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
@@ -91,7 +92,7 @@ class TrainingSettings:
     stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
-    strain_position  splats move with the strain around their triangle (`avatar.strain.smoothed_strain`)
+    driven_offsets  names of `avatar.offsets.table`: splats move with signals of the pose
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
@@ -141,12 +142,22 @@ class TrainingSettings:
     stop_when_flat: bool = False
     preset: str | None = None
     strain_color: bool = False
-    strain_position: bool = False
+    driven_offsets: tuple[str, ...] = ()
     antialiased: bool = False
     teeth: bool = True
     exposure: tuple[tuple[float, ...], ...] = ()
     tracking: bool = False
     effects: Mapping[str, str] | None = None
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """The arrays that effects add to splats (`avatar.splats.ADDED`)."""
+        return tuple(name for name in ADDED if getattr(self, name))
+
+    @property
+    def follows_strain(self) -> bool:
+        """Whether colors or positions depend on the strain of the mesh."""
+        return self.strain_color or bool(self.driven_offsets)
 
     def check(self) -> None:
         """Raise StgaError for settings at odds with each other, and for rows and names that types do not tell."""
@@ -158,8 +169,10 @@ class TrainingSettings:
             if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
                 expected = "rows of a camera index, three gains above 0, three offsets"
                 raise StgaError(complaint("exposure", expected, row))
+        if not set(self.driven_offsets) <= set(OFFSETS):
+            raise StgaError(complaint("driven_offsets", f"names among {', '.join(OFFSETS)}", self.driven_offsets))
         effects = self.effects or {}
-        if not (set(effects) <= set(EFFECT_NAMES) and set(effects.values()) <= set(CHOICES)):
+        if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
             raise StgaError(complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects)))
         if effects and (self.schedule == "paper" or self.strategy == "gaussian-avatars"):
             other = "--schedule paper" if self.schedule == "paper" else "--strategy gaussian-avatars"

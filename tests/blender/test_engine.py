@@ -382,13 +382,13 @@ def test_strain_and_antialiasing_are_rendered(tmp_path):
     colors = rng.normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
     positions = rng.normal(0, 0.004, (len(avatar.faces), 3, 3)).astype(np.float32)
     splats = replace(avatar.splats, strain_color=colors)
-    avatar = replace(avatar, splats=splats, strain_position=positions, antialiased=True)
+    avatar = replace(avatar, splats=splats, driven_offsets={"strain_position": positions}, antialiased=True)
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
     expected = render_avatar(avatar, evaluated_vertices(head), camera, (1.0,) * 3)
     for lost in (
         replace(avatar, splats=replace(splats, strain_color=None)),
-        replace(avatar, strain_position=None),
+        replace(avatar, driven_offsets={}),
         replace(avatar, antialiased=False),
     ):
         assert (
@@ -401,12 +401,12 @@ def test_positions_alone_follow_strain(tmp_path):
     """Catches strain that is left out, or colors that are read where there are none, without strain colors."""
     avatar = textured(avatar_of("gaussian_avatars"))
     positions = np.random.default_rng(5).normal(0, 0.4, (len(avatar.faces), 3, 3)).astype(np.float32)
-    avatar = replace(avatar, strain_position=positions)
+    avatar = replace(avatar, driven_offsets={"strain_position": positions})
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
     expected, unmoved = (
         render_avatar(a, evaluated_vertices(head), camera, (1.0,) * 3)
-        for a in (avatar, replace(avatar, strain_position=None))
+        for a in (avatar, replace(avatar, driven_offsets={}))
     )
     assert np.abs(expected - unmoved).max() > 0.05
     assert np.abs(displayed(render(tmp_path), 1.0) - expected).max() < TOLERANCE

@@ -51,9 +51,10 @@ def avatar(degree: int, strain: bool = False) -> Avatar:
     return Avatar(splats, "stga", vertices.astype(np.float32), faces)
 
 
-def with_strain_position(of: Avatar) -> Avatar:
+def with_offset(of: Avatar) -> Avatar:
     shape = (len(of.faces), 3, 3)
-    return replace(of, strain_position=np.random.default_rng(9).normal(0, 5e-3, shape).astype(np.float32))
+    values = np.random.default_rng(9).normal(0, 5e-3, shape).astype(np.float32)
+    return replace(of, driven_offsets={"strain_position": values})
 
 
 def layer(of: Avatar, pose: np.ndarray | None = None, antialiased: bool = False, **more: Any) -> SceneLayer:
@@ -77,7 +78,7 @@ def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
         "sh 0": ([layer(avatar(0))], near),
         "sh 3": ([layer(avatar(3))], near),
         "sh 1, strain": ([layer(avatar(1, strain=True))], near),
-        "strain position": ([layer(with_strain_position(avatar(1)))], near),
+        "strain position": ([layer(with_offset(avatar(1)))], near),
         "antialiased": ([layer(avatar(0), antialiased=True)], near),
         "rotated and scaled": ([layer(avatar(3), TURNED)], near),
         "orthographic": ([layer(avatar(3))], far),

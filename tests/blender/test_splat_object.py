@@ -1,6 +1,7 @@
 """Splat objects against the numpy embedding, on a head that shape keys animate."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -289,7 +290,7 @@ def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Av
         neutral=neutral.astype(np.float32),
         faces=faces,
         strain_range=ends.astype(np.float32),
-        strain_position=rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32),
+        driven_offsets={"strain_position": rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32)},
     )
 
 
@@ -310,7 +311,7 @@ def test_positions_follow_strain(convention, strain_color, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     shown, head = bpy.data.objects[shown_name(convention)], bpy.data.objects["head"]
     set_input(shown, splat_nodes.DISPLAY, POINTS)
-    unmoved = replace(avatar, strain_position=None)
+    unmoved = replace(avatar, driven_offsets={})
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
         frames, plain = (each.frames(evaluated_vertices(head)) for each in (avatar, unmoved))
@@ -330,12 +331,12 @@ def test_an_avatar_that_follows_strain_is_read_back(convention):
     avatar = following_positions(convention)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     stored = stored_avatar(shown)
-    np.testing.assert_array_equal(stored.strain_position, avatar.strain_position)
+    np.testing.assert_array_equal(stored.driven_offsets["strain_position"], avatar.driven_offsets["strain_position"])
     np.testing.assert_array_equal(stored.strain_range, avatar.strain_range)
     posed = evaluated_vertices(bpy.data.objects["head"])
     np.testing.assert_array_equal(stored.frames(posed).origin, avatar.frames(posed).origin)
-    other = show_avatar(replace(avatar, strain_position=None), bpy.data.objects["head"])
-    assert stored_avatar(other).strain_position is None
+    other = show_avatar(replace(avatar, driven_offsets={}), bpy.data.objects["head"])
+    assert not stored_avatar(other).driven_offsets
 
 
 def test_updated_splats_follow_strain_anew():
@@ -349,8 +350,10 @@ def test_updated_splats_follow_strain_anew():
     assert can_update(shown, second)
     update_splats(shown, avatar_attributes(second))
     assert_follows(shown, head, second)
-    np.testing.assert_array_equal(stored_avatar(shown).strain_position, second.strain_position)
-    assert not can_update(shown, replace(second, strain_position=None))
+    np.testing.assert_array_equal(
+        stored_avatar(shown).driven_offsets["strain_position"], second.driven_offsets["strain_position"]
+    )
+    assert not can_update(shown, replace(second, driven_offsets={}))
     colors = np.zeros((len(second.splats), 3, 3), np.float32)
     assert not can_update(shown, replace(second, splats=replace(second.splats, strain_color=colors)))
     set_input(shown, splat_nodes.NEUTRAL, None)
@@ -363,7 +366,7 @@ def test_names_of_trees_are_told_apart():
         splat_nodes.TreeOptions(convention, degree, *strain)
         for convention in (*CONVENTIONS, None)
         for degree in range(4)
-        for strain in ((False, False), (True, False), (False, True), (True, True))
+        for strain in product((False, True), ((), ("strain_position",)))
         if convention or not any(strain)
     ]
     trees = {kind: splat_nodes.splat_tree(kind) for kind in kinds}
@@ -509,8 +512,8 @@ def test_trees_and_materials_are_built_once(tmp_path: Path):
         ("stga", 3, True),
         ("gaussian_avatars", 2, False),
         (None, 0, False),
-        ("stga", 0, False, True),
-        ("gaussian_avatars", 3, True, True),
+        ("stga", 0, False, ("strain_position",)),
+        ("gaussian_avatars", 3, True, ("strain_position",)),
     ],
 )
 def test_trees_are_built_one_node_group_at_a_time(kind):

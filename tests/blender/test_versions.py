@@ -62,7 +62,9 @@ def test_the_whole_workflow(version: str, zip_file: Path, tmp_path: Path) -> Non
     rng = np.random.default_rng(2)
     splats = lattice_splats(capture.neutral, faces, order=0)
     positions = rng.normal(0, 0.003, (len(faces), 3, 3)).astype(np.float32)
-    avatar = Avatar(splats, "stga", capture.neutral.astype(np.float32), faces, strain_position=positions)
+    avatar = Avatar(
+        splats, "stga", capture.neutral.astype(np.float32), faces, driven_offsets={"strain_position": positions}
+    )
     write_avatar(tmp_path / "a.npz", avatar)
     other = {"expr": rng.normal(size=(5, 2)), "pose": rng.normal(0, 0.3, (5, 15)), "shape": np.ones(4)}
     np.savez(tmp_path / "other.npz", **other)

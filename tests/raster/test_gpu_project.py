@@ -237,7 +237,7 @@ def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str
     step = Embedding(device, neutral, faces, convention, basis)
     step.upload(posed, camera)
     with device.record() as work:
-        table = step.compose(work)
+        table = step.compose(work, {})
     frames = device.read(table, (len(faces), 12 + STRAIN_COMPONENTS))
     np.testing.assert_allclose(frames[:, :3], expected.origin, atol=FRAME_TOLERANCE)
     # The area of what is a line in float32, whose root is the scale, has hardly any digits.
@@ -258,7 +258,7 @@ def test_without_strain_there_is_none(device: Device) -> None:
     step = Embedding(device, neutral, faces, "stga")
     step.upload(posed, camera)
     with device.record() as work:
-        table = step.compose(work)
+        table = step.compose(work, {})
     expected = frames_in_camera(face_frames(posed, faces, neutral), camera)
     frames = device.read(table, (len(faces), 12))
     np.testing.assert_allclose(frames[:, :3], expected.origin, atol=FRAME_TOLERANCE)
@@ -277,16 +277,23 @@ def test_frames_moved_by_strain_are_the_avatars(device: Device, convention: str)
     coefficients = rng.normal(0, 0.01 / unit, (len(faces), STRAIN_COMPONENTS, 3)).astype(np.float32)
     bare = {name: np.zeros((0, *shape), np.float32) for name, shape in SHAPES.items()}
     splats = Splats(**bare, face=np.zeros(0, np.int32), unbound=np.zeros(0, bool))
-    avatar = Avatar(splats, convention, neutral, faces, strain_range=range_of_strain, strain_position=coefficients)
+    avatar = Avatar(
+        splats,
+        convention,
+        neutral,
+        faces,
+        strain_range=range_of_strain,
+        driven_offsets={"strain_position": coefficients},
+    )
     camera = SCENES["plain"].camera
     basis = strain_basis(neutral, faces, range_of_strain)
     still = frames_in_camera(face_frames(posed, faces, neutral, convention, basis), camera)
     expected = frames_in_camera(avatar.frames(posed), camera)
     assert (np.abs(expected.origin - still.origin).max(axis=1) > 100 * FRAME_TOLERANCE).mean() > 0.9
-    step = Embedding(device, neutral, faces, convention, basis)
+    step = Embedding(device, neutral, faces, convention, basis, ["strain_position"])
     step.upload(posed, camera)
     for moved, want in ((coefficients, expected), (None, still)):
-        uploaded = None if moved is None else device.upload("test coefficients", moved)
+        uploaded = {} if moved is None else {"strain_position": device.upload("test coefficients", moved)}
         with device.record() as work:
             table = step.compose(work, uploaded)
         frames = device.read(table, (len(faces), 12 + STRAIN_COMPONENTS))

@@ -21,7 +21,7 @@ from render.test_compose import CAMERA, scene
 from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
 from training.test_gpu_backend import batch_of
-from training.test_gpu_strain_position import position_settings, state_of
+from training.test_gpu_driven_offsets import position_settings, state_of
 from stga_addon.training.optimize.backends import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.losses import limit_units

@@ -171,15 +171,17 @@ def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Pa
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
     train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
     prepared = prepare_extension(tmp_path / "run", (takes[1],), iterations=6)
-    run = replace(prepared.run, settings=replace(prepared.run.settings, strain_color=True, strain_position=True))
+    run = replace(
+        prepared.run, settings=replace(prepared.run.settings, strain_color=True, driven_offsets=("strain_position",))
+    )
     train(prepared.capture, tmp_path / "new", run, prepared.selection)
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
     assert first["psnr_take_1"] == pytest.approx(before["psnr"], abs=0.01)
     avatar = read_avatar(tmp_path / "new" / "avatar.npz")
     assert avatar.splats.strain_color.shape[1:] == (3, 3)
     assert avatar.splats.strain_color.any()
-    assert avatar.strain_position is not None
-    assert avatar.strain_position.any()
+    assert avatar.driven_offsets["strain_position"] is not None
+    assert avatar.driven_offsets["strain_position"].any()
     assert avatar.strain_range is not None
     assert (avatar.strain_range[:, 0] > COLOR_RANGE[0]).all()  # what the takes show, not any strain
 
@@ -251,11 +253,11 @@ def benchmark() -> Any:
 def test_the_benchmark_compares_equal_effects(takes: tuple[Path, Path], parent: Path) -> None:
     """Catches an extension that wins because training anew goes without an effect that began with the take."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
-    settings = replace(prepared.run.settings, strain_color=True, strain_position=True)
+    settings = replace(prepared.run.settings, strain_color=True, driven_offsets=("strain_position",))
     arms = benchmark().extend_arms(replace(prepared, run=replace(prepared.run, settings=settings)), 0)
-    assert (arms["anew"].settings.strain_color, arms["anew"].settings.strain_position) == (True, True)
+    assert (arms["anew"].settings.strain_color, arms["anew"].settings.driven_offsets) == (True, ("strain_position",))
     plain = arms["all-in-turn-plain"].settings
-    assert (plain.strain_color, plain.strain_position) == (True, False)  # as the parent
+    assert (plain.strain_color, plain.driven_offsets) == (True, ())  # as the parent
 
 
 def test_the_benchmark_shows_what_the_old_take_pays() -> None:

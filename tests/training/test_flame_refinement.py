@@ -228,7 +228,7 @@ def run_folder(lost: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_run(capture: Capture, **changes: Any) -> Run:
-    ours = {"iterations": 40, "lattice": 1, "tracking": True, "strain_position": True}
+    ours = {"iterations": 40, "lattice": 1, "tracking": True, "driven_offsets": ("strain_position",)}
     settings = quick_settings("global", **{**ours, **changes})
     return Run(capture.root, capture.root / "model.npz", "vhap", settings)
 
@@ -245,7 +245,7 @@ def test_stopped_and_resumed_is_the_unbroken_run(lost: Made, run_folder: Path, t
     for name, array in vars(theirs.tracking).items():
         np.testing.assert_array_equal(getattr(ours.tracking, name), array, err_msg=name)
     np.testing.assert_array_equal(ours.state.parameters.xyz, theirs.state.parameters.xyz)
-    moved, expected = (checkpoint.state.strain_position for checkpoint in (ours, theirs))
+    moved, expected = (checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs))
     assert moved is not None
     assert expected is not None
     assert np.abs(expected.value).max() > 0

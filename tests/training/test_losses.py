@@ -7,7 +7,7 @@ import torch
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
 from stga_addon.raster.cpu.layout import TILE
 from stga_addon.raster.reference import image_loss
-from stga_addon.training.optimize.losses import image_gradient, similarity, tile_rectangles, whole_image
+from stga_addon.training.optimize.losses import image_gradient, mean_ssim, tile_rectangles, whole_image
 
 # float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.
 TOLERANCE = 5e-4
@@ -49,7 +49,7 @@ def test_gradient_and_values(height: int, width: int, weight: float) -> None:
     assert_same_gradient(out, expected)
     assert l1 == pytest.approx(float(absolute.mean()), rel=1e-5)
     assert ssim == pytest.approx(float(similar.mean()), abs=1e-4)
-    assert similarity(image, target) == pytest.approx(ssim, abs=1e-7)
+    assert mean_ssim(image, target) == pytest.approx(ssim, abs=1e-7)
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])

@@ -29,8 +29,10 @@ SH_STEP = 0.005
 STRAIN_COLOR_STEP = 0.008
 STRAIN_RANGE_STEP = 0.002
 """Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a unit err by 2 µm."""
-STRAIN_POSITION_STEP_M = POSITION_STEP_M / 16
-"""Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
+OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
+"""Driven offset that the player has a signal for (`player/signals.js`) -> step of its coefficients.
+
+Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
 along an axis at most, where half of POSITION_STEP_M is 2 µm."""
 VERTEX_STEP_M = 2.0**-24
 """Of base and neutral mesh: so fine that no thin triangle becomes a line, or the reverse."""
@@ -44,12 +46,12 @@ MIN_SLIDER_RANGE, SLIDER_HEADROOM = 1.0, 1.5
 def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = False) -> bytes:
     """The data file of an avatar that `rig` moves; `exact`: float32 instead of fixed point.
 
-    Raises ValueError where a value is not finite.
+    Raises ValueError where a value is not finite, or a driven offset is not in OFFSET_STEPS_M.
     """
     order = np.argsort(avatar.splats.face, kind="stable")
     splats = avatar.splats.rows(order)
     unit = _local_unit(avatar)
-    arrays = _splat_arrays(splats, unit) | _strain_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
+    arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
     arrays |= _rig_arrays(rig)
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
@@ -124,15 +126,16 @@ def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return largest.astype(np.uint8), np.take_along_axis(q, others, 1)
 
 
-def _strain_arrays(avatar: Avatar, local_unit: float) -> Arrays:
-    """What the triangles hold for colors and positions that follow strain."""
+def _driven_arrays(avatar: Avatar, local_unit: float) -> Arrays:
+    """What the triangles hold for colors and positions that follow the pose."""
     arrays: Arrays = {}
     rows = (len(avatar.faces), -1)
     if avatar.follows_strain and avatar.strain_range is not None:
         arrays["strain_range"] = FixedPoint(avatar.strain_range.reshape(rows), STRAIN_RANGE_STEP)
-    if avatar.strain_position is not None:
-        step = STRAIN_POSITION_STEP_M / local_unit
-        arrays["strain_position"] = FixedPoint(avatar.strain_position.reshape(rows), step)
+    for name, coefficients in avatar.driven_offsets.items():
+        if name not in OFFSET_STEPS_M:
+            raise ValueError(f"the web player has no driven offset {name}")
+        arrays[name] = FixedPoint(coefficients.reshape(rows), OFFSET_STEPS_M[name] / local_unit)
     return arrays
 
 

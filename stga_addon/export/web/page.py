@@ -8,12 +8,13 @@ from pathlib import Path
 
 PLAYER = Path(__file__).parent / "player"
 MODULES = (
-    "data.js",
     "vector.js",
+    "strain.js",
+    "signals.js",
+    "data.js",
     "rotation.js",
     "motion.js",
     "rig.js",
-    "strain.js",
     "face_frames.js",
     "depth_sort.js",
     "shaders.js",

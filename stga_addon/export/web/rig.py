@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...capture.rigid import weighted_procrustes
 from ...flame.forward import joint_positions
 from ...flame.model import JOINTS
 from ...flame.quaternions import from_matrices, to_axis_angle
@@ -113,12 +114,6 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rigid_motion(meshes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (T, 3, 3) and translations (T, 3) that best take the first mesh to each of `meshes` (T, V, 3)
-    (Kabsch)."""
-    centers = meshes.mean(1)
-    first = meshes[0] - centers[0]
-    u, _, vt = np.linalg.svd(np.einsum("tva,vb->tab", meshes - centers[:, None], first))
-    signs = np.ones((len(meshes), 3))
-    signs[:, 2] = np.linalg.det(u @ vt)
-    rotations = np.einsum("tab,tb,tbc->tac", u, signs, vt)
-    return rotations, centers
+    """Rotations (T, 3, 3) that best take the first mesh to each of `meshes` (T, V, 3), and their centers (T, 3)."""
+    weights = np.ones(meshes.shape[1])
+    return np.stack([weighted_procrustes(meshes[0], mesh, weights)[0] for mesh in meshes]), meshes.mean(1)

@@ -116,6 +116,11 @@ def splat_rows(splats: Parameters) -> np.ndarray:
     return np.concatenate(flat, axis=1)
 
 
+def list_words(lists: strain.IndexLists) -> np.ndarray:
+    """Where each list begins in this same array, and the last one ends; then the lists."""
+    return np.asarray(np.concatenate([lists.indptr + len(lists.indptr), lists.indices]), np.uint32)
+
+
 def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
     """The opposite of `splat_rows`: copies of its columns; coefficients: K."""
     n, end = len(rows), SH + 3 * coefficients

@@ -17,7 +17,7 @@ STEP = np.dtype(
     [("rates", np.float32, 8)]
     + [(name, np.float32) for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "ema_share")]
     + [(name, np.float32) for name in ("scale_weight", "distance_weight", "opacity_weight")]
-    + [("statistics", np.uint32), ("triangles", np.uint32), ("strain_position_rate", np.float32)]
+    + [(name, np.uint32) for name in ("statistics", "triangles", "padding")]
 )
 """The uniform `step` of optimizer.wgsl."""
 
@@ -48,20 +48,19 @@ def upload_step(
     weights: tuple[float, float, float],
     statistics: bool,
     triangles: int = 0,
-    strain_position_rate: float = 0.0,
 ) -> None:
     """Send the numbers of the next step.
 
     rates by name; ema_share: least share of a step in the exponential moving average; weights: of the limits of scale,
-    distance and, divided by the number of splats, opacity; statistics: collect the screen gradients. triangles,
-    strain_position_rate: see `strain_position.step`.
+    distance and, divided by the number of splats, opacity; statistics: collect the screen gradients; triangles:
+    whose splats driven offsets move.
     """
     step = np.zeros(1, STEP)
     step["rates"][0, : len(RATES)] = [rates[name] for name in RATES]
     step["beta1"], step["beta2"] = betas
     step["log_beta1"], step["log_beta2"] = (math.log(beta) for beta in betas)
     step["epsilon"], step["ema_share"], step["statistics"] = epsilon, ema_share, statistics
-    step["triangles"], step["strain_position_rate"] = triangles, strain_position_rate
+    step["triangles"] = triangles
     step["scale_weight"], step["distance_weight"], step["opacity_weight"] = weights
     device.upload("step", step, "uniform")
 

@@ -12,8 +12,8 @@ struct Step {
   distance_weight: f32,
   opacity_weight: f32, // already divided by the number of splats
   statistics: u32, // 1: collect what density control asks for
-  triangles: u32, // whose splats move with strain
-  strain_position_rate: f32,
+  triangles: u32, // whose splats driven offsets move
+  padding: u32,
 }
 
 // Number of the parameter that a column of a row belongs to: in the order of `cpu.layout.Parameters`.

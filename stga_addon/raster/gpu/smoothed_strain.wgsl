@@ -1,19 +1,16 @@
-// Strain around each triangle, and frames moved by it, as `avatar/strain.py` and `avatar/embedding.py` define them.
+// Strain around each triangle, as `avatar/strain.py` defines it: one round of averaging.
 
 @group(0) @binding(0) var<uniform> pose: Pose;
 // (F + 1 + N): where the triangles that share an edge with a triangle begin in this array, then those triangles.
 @group(0) @binding(1) var<storage, read> neighbors: array<u32>;
-// (F, S, 3): `Avatar.strain_position`.
-@group(0) @binding(2) var<storage, read> coefficients: array<f32>;
 // (F, S): strain less that at rest, averaged in the rounds so far.
-@group(0) @binding(3) var<storage, read> smoothed: array<f32>;
+@group(0) @binding(2) var<storage, read> smoothed: array<f32>;
 // (F, S): the same, averaged once more.
-@group(0) @binding(4) var<storage, read_write> averaged: array<f32>;
-@group(0) @binding(5) var<storage, read_write> frames: array<f32>;
+@group(0) @binding(3) var<storage, read_write> averaged: array<f32>;
 
 // The mean of a triangle's strain and of those that share an edge with it, component by component.
 @compute @workgroup_size(WORKGROUP)
-fn average(
+fn main(
   @builtin(workgroup_id) workgroup: vec3u,
   @builtin(num_workgroups) workgroups: vec3u,
   @builtin(local_invocation_index) local: u32,
@@ -29,28 +26,5 @@ fn average(
       total += smoothed[neighbors[n] * pose.strains + k];
     }
     averaged[f * pose.strains + k] = total / f32(1u + end - neighbors[f]);
-  }
-}
-
-// Move a triangle's origin by Σ smoothed · coefficients, in the triangle's axes and unit.
-@compute @workgroup_size(WORKGROUP)
-fn shift(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let f = thread_number(workgroup, workgroups, local);
-  if f >= pose.triangles {
-    return;
-  }
-  var moved = vec3f(0.0);
-  for (var k = 0u; k < pose.strains; k++) {
-    let row = f * pose.strains + k;
-    moved += smoothed[row] * vec3f(coefficients[3u * row], coefficients[3u * row + 1u], coefficients[3u * row + 2u]);
-  }
-  let at = f * (FRAME_STRAIN + pose.strains);
-  for (var axis = 0u; axis < 3u; axis++) {
-    let row = at + FRAME_MATRIX + 3u * axis;
-    frames[at + FRAME_ORIGIN + axis] += dot(vec3f(frames[row], frames[row + 1u], frames[row + 2u]), moved);
   }
 }

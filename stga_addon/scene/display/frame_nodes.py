@@ -9,8 +9,7 @@ import bpy
 from ...avatar.embedding import MIN_AREA_RATIO, UPRIGHT_COSINE
 from .display_modes import WORLD_ROTATION, WORLD_SCALE
 from .node_builder import NodeGroup, Nodes
-from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, STRAIN_POSITION, XYZ
-from .strain_nodes import NEARBY, NEARBY_STRAIN
+from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, XYZ
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = "stga_frame_origin", "stga_frame_rotation", "stga_frame_size"
@@ -25,19 +24,11 @@ def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
     return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
 
 
-def _shifted_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with frames that are moved by the strain around them (`avatar.embedding.shifted_frames`).
+def shifted_frames(nodes: Nodes, mesh: Any, shift: Any, convention: str) -> Any:
+    """The mesh with its frames moved by a shift in their own axes and unit (`avatar.embedding.shifted_frames`).
 
-    mesh: from STRAIN, with the neutral mesh's attributes.
+    mesh: from FRAMES, with the neutral mesh's attributes; shift: a vector field on its faces.
     """
-    mesh = nodes.group(FRAMES[convention], nodes.group(NEARBY, mesh))
-    nearby = nodes.components(nodes.attribute(NEARBY_STRAIN, "FLOAT_VECTOR"))
-    shift = nodes.sum(
-        *(
-            nodes.scale(nodes.attribute(STRAIN_POSITION.format(index), "FLOAT_VECTOR"), factor)
-            for index, factor in enumerate(nearby)
-        )
-    )
     shift = nodes.scale(shift, _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention))
     rotation = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
     moved = nodes.out("FunctionNodeRotateVector", {"Vector": shift, "Rotation": rotation})
@@ -144,13 +135,6 @@ FRAMES = {
     for convention in _FRAMES
 }
 """Head mesh -> the mesh with frames, by convention."""
-SHIFTED = {
-    convention: NodeGroup(
-        f"STGA Shifted Frames ({convention})", {"Strain": "Geometry"}, "Geometry", partial(_shifted_frames, convention)
-    )
-    for convention in _FRAMES
-}
-"""Deformed neutral mesh with strain -> the same with frames that are moved by strain, by convention."""
 PLACED: dict[str | None, NodeGroup] = {
     convention: NodeGroup(
         f"STGA Place Splats ({convention or 'world'})",

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar
+from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 from ...capture.color import srgb_to_linear
@@ -24,13 +25,13 @@ COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for spla
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
-NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²; also on the faces that have STRAIN_POSITION
+NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²; also on the faces that have driven offsets
 
 # On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
 GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
 RANGE = ("stga_strain_lowest", "stga_strain_highest")
-STRAIN_POSITION = "stga_strain_position_{}"  # by component of strain, as in `Avatar`
+DRIVEN_OFFSET = "stga_{}_{}"  # by name and component of the signal, as in `Avatar.driven_offsets`
 
 Attributes = dict[str, tuple[str, str, np.ndarray]]
 """Name -> (data type, name of the element's field, flat values)."""
@@ -60,11 +61,11 @@ def _neutral_attributes(avatar: Avatar, areas: np.ndarray) -> Attributes:
     if not avatar.follows_strain:
         return {}
     vectors = dict(_strain_vectors(strain_basis(avatar.neutral, avatar.faces, avatar.strain_range)))
-    if avatar.strain_position is not None:
-        for index in range(STRAIN_COMPONENTS):
-            vectors[STRAIN_POSITION.format(index)] = avatar.strain_position[:, index]
+    for offset, coefficients in avatar.driven_offsets.items():
+        for index in range(coefficients.shape[1]):
+            vectors[DRIVEN_OFFSET.format(offset, index)] = coefficients[:, index]
     attributes: Attributes = {name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors.items()}
-    if avatar.strain_position is not None:
+    if avatar.driven_offsets:
         attributes[NEUTRAL_AREA] = ("FLOAT", "value", flat_floats(areas))
     return attributes
 
@@ -137,9 +138,13 @@ def read_strain_range(neutral: Any) -> np.ndarray | None:
     return _read_vectors(neutral, RANGE)
 
 
-def read_strain_position(neutral: Any) -> np.ndarray | None:
-    """`Avatar.strain_position` as stored in a neutral mesh; None where it is not."""
-    return _read_vectors(neutral, [STRAIN_POSITION.format(index) for index in range(STRAIN_COMPONENTS)])
+def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
+    """`Avatar.driven_offsets` as stored in a neutral mesh."""
+    found = {
+        name: _read_vectors(neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)])
+        for name, offset in OFFSETS.items()
+    }
+    return {name: coefficients for name, coefficients in found.items() if coefficients is not None}
 
 
 def _read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:

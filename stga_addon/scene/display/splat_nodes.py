@@ -12,11 +12,12 @@ from .. import tags
 from ..layers import FROZEN_COLOR
 from .color_nodes import SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
 from .display_modes import AS_TRAINED, MODES, displayed
-from .frame_nodes import FRAMES, PLACED, SHIFTED
+from .frame_nodes import FRAMES, PLACED
 from .materials import DISPLAY_COLOR
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
+from .offset_nodes import SIGNALS, shifted
 from .splat_attributes import COLOR, FACE, OPACITY
-from .strain_nodes import DEFORMED, NEARBY, SAMPLED_STRAIN, STRAIN
+from .strain_nodes import DEFORMED, SAMPLED_STRAIN, STRAIN
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"
@@ -37,26 +38,20 @@ class TreeOptions(NamedTuple):
 
     convention       of the splats' embedding ("stga", "gaussian_avatars"); None for world space
     degree           of their spherical harmonics
-    strain_color, strain_position  whether colors, and positions, follow the strain of triangles
+    strain_color     whether colors follow the strain of triangles
+    offsets          driven offsets that move the splats, of `displayed_offsets`
     """
 
     convention: str | None
     degree: int = 0
     strain_color: bool = False
-    strain_position: bool = False
+    offsets: tuple[str, ...] = ()
 
     @property
     def tree_name(self) -> str:
         """At most 59 characters: Blender before 5.0 has room for 63, and adds ".001" to a name that is taken."""
-        return f"STGA Splats ({self.convention or 'world'}, SH {self.degree}{_STRAIN_NAMES[self[2:]]})"
-
-
-_STRAIN_NAMES = {
-    (False, False): "",
-    (True, False): ", strain in range",
-    (False, True): ", strain position",
-    (True, True): ", strain color/position",
-}
+        driven = [*(["strain color"] if self.strain_color else []), *(SIGNALS[name].label for name in self.offsets)]
+        return f"STGA Splats ({', '.join([self.convention or 'world', f'SH {self.degree}', *driven])})"
 
 
 def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
@@ -93,16 +88,16 @@ def build_next_node_group(options: TreeOptions) -> bool:
 
 def _node_groups(options: TreeOptions) -> list[NodeGroup]:
     """The groups that `_build` uses, each after those that it uses itself."""
-    convention, degree, strain_color, strain_position = options
+    convention, degree, strain_color, offsets = options
     groups = [PLACED[convention], *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS]
-    if strain_color or strain_position:
+    if strain_color or offsets:
         groups += [DEFORMED, STRAIN]
     if strain_color:
         groups.append(SAMPLED_STRAIN)
-    if strain_position and convention is not None:
-        groups += [NEARBY, SHIFTED[convention]]
+    for name in offsets if convention is not None else ():
+        groups += [SIGNALS[name].group, shifted(name, convention)]
     if degree > 0 or strain_color:
         groups.append(SRGB_TO_LINEAR)
     return groups
@@ -143,11 +138,8 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         color = _color(nodes, inputs, None, options.degree)
     else:
         head = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
-        strained = _strained(nodes, inputs, head) if options.strain_color or options.strain_position else None
-        if options.strain_position:
-            frames = nodes.group(SHIFTED[options.convention], strained)
-        else:
-            frames = nodes.group(FRAMES[options.convention], head)
+        strained = _strained(nodes, inputs, head) if options.strain_color or options.offsets else None
+        frames = _frames(nodes, head, strained, options.convention, options.offsets)
         splats = nodes.group(PLACED[options.convention], splats, frames)
         strain = nodes.group(SAMPLED_STRAIN, strained) if options.strain_color else None
         color = _color(nodes, inputs, strain, options.degree)
@@ -159,6 +151,19 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     nodes.finish("NodeGroupOutput", {"Geometry": displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE])})
     display = next(item for item in nodes.tree.interface.items_tree if item.name == DISPLAY)
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
+
+
+def _frames(nodes: Nodes, head: Any, strained: Any, convention: str, offsets: tuple[str, ...]) -> Any:
+    """The mesh with the frames that place splats; strained: from `_strained`, where there are driven offsets."""
+    if not offsets:
+        return nodes.group(FRAMES[convention], head)
+    mesh = strained
+    for name in offsets:
+        mesh = nodes.group(SIGNALS[name].group, mesh)
+    mesh = nodes.group(FRAMES[convention], mesh)
+    for name in offsets:
+        mesh = nodes.group(shifted(name, convention), mesh)
+    return mesh
 
 
 def _strained(nodes: Nodes, inputs: Any, head: Any) -> Any:

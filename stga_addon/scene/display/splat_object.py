@@ -15,12 +15,13 @@ from ..layers import DisplaySettings
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
 from .node_builder import is_splat_tree
+from .offset_nodes import displayed_offsets
 from .splat_attributes import (
     Attributes,
     SplatAttributes,
     avatar_attributes,
+    read_driven_offsets,
     read_splats,
-    read_strain_position,
     read_strain_range,
     splat_attributes,
     write_attributes,
@@ -176,7 +177,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         faces=mesh_triangles(neutral.data),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
         strain_range=read_strain_range(neutral.data),
-        strain_position=read_strain_position(neutral.data),
+        driven_offsets=read_driven_offsets(neutral.data),
     )
 
 
@@ -237,5 +238,5 @@ def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
     splats = avatar.splats
     return splat_nodes.TreeOptions(
-        avatar.convention, splats.sh_degree, splats.strain_color.shape[1] > 0, avatar.strain_position is not None
+        avatar.convention, splats.sh_degree, splats.strain_color.shape[1] > 0, displayed_offsets(avatar.driven_offsets)
     )

@@ -6,8 +6,8 @@ from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, STRAIN_GAIN
 from .node_builder import NodeGroup, Nodes
 from .splat_attributes import FACE, GRAM, PLANE, RANGE, TENSOR, TENSOR_HALVES
 
-NEARBY_STRAIN = "stga_nearby_strain"
-"""Vector on the faces of the mesh from NEARBY."""
+SMOOTHED_STRAIN = "stga_smoothed_strain"
+"""Vector on the faces of the mesh from SMOOTHED."""
 # Temporary attributes on the faces of the deformed neutral mesh.
 _GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
 
@@ -47,13 +47,13 @@ def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
     return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
 
 
-def _with_nearby_strain(nodes: Nodes, mesh: Any) -> Any:
+def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
     """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
     change = nodes.vector("SUBTRACT", nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0)))
     # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge with it.
     inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
-    nearby = nodes.out("GeometryNodeBlurAttribute", inputs, data_type="FLOAT_VECTOR")
-    return nodes.store(mesh, NEARBY_STRAIN, nearby, "FLOAT_VECTOR", "FACE")
+    smoothed = nodes.out("GeometryNodeBlurAttribute", inputs, data_type="FLOAT_VECTOR")
+    return nodes.store(mesh, SMOOTHED_STRAIN, smoothed, "FLOAT_VECTOR", "FACE")
 
 
 def _in_range(nodes: Nodes, strain: Any) -> Any:
@@ -64,4 +64,4 @@ def _in_range(nodes: Nodes, strain: Any) -> Any:
 DEFORMED = NodeGroup("STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
 STRAIN = NodeGroup("STGA Triangle Strain", {"Deformed": "Geometry"}, "Geometry", _strained)
 SAMPLED_STRAIN = NodeGroup("STGA Sampled Strain", {"Strain": "Geometry"}, "Vector", _sampled_strain)
-NEARBY = NodeGroup("STGA Nearby Strain", {"Strain": "Geometry"}, "Geometry", _with_nearby_strain)
+SMOOTHED = NodeGroup("STGA Smoothed Strain", {"Strain": "Geometry"}, "Geometry", _with_smoothed_strain)

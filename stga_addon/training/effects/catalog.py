@@ -9,16 +9,21 @@ from typing import Any
 class Effect:
     """An effect: its name, as in `--effect NAME=on`, its cost while it is on, and the settings that switch it.
 
-    on, off  changes to `TrainingSettings`
+    on, off      changes to `TrainingSettings`
+    offset       the driven offset (`avatar.offsets.table`) that it trains, if any
+    added_later  whether a continuation may switch it on in a run that went without: only where it adds coefficients,
+                 which leave the splats as they were while they are zero
     """
 
     name: str
     cost: str
     on: Mapping[str, Any] = field(default_factory=dict)
     off: Mapping[str, Any] = field(default_factory=dict)
+    offset: str | None = None
+    added_later: bool = False
 
 
-EFFECTS = (
+_EFFECTS = (
     Effect(
         "view-color",
         "3, 8 or 15 coefficients more a splat and channel",
@@ -55,12 +60,13 @@ EFFECTS = (
         "3 coefficients more a splat and channel, and the strain of every frame",
         on={"strain_color": True},
         off={"strain_color": False},
+        added_later=True,
     ),
     Effect(
         "strain-position",
         "9 coefficients a triangle, and the strain of every frame",
-        on={"strain_position": True},
-        off={"strain_position": False},
+        offset="strain_position",
+        added_later=True,
     ),
     Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
     Effect("neck", "9 shape keys and drivers in Blender"),
@@ -74,5 +80,5 @@ EFFECTS = (
         off={"tracking": False},
     ),
 )
-"""In display order."""
-EFFECT_NAMES = tuple(effect.name for effect in EFFECTS)
+EFFECTS = {effect.name: effect for effect in _EFFECTS}
+"""By name, in display order."""

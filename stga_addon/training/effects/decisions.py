@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ...errors import StgaError
 from ...schema import complaint
-from .catalog import EFFECT_NAMES
+from .catalog import EFFECTS
 
 CHOICES = ("auto", "on", "off")
 TRACKING = "tracking.npz"
@@ -16,7 +16,7 @@ TRACKING = "tracking.npz"
 class EffectDecision:
     """The decision about one effect.
 
-    effect  one of EFFECT_NAMES
+    effect  one of EFFECTS
     choice  the user's: one of CHOICES
     on      the decision
     reason  with the figure that it rests on
@@ -44,9 +44,9 @@ def parse_choices(texts: Sequence[str]) -> dict[str, str]:
     choices = {}
     for text in texts:
         name, _, choice = text.partition("=")
-        if name not in EFFECT_NAMES or choice not in CHOICES:
+        if name not in EFFECTS or choice not in CHOICES:
             raise StgaError(
-                f"--effect: '{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECT_NAMES)}"
+                f"--effect: '{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}"
             )
         choices[name] = choice
     return choices

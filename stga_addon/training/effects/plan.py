@@ -1,9 +1,11 @@
 """Effect plan: deciding the effects of a run from its capture."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
+from ...avatar.offsets.table import OFFSETS
 from ...capture.model import Capture
 from ...errors import StgaError
 from ..settings import TrainingSettings
@@ -14,9 +16,6 @@ from .rules import RULES, Verdict
 
 if TYPE_CHECKING:
     from ..run.folder import Run
-
-ADDED_LATER = ("strain-color", "strain-position")
-"""Effects that a continuation may switch on, in a run that went without."""
 
 
 def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
@@ -32,21 +31,18 @@ def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run"
 
 
 def with_effects_of_takes(run: "Run", capture: Capture) -> "Run":
-    """The run with colors and positions that follow strain where all its takes together call for it and the run it
-    continues went without.
-
-    Splats can be given no other effect later: coefficients of zero leave them as they were. A user's choice stays.
-    capture: of all takes.
+    """The run with the effects that may be `added_later` where all its takes together call for them and the run it
+    continues went without. A user's choice stays. capture: of all takes.
     """
     facts, settings = CaptureFacts(capture, run.settings), run.settings
     plan = {decision.effect: decision for decision in run.effect_plan}
-    for effect in EFFECTS:
+    for effect in EFFECTS.values():
         before = plan.get(effect.name)
-        if effect.name in ADDED_LATER and before is not None and not before.on and before.choice == "auto":
+        if effect.added_later and before is not None and not before.on and before.choice == "auto":
             verdict = RULES[effect.name](facts)
             assert verdict is not None
             plan[effect.name] = replace(before, on=verdict.on, reason=verdict.reason)
-            settings = replace(settings, **(effect.on if verdict.on else effect.off))
+            settings = switched(settings, effect, verdict.on)
     return replace(run, settings=settings, effect_plan=tuple(plan.values()))
 
 
@@ -58,24 +54,34 @@ def plan_effects(
     Raises StgaError where an image cannot be read, or for a choice in `settings.effects` that cannot work.
     """
     facts, choices = CaptureFacts(capture, settings, device), settings.effects or {}
-    changes: dict[str, object] = {}
-    plan = []
-    for effect in EFFECTS:
+    decided, plan = settings, []
+    for effect in EFFECTS.values():
         choice, verdict = choices.get(effect.name, "auto"), RULES[effect.name](facts)
         if verdict is None:
             if choice == "on":
                 raise StgaError(f"--effect {effect.name}=on: {capture.root} has none: {_needs(effect)}")
             continue
         on = _decided(effect, choice, verdict)
-        changes.update({**effect.on, **verdict.changes} if on else effect.off)
+        decided = switched(decided, effect, on, verdict.changes)
         plan.append(EffectDecision(effect.name, choice, on, verdict.reason, effect.cost))
-    return replace(settings, **changes), tuple(plan)  # type: ignore[arg-type]
+    return decided, tuple(plan)
+
+
+def switched(
+    settings: TrainingSettings, effect: Effect, on: bool, changes: Mapping[str, Any] = MappingProxyType({})
+) -> TrainingSettings:
+    """The settings with an effect on or off; changes: further ones for when it is on."""
+    changed = {**effect.on, **changes} if on else dict(effect.off)
+    if effect.offset is not None:
+        offsets = {*settings.driven_offsets, effect.offset} if on else {*settings.driven_offsets} - {effect.offset}
+        changed["driven_offsets"] = tuple(name for name in OFFSETS if name in offsets)
+    return replace(settings, **changed)
 
 
 def _decided(effect: Effect, choice: str, verdict: Verdict) -> bool:
     if choice == "auto":
         return verdict.on
-    if verdict.only and (choice == "on") != verdict.on:
+    if verdict.fixed and (choice == "on") != verdict.on:
         raise StgaError(f"--effect {effect.name}={choice}: is not possible, because {verdict.reason}")
     return choice == "on"
 

@@ -51,13 +51,13 @@ class Verdict:
 
     on       whether the capture calls for the effect
     reason   a clause with the figure that decided
-    only     no other choice can work: an override is refused with the reason
+    fixed    no other choice can work: an override is refused with the reason
     changes  further settings for when the effect is on
     """
 
     on: bool
     reason: str
-    only: bool = False
+    fixed: bool = False
     changes: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -67,7 +67,7 @@ Rule = Callable[[CaptureFacts], Verdict | None]
 
 def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
-        return Verdict(False, "a single camera sees everything from one direction", only=True)
+        return Verdict(False, "a single camera sees everything from one direction", fixed=True)
     if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
         return Verdict(False, f"{facts.cameras} cameras are too few to tell how color depends on the view")
     found = facts.view_dependence
@@ -77,7 +77,7 @@ def view_color(facts: CaptureFacts) -> Verdict:
 
 def exposure(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
-        return Verdict(False, "a single camera has no other to differ from", only=True)
+        return Verdict(False, "a single camera has no other to differ from", fixed=True)
     found, colors = facts.camera_difference, facts.camera_colors
     rows = tuple(
         (float(camera), *gain, *offset)
@@ -108,7 +108,7 @@ def background(facts: CaptureFacts) -> Verdict:
         return Verdict(True, reason, changes={"backdrop": "mesh"})
     known = ~np.isnan(samples.background_spread)
     if facts.unmasked or not known.any():
-        return Verdict(False, "not every image has a mask or transparency that shows where the head ends", only=True)
+        return Verdict(False, "not every image has a mask or transparency that shows where the head ends", fixed=True)
     backgrounds = samples.background[known]
     color, spread = backgrounds.mean(0), float(samples.background_spread[known].max())
     spread = max(spread, float(abs(backgrounds - color).max()))
@@ -125,7 +125,7 @@ def background(facts: CaptureFacts) -> Verdict:
 
 def hull_points(facts: CaptureFacts) -> Verdict:
     if facts.shows_backdrop:
-        return Verdict(False, "without masks, it is not known what beside the mesh belongs to the head", only=True)
+        return Verdict(False, "without masks, it is not known what beside the mesh belongs to the head", fixed=True)
     if np.isnan(facts.uncovered):
         return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
     reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
@@ -150,7 +150,7 @@ def selection(facts: CaptureFacts) -> Verdict:
     if facts.selected_share == 0:
         count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
         reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
-        return Verdict(False, reason, only=count == total)
+        return Verdict(False, reason, fixed=count == total)
     reason = f"a frame moves {facts.selected_share:.0%} of the triangles by more than {threshold:g} mm"
     asked = facts.settings.strategy == "selective"
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
@@ -173,7 +173,7 @@ def strain_position(facts: CaptureFacts) -> Verdict:
 def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
     """The verdict where nothing can be learned from how the mesh deforms."""
     if facts.strain < MIN_STRETCH:
-        return Verdict(False, "the mesh has the same shape in every training frame", only=True)
+        return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
         return Verdict(False, f"{facts.timesteps} frames are too few to tell how {follows} deformation")
     return None
@@ -221,17 +221,17 @@ def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
         return None
     count = sum(frame.dynamic_offset is not None for frame in facts.frames)
     if not count:
-        return Verdict(False, "no frame has any", only=True)
-    return Verdict(True, f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them", only=True)
+        return Verdict(False, "no frame has any", fixed=True)
+    return Verdict(True, f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them", fixed=True)
 
 
 def tracking(facts: CaptureFacts) -> Verdict | None:
     if not facts.frames:
         return None
     if facts.device != "cpu":
-        return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", only=True)
+        return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", fixed=True)
     if facts.timesteps == 1:
-        return Verdict(False, "the splats of a single frame follow its images without it", only=True)
+        return Verdict(False, "the splats of a single frame follow its images without it", fixed=True)
     if is_tracked(facts.capture.root):
         return Verdict(True, "the capture is from `stga track`: splats see motion more sharply than landmarks do")
     if np.isnan(facts.outside):

@@ -12,7 +12,7 @@ import numpy as np
 from ...avatar.file import Avatar
 from ...capture.model import Capture, View
 from ...render.render import render_avatar
-from ..optimize.losses import similarity
+from ..optimize.losses import mean_ssim
 from . import lpips
 from .detail_difference import detail_difference
 from .evaluation_views import EvaluationView, read_evaluation_view
@@ -135,7 +135,7 @@ def _scores(
     if where is not None:
         image = np.where(where, image, target.transpose(2, 0, 1).astype(np.float32) / 255)
         share = float(where.mean())
-    ssim = 1 - (1 - similarity(image, target)) / share
+    ssim = 1 - (1 - mean_ssim(image, target)) / share
     distance = _lpips(image, target) if perceptual else None
     return psnr_db, ssim, np.nan if distance is None else distance
 

@@ -23,6 +23,10 @@ def make_backend(
     if settings.tracking:
         raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
     from ...raster.gpu.device import Device  # needs wgpu, which training on the CPU does without
+    from ...raster.gpu.driven_offsets import SIGNALS
     from .gpu_backend import GpuBackend
 
+    for name in state.driven_offsets:
+        if name not in SIGNALS:
+            raise StgaError(f"driven offset {name}: is trained on the CPU only, not on {device}")
     return GpuBackend(Device(adapter_name(device)), settings, units, frames, state)

@@ -2,14 +2,15 @@
 
 import numpy as np
 
-from ...avatar.embedding import FaceFrames, frame_backward, shifted_frames, strain_offset
+from ...avatar.embedding import FaceFrames, frame_backward
+from ...avatar.offsets.offset import moved_frames, offset_of
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..settings import TrainingSettings
-from . import adam, strain_position
+from . import adam, driven_offsets
 from .backend import Batch
 from .flame_refinement import frame_gradient
 from .frames import FrameStore
@@ -39,7 +40,7 @@ class CpuBackend:
         target = self._target(batch)
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
-        self._step_strain_position(batch, rows, epsilon)
+        self._step_offsets(batch, rows, epsilon)
         if batch.refinement_rate:
             self._refine_tracking(batch, rows)
         self._add_limit_gradients(rows)
@@ -84,12 +85,10 @@ class CpuBackend:
         return rows, screen, loss if focus is None else None
 
     def _moved_frames(self, timestep: int, averaged: bool = False) -> FaceFrames:
-        """The timestep's frames, moved by strain where positions follow it; averaged: by the moving average."""
-        frames, following = self._frames.of(timestep), self.state.strain_position
-        if following is None:
-            return frames
-        coefficients = following.average if averaged else following.value
-        return shifted_frames(frames, strain_offset(coefficients, self._frames.smoothed_strain(timestep)))
+        """The timestep's frames, moved by the driven offsets; averaged: by their moving averages."""
+        offsets = self.state.driven_offsets.items()
+        coefficients = {name: state.average if averaged else state.value for name, state in offsets}
+        return moved_frames(self._frames.of(timestep), coefficients, self._frames.signals(timestep))
 
     def _forward(
         self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray, sh_degree: int,
@@ -107,26 +106,24 @@ class CpuBackend:
         assert store.tracking is not None
         frames, gradients = store.of(timestep), Parameters(*(g.numpy() for g in state.gradients))
         splats, face = state.arrays(), state.face.numpy()
-        if state.strain_position is not None:
-            shift = strain_offset(state.strain_position.value, store.smoothed_strain(timestep))
+        for name, offset in state.driven_offsets.items():
+            shift = offset_of(offset.value, store.signals(timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
         gradients_of_frames = frame_gradient(splats, face, gradients, rows, frames)
         vertex_gradient = frame_backward(store.mesh(timestep), store.capture.faces, frames, *gradients_of_frames)
         store.tracking.step(timestep, vertex_gradient, batch.refinement_rate)
         store.clear()
 
-    def _step_strain_position(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
-        """Step how the triangles' splats move with strain.
+    def _step_offsets(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
+        """Step the driven offsets.
 
-        Before the mesh is refined, whose strain the gradient is of, and before the limits' gradients are added.
+        Before the mesh is refined, whose signals the gradient is of, and before the limits' gradients are added.
         """
         state = self.state
-        if state.strain_position is not None:
-            strain_position.step(
-                state.strain_position, rows, state.face.numpy(), state.gradients.xyz.numpy(),
-                self._frames.smoothed_strain(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share,
-                epsilon,
-            )  # fmt: skip
+        driven_offsets.step(
+            state.driven_offsets, rows, state.face.numpy(), state.gradients.xyz.numpy(),
+            self._frames.signals(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
+        )  # fmt: skip
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:
         """Add the gradients that keep splats near what they cover, and unbound ones out of the air."""

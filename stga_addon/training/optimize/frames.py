@@ -1,13 +1,14 @@
 """Cache of meshes and face frames by timestep."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, face_frames
-from ...avatar.strain import color_range, smoothed_strain, strain_basis
+from ...avatar.offsets.table import OFFSETS
+from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
 from .flame_refinement import Tracking
 
@@ -19,7 +20,7 @@ CACHED_TIMESTEPS = 12
 class _Timestep:
     mesh: np.ndarray
     frames: FaceFrames | None = None
-    smoothed_strain: np.ndarray | None = None
+    signals: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class FrameStore:
@@ -49,13 +50,17 @@ class FrameStore:
             entry.frames = face_frames(entry.mesh, capture.faces, capture.neutral, self.convention, self.strain)
         return entry.frames
 
-    def smoothed_strain(self, timestep: int) -> np.ndarray:
-        """(F, 3) `smoothed_strain`; only where there is a `strain` basis."""
-        assert self.strain is not None
-        frames, entry = self.of(timestep), self._latest(timestep)
-        if entry.smoothed_strain is None:
-            entry.smoothed_strain = smoothed_strain(self.strain, frames.strain)
-        return entry.smoothed_strain
+    def signals(self, timestep: int) -> Callable[[str], np.ndarray]:
+        """Name of a driven offset -> its signal (F, S); only where there is a `strain` basis."""
+
+        def signal(name: str) -> np.ndarray:
+            assert self.strain is not None
+            frames, entry = self.of(timestep), self._latest(timestep)
+            if name not in entry.signals:
+                entry.signals[name] = OFFSETS[name].signal(self.strain, frames)
+            return entry.signals[name]
+
+        return signal
 
     def mesh(self, timestep: int) -> np.ndarray:
         """(V, 3) that the frames of the timestep are computed from."""

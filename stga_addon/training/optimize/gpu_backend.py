@@ -1,37 +1,37 @@
 """Training backend on a GPU, by WebGPU kernels."""
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from ...avatar.strain import STRAIN_COMPONENTS
+from ...avatar.offsets.table import OFFSETS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.cpu.layout import Parameters
+from ...raster.gpu import driven_offsets as offset_stage
 from ...raster.gpu import frames as frame_stage
 from ...raster.gpu import image_loss as loss_stage
 from ...raster.gpu import optimizer as optimizer_stage
 from ...raster.gpu import rasterize as raster_stage
-from ...raster.gpu import strain_position as strain_position_stage
 from ...raster.gpu.device import Device, Readback, Recording
+from ...raster.gpu.driven_offsets import OffsetTables, splats_by_triangle
 from ...raster.gpu.frames import Embedding
 from ...raster.gpu.image_loss import image_loss, upload_target
 from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
 from ...raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from ...raster.gpu.project import mark_focus
 from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions, upload_splats
-from ...raster.gpu.strain_position import StrainPositionTables, splats_by_triangle
 from ...raster.gpu.tiles import counts_buffer
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, image_epsilon
 from .backend import Batch
 from .frames import FrameStore
 from .losses import scale_limits
-from .state import StrainPosition, TrainState
-from .strain_position import RATE_SHARE
+from .state import OffsetState, TrainState
 
 QUEUED_ITERATIONS = 2
 """Iterations that the device may be behind; losses are returned as many iterations late."""
@@ -51,7 +51,7 @@ class _Queued:
 
 def compile_kernels(device: Device) -> None:
     """Compile what an iteration dispatches, before the time that is given to training."""
-    for stage in (frame_stage, raster_stage, loss_stage, optimizer_stage, strain_position_stage):
+    for stage in (frame_stage, raster_stage, loss_stage, optimizer_stage, offset_stage):
         stage.compile_kernels(device)
 
 
@@ -69,7 +69,9 @@ class GpuBackend:
         capture = frames.capture
         self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = Rasterizer(device)
-        self._embedding = Embedding(device, capture.neutral, capture.faces, frames.convention, frames.strain)
+        self._embedding = Embedding(
+            device, capture.neutral, capture.faces, frames.convention, frames.strain, state.driven_offsets
+        )
         self._triangles = len(capture.faces)
         self._limits = np.column_stack([*scale_limits(capture, settings), settings.distance_limit * units])
         self._pending: deque[_Queued] = deque()
@@ -105,7 +107,7 @@ class GpuBackend:
             unseen_share=torch.from_numpy(traits[:, 1].copy()),
             screen_gradient=torch.from_numpy(sums[:, 1].copy()),
             gradient_count=torch.from_numpy(sums[:, 2].copy()),
-            strain_position=self._read_strain_position(),
+            driven_offsets={name: self._read_offset(name) for name in self._offsets},
         )
 
     @state.setter
@@ -128,8 +130,13 @@ class GpuBackend:
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
         self._splats = upload_splats(self.device, _arrays(state.parameters), state.face.numpy())
-        following, face = state.strain_position, state.face.numpy()
-        self._following = None if following is None else self._upload_strain_position(following, face)
+        splats_of = upload("splats by triangle", splats_by_triangle(state.face.numpy(), self._triangles))
+        self._offsets = {
+            name: OffsetTables(
+                **{part: upload(f"{name} {part}", table) for part, table in vars(offset).items()}, splats_of=splats_of
+            )
+            for name, offset in state.driven_offsets.items()
+        }
 
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last if it was a global one."""
@@ -147,7 +154,7 @@ class GpuBackend:
         """The view with the splats' moving average after all queued iterations: a new (3, H, W) float32 image."""
         self._finish_all()
         average = replace(self._splats, rows=self._tables.average)
-        moved = None if self._following is None else self._following.average
+        moved = {name: tables.average for name, tables in self._offsets.items()}
         while True:
             with self.device.record() as work:
                 rendering = self._render(work, average, moved, view, background, sh_degree)
@@ -183,18 +190,17 @@ class GpuBackend:
         self._upload_step(batch)
         with self.device.record() as work:
             splats, camera = self._splats, batch.view.camera
-            moved = None if self._following is None else self._following.value
+            moved = {name: tables.value for name, tables in self._offsets.items()}
             rendering = self._render(work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected)
             v_image, loss = image_loss(
                 work, camera.width, camera.height, view=rendering.view, image=rendering.image,
                 touched=rendering.chosen.touched, whole=whole,
             )  # fmt: skip
             screen = self._rasterizer.backward(work, rendering, splats, v_image, self._gradients)
-            if self._following is not None:
-                strain_position_stage.step(
-                    work, self._triangles, self._following, view=rendering.view, wanted=rendering.lists.wanted,
-                    gradients=self._gradients, smoothed=self._embedding.smoothed_strain,
-                )  # fmt: skip
+            offset_stage.step(
+                work, self._triangles, self._offsets, self._embedding.signals, view=rendering.view,
+                wanted=rendering.lists.wanted, gradients=self._gradients,
+            )  # fmt: skip
             limited = bool(self._settings.scale_weight or self._settings.distance_weight)
             optimize(
                 work, splats.count, splats.stride, self._tables, limited, view=rendering.view, splats=splats.rows,
@@ -204,10 +210,10 @@ class GpuBackend:
         queued.readback.start()
 
     def _render(
-        self, work: Recording, splats: SplatTable, strain_position: Any | None, view: View, background: np.ndarray,
+        self, work: Recording, splats: SplatTable, offsets: Mapping[str, Any], view: View, background: np.ndarray,
         sh_degree: int, selected: np.ndarray | None = None,
     ) -> Rendering:  # fmt: skip
-        """Record a view of the splats, moved by strain with coefficients strain_position (F, 3, 3) on the device.
+        """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on the device.
 
         Only the tiles around the splats on the selected triangles, if any are given.
         """
@@ -221,7 +227,7 @@ class GpuBackend:
         if selected is not None:
             marked = self.device.upload("selected", selected)
             focus = mark_focus(work, splats.count, view=uniform, face=splats.face, selected=marked)
-        frames = self._embedding.compose(work, strain_position)
+        frames = self._embedding.compose(work, offsets)
         return self._rasterizer.forward(work, splats, frames, options, uniform, focus)
 
     def _upload_target(self, batch: Batch) -> None:
@@ -235,21 +241,11 @@ class GpuBackend:
         upload_step(
             self.device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
             statistics=batch.accumulate, triangles=self._triangles,
-            strain_position_rate=RATE_SHARE * batch.rates["xyz"],
         )  # fmt: skip
 
-    def _upload_strain_position(self, state: StrainPosition, face: np.ndarray) -> StrainPositionTables:
-        upload = self.device.upload
-        return StrainPositionTables(
-            **{name: upload(f"strain position {name}", table) for name, table in vars(state).items()},
-            splats_of=upload("splats by triangle", splats_by_triangle(face, self._triangles)),
-        )
-
-    def _read_strain_position(self) -> StrainPosition | None:
-        if self._following is None:
-            return None
-        read, tables, shape = self.device.read, self._following, (self._triangles, STRAIN_COMPONENTS, 3)
-        return StrainPosition(
+    def _read_offset(self, name: str) -> OffsetState:
+        read, tables, shape = self.device.read, self._offsets[name], (self._triangles, OFFSETS[name].signals, 3)
+        return OffsetState(
             value=read(tables.value, shape),
             first=read(tables.first, shape),
             second=read(tables.second, shape),

@@ -6,8 +6,7 @@ import numpy as np
 
 from ...avatar.embedding import face_frames, to_world
 from ...avatar.lattice import lattice_splats
-from ...avatar.splats import SH_C0, Splats
-from ...avatar.strain import STRAIN_COMPONENTS
+from ...avatar.splats import ADDED, SH_C0, Splats
 from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .hull_points import flat_points, hull_points, in_image
@@ -31,9 +30,9 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
             parts.append(flat_points(capture, views[0], settings.convention, settings.sh_degree))
         else:
             parts.append(hull_points(capture, views, settings.convention, settings.sh_degree))
-    strains = STRAIN_COMPONENTS if settings.strain_color else 0
-    parts = [replace(part, strain_color=np.zeros((len(part), strains, 3), np.float32)) for part in parts]
-    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
+    splats = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
+    added = {name: np.zeros((len(splats), ADDED[name], 3), np.float32) for name in settings.added}
+    return replace(splats, **added)
 
 
 def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarray:

@@ -41,7 +41,7 @@ def image_gradient(
     return float(l1), float(ssim)
 
 
-def similarity(image: np.ndarray, target: np.ndarray) -> float:
+def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:
     """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
     unused = np.empty_like(image)
     return image_gradient(image, target, whole_image(*image.shape[1:]), 1.0, unused)[1]

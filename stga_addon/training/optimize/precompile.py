@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ...avatar.embedding import WORLD
+from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import Splats
-from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.camera import Camera
 from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
@@ -19,9 +19,9 @@ from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
 from ...render.device import adapter_name
 from ...worker.launch import same_interpreter_environment
-from . import adam, strain_position
+from . import adam, driven_offsets
 from .losses import image_gradient, whole_image
-from .state import TrainState, new_state, new_strain_position
+from .state import TrainState, new_state, with_offsets
 
 PACKAGE = "stga_addon"
 HELPER_TIMEOUT_S = 120.0
@@ -101,10 +101,10 @@ def _second_half() -> None:
     rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
     state, rows = _pair(), np.arange(2, dtype=np.int32)
     adam.step(state, rows, rates)
-    following = new_strain_position(np.zeros((2, STRAIN_COMPONENTS, 3)))
-    strain_position.step(
-        following, rows, state.face.numpy(), state.gradients.xyz.numpy(), np.zeros((2, STRAIN_COMPONENTS), np.float32),
-        1e-3, 1.0, adam.EPSILON,
+    offsets = with_offsets(state, OFFSETS, 2).driven_offsets
+    driven_offsets.step(
+        offsets, rows, state.face.numpy(), state.gradients.xyz.numpy(),
+        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 1.0, adam.EPSILON,
     )  # fmt: skip
 
 

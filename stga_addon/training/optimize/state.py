@@ -1,22 +1,22 @@
 """State of the splats in training: parameters, optimizer moments and statistics for density control."""
 
-from collections.abc import Callable
-from dataclasses import Field, dataclass, fields, replace
+from collections.abc import Callable, Collection
+from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from ...avatar.splats import Splats
-from ...avatar.strain import STRAIN_COMPONENTS
+from ...avatar.offsets.table import OFFSETS
+from ...avatar.splats import ADDED, Splats
 from ...raster.cpu.layout import Parameters
 
 
 @dataclass
-class StrainPosition:
-    """`Avatar.strain_position` of a mesh's F triangles in training.
+class OffsetState:
+    """Coefficients of a driven offset (`Avatar.driven_offsets`) of a mesh's F triangles in training.
 
-    value, first, second, average  (F, 3, 3) float32 coefficients, Adam's two moments, and the exponential moving
+    value, first, second, average  (F, S, 3) float32 coefficients, Adam's two moments, and the exponential moving
                                    average from which the avatar is made
     steps                          (F,) int32 Adam steps of each triangle
     """
@@ -28,11 +28,11 @@ class StrainPosition:
     steps: np.ndarray
 
 
-def new_strain_position(coefficients: np.ndarray) -> StrainPosition:
-    """A copy of coefficients (F, 3, 3), with zero moments."""
+def new_offset(coefficients: np.ndarray) -> OffsetState:
+    """A copy of coefficients (F, S, 3), with zero moments."""
     value = np.array(coefficients, np.float32)
     zeros, steps = np.zeros_like(value), np.zeros(len(value), np.int32)
-    return StrainPosition(value, zeros, zeros.copy(), value.copy(), steps)
+    return OffsetState(value, zeros, zeros.copy(), value.copy(), steps)
 
 
 @dataclass
@@ -47,7 +47,7 @@ class TrainState:
                      parent; 0 for bound splats
     screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density control
     gradient_count   (N,) float32 number of summands
-    strain_position  of the mesh's triangles, not of the splats; None where positions follow the mesh alone
+    driven_offsets   by name, of the mesh's triangles, not of the splats
     """
 
     parameters: Parameters
@@ -61,7 +61,7 @@ class TrainState:
     unseen_share: torch.Tensor
     screen_gradient: torch.Tensor
     gradient_count: torch.Tensor
-    strain_position: StrainPosition | None = None
+    driven_offsets: dict[str, OffsetState] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -111,13 +111,13 @@ def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
     return _map(lambda tensors: tensors[0][keep], state)
 
 
-def with_strain_coefficients(state: TrainState) -> TrainState:
-    """The state with strain coefficients; they and their moments are zero where there were none."""
-    if state.parameters.strain_color.shape[1]:
-        return state
+def with_added(state: TrainState, names: Collection[str]) -> TrainState:
+    """The state with these arrays of ADDED; they and their moments are zero where there were none."""
+    zeros = {name: torch.zeros(len(state), ADDED[name], 3) for name in names}
+    zeros = {name: tensor for name, tensor in zeros.items() if not getattr(state.parameters, name).shape[1]}
 
     def added(tensors: Parameters) -> Parameters:
-        return tensors._replace(strain_color=torch.zeros(len(state), STRAIN_COMPONENTS, 3))
+        return tensors._replace(**{name: tensor.clone() for name, tensor in zeros.items()})
 
     return replace(
         state,
@@ -129,12 +129,10 @@ def with_strain_coefficients(state: TrainState) -> TrainState:
     )
 
 
-def with_strain_position(state: TrainState, triangles: int) -> TrainState:
-    """The state with positions that follow the strain of so many triangles, by zero where they did not before."""
-    if state.strain_position is not None:
-        return state
-    still = new_strain_position(np.zeros((triangles, STRAIN_COMPONENTS, 3), np.float32))
-    return replace(state, strain_position=still)
+def with_offsets(state: TrainState, names: Collection[str], triangles: int) -> TrainState:
+    """The state with these driven offsets of so many triangles too; those that it lacked begin by zero."""
+    zeros = {name: new_offset(np.zeros((triangles, OFFSETS[name].signals, 3), np.float32)) for name in names}
+    return replace(state, driven_offsets={**zeros, **state.driven_offsets})
 
 
 def join(state: TrainState, other: TrainState) -> TrainState:
@@ -166,11 +164,11 @@ def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
 
 
 def _splat_fields() -> list[Field[Any]]:
-    return [f for f in fields(TrainState) if f.name != "strain_position"]
+    return [f for f in fields(TrainState) if f.name != "driven_offsets"]
 
 
 def _map(function: Callable[[list[torch.Tensor]], torch.Tensor], *states: TrainState) -> TrainState:
     """The first state with other splats."""
     flat = [tensors_of(s) for s in states]
     mapped = state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})
-    return replace(mapped, strain_position=states[0].strain_position)
+    return replace(mapped, driven_offsets=states[0].driven_offsets)

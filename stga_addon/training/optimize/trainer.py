@@ -13,7 +13,7 @@ from .flame_refinement import RefinementState, refinable_tracking, refinement_ra
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .losses import limit_units
-from .state import TrainState, new_state, with_strain_position
+from .state import TrainState, new_state, with_offsets
 from .strategies import DensityControl, PostStep, StrayReset, make_strategy
 
 
@@ -41,8 +41,7 @@ class Trainer:
         self.capture, self.settings = capture, settings
         self.strategy = make_strategy(settings, selection)
         self.tracking = refinable_tracking(capture, settings.convention) if settings.tracking else None
-        strained = settings.strain_color or settings.strain_position
-        self.frames = FrameStore(capture, settings.convention, strained, self.tracking, strain_range)
+        self.frames = FrameStore(capture, settings.convention, settings.follows_strain, self.tracking, strain_range)
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
@@ -50,8 +49,7 @@ class Trainer:
         if state is None:
             splats = initial_splats(capture, settings)
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
-            if settings.strain_position:
-                state = with_strain_position(state, len(capture.faces))
+            state = with_offsets(state, settings.driven_offsets, len(capture.faces))
         self._backend = make_backend(device, settings, self._limit_units, self.frames, state)
         self.initial_count = len(self)
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...avatar.file import SH_SIZES
-from ...avatar.strain import STRAIN_COMPONENTS
+from ...avatar.offsets.table import OFFSETS
+from ...avatar.splats import ARRAYS
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
 from ..optimize.flame_refinement import RefinementState
-from ..optimize.state import StrainPosition, TrainState, state_of, tensors_of
+from ..optimize.state import OffsetState, TrainState, state_of, tensors_of
 from .folder import CHECKPOINT, SELECTION
 
 VERSION = 3
-REFINEMENT, POSITION, IDENTITY = "tracking/", "strain_position/", "identity"
+REFINEMENT, IDENTITY = "tracking/", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
 OTHER_RUN = "belongs to another run than run.json beside it; remove it, or train into another folder"
@@ -74,7 +74,8 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
     arrays = {k: t.numpy() for k, t in tensors_of(checkpoint.state).items() if not k.startswith("gradients/")}
-    for prefix, part in ((REFINEMENT, checkpoint.tracking), (POSITION, checkpoint.state.strain_position)):
+    parts = {f"{name}/": offset for name, offset in checkpoint.state.driven_offsets.items()}
+    for prefix, part in {**parts, REFINEMENT: checkpoint.tracking}.items():
         arrays.update({prefix + name: array for name, array in (vars(part) if part is not None else {}).items()})
     values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
     arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
@@ -89,7 +90,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         meta = _meta(arrays.pop("meta"))
         if meta.pop("version") != VERSION:
             raise StgaError(f"{path}: was written by another version")
-        refinement, position = _refinement(path, arrays), _strain_position(path, arrays)
+        refinement = _refinement(path, arrays)
+        offsets = {name: offset for name in OFFSETS if (offset := _offset(path, arrays, name)) is not None}
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         for name in [n for n in tensors if n.startswith("first/")]:
             tensors[name.replace("first/", "gradients/")] = torch.zeros_like(tensors[name])
@@ -97,7 +99,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             raise StgaError(f"{path}: an array has no rows")
         state = state_of(tensors)
         _check_state(path, state)
-        state.strain_position = position
+        state.driven_offsets = offsets
         return Checkpoint(state=state, tracking=refinement, **meta)
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
@@ -136,11 +138,12 @@ def _is_number(value: Any) -> bool:
 
 def _check_state(path: Path, state: TrainState) -> None:
     """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the array."""
-    n, coefficients = len(state), state.parameters.sh.shape[1]
-    if coefficients not in SH_SIZES:
-        raise StgaError(f"{path}: parameters/sh has {coefficients} coefficients, expected one of {SH_SIZES}")
-    strains = STRAIN_COMPONENTS if state.parameters.strain_color.shape[1] else 0
-    tails = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "sh": (coefficients, 3), "strain_color": (strains, 3)}
+    n, tails = len(state), {}
+    for field, kind in ARRAYS.items():
+        size = getattr(state.parameters, field).shape[1] if kind.sizes else 0
+        if kind.sizes and size not in kind.sizes:
+            raise StgaError(f"{path}: parameters/{field} has {size} coefficients, expected one of {kind.sizes}")
+        tails[field] = kind.shape_at(size)
     whole = {"steps": torch.int32, "face": torch.int32, "unbound": torch.bool}
     for name, tensor in tensors_of(state).items():
         dtype = whole.get(name, torch.float32)
@@ -166,16 +169,17 @@ def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | 
     return found
 
 
-def _strain_position(path: Path, arrays: dict[str, np.ndarray]) -> StrainPosition | None:
-    """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
-    taken = _taken(arrays, POSITION)
+def _offset(path: Path, arrays: dict[str, np.ndarray], name: str) -> OffsetState | None:
+    """A driven offset, taken out of a checkpoint's arrays; None where there is none. Raises StgaError naming an array
+    that is wrong."""
+    taken = _taken(arrays, f"{name}/")
     if not taken:
         return None
-    found = StrainPosition(**taken)
+    found = OffsetState(**taken)
     triangles = found.steps.shape[:1]
-    for name, array in taken.items():
-        tail = () if name == "steps" else (STRAIN_COMPONENTS, 3)
-        _check_array(path, POSITION + name, array, "float32" if tail else "int32", (*triangles, *tail))
+    for part, array in taken.items():
+        tail = () if part == "steps" else (OFFSETS[name].signals, 3)
+        _check_array(path, f"{name}/{part}", array, "float32" if tail else "int32", (*triangles, *tail))
     return found
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ...avatar.file import Avatar, read_avatar
+from ...avatar.splats import ADDED
 from ...capture.model import Capture, View, evenly_spread
 from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
@@ -26,10 +27,10 @@ from ..evaluate.residuals import RESIDUAL_SCALE, Residuals, triangle_residuals
 from ..optimize.image_preparation import image_preparation
 from ..optimize.state import (
     TrainState,
+    new_offset,
     new_state,
-    new_strain_position,
-    with_strain_coefficients,
-    with_strain_position,
+    with_added,
+    with_offsets,
 )
 from ..settings import Rates, TrainingSettings
 from .checkpoint import read_checkpoint
@@ -95,31 +96,30 @@ def starting_state(continuation: Continuation, settings: TrainingSettings, trian
     """
     folder = continuation.parent
     if file_digest(folder / AVATAR) != continuation.avatar:
-        raise StgaError(f"{folder / 'avatar.npz'}: has changed since this continuation was started from it")
+        raise StgaError(f"{folder / AVATAR}: has changed since this continuation was started from it")
     avatar = read_avatar(folder / AVATAR)
     require_color_range(folder / AVATAR, avatar)
     state = new_state(avatar.splats)
-    if avatar.strain_position is not None:
-        state.strain_position = new_strain_position(avatar.strain_position)
+    state.driven_offsets = {name: new_offset(values) for name, values in avatar.driven_offsets.items()}
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
         if _is_of(kept, avatar):
             parameters = Parameters(*(tensor.clone() for tensor in kept.average))
             zero = torch.zeros(len(kept))
             state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
-            if kept.strain_position is not None:
-                kept.strain_position.value = kept.strain_position.average.copy()
-    if settings.strain_color:
-        state = with_strain_coefficients(state)
-    return with_strain_position(state, triangles) if settings.strain_position else state
+            for offset in kept.driven_offsets.values():
+                offset.value = offset.average.copy()
+    state = with_added(state, settings.added)
+    return with_offsets(state, settings.driven_offsets, triangles)
 
 
 def _is_of(state: TrainState, avatar: Avatar) -> bool:
     """Whether the avatar was made of this state."""
-    averaged, position = state.averaged(), state.strain_position
-    moved = None if position is None else position.average
-    return np.array_equal(moved, avatar.strain_position) and all(  # type: ignore[arg-type]
-        np.array_equal(array, getattr(averaged, name)) for name, array in vars(avatar.splats).items()
+    offsets = {name: offset.average for name, offset in state.driven_offsets.items()}
+    pairs = [(vars(avatar.splats), vars(state.averaged())), (avatar.driven_offsets, offsets)]
+    return all(
+        ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
+        for ours, theirs in pairs
     )
 
 
@@ -142,12 +142,12 @@ def continued_settings(
 ) -> TrainingSettings:
     """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a value not allowed.
 
-    An extension's strain color begins with the first rate of the run: other expressions strain triangles in directions
-    that the old takes never showed.
+    What effects add to splats begins with the first rate of the run in an extension: other expressions strain triangles
+    in directions that the old takes never showed.
     """
     rates = late_rates(settings.rates, START_SHARE)
     if strategy == "extend":
-        rates = replace(rates, strain_color=settings.rates.strain_color)
+        rates = replace(rates, **{name: getattr(settings.rates, name) for name in ADDED})
     continued = replace(
         settings,
         strategy=strategy,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
+from ...avatar.splats import ADDED
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture, evenly_spread
 from ...errors import StgaError
@@ -35,7 +36,7 @@ from .metrics_log import METRICS, cut_metrics, read_metrics
 from .progress import Progress, Report
 from .replay import continued_order
 from .residual_file import write_residuals
-from .strain_range import STRAIN_RANGE, follows_strain, require_color_range, strain_range_of, trained_strain_range
+from .strain_range import STRAIN_RANGE, require_color_range, strain_range_of, trained_strain_range
 
 RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
@@ -122,7 +123,7 @@ class Session:
             self.settings.antialiased,
             self.run.principal_point,
             self.strain_range,
-            None if state.strain_position is None else state.strain_position.average.copy(),
+            {name: offset.average.copy() for name, offset in state.driven_offsets.items()},
         )
 
     def figures(self) -> dict[str, Any]:
@@ -177,7 +178,7 @@ class Session:
 
     def _measure_refined_strain(self) -> None:
         """Measure the strain of all training timesteps where refined tracking has moved their meshes."""
-        if follows_strain(self.settings):
+        if self.settings.follows_strain:
             self.strain_range = trained_strain_range(self.capture, self.trainer.frames.mesh, None)
 
 
@@ -248,7 +249,7 @@ def _restore(folder: Path, trainer: Trainer, checkpoint: Checkpoint) -> None:
 
 
 def _strain_range(folder: Path, capture: Capture, run: Run, report: Report) -> np.ndarray | None:
-    if follows_strain(run.settings):
+    if run.settings.follows_strain:
         report(Progress(message="Measuring strain"))
     return strain_range_of(folder, capture, run)
 
@@ -272,16 +273,17 @@ def _refined_region(run: Run, trainer: Trainer) -> np.ndarray | None:
 
 def _check_state(folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState) -> None:
     """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
-    face, splats, position, faces = state.face, state.splats(), state.strain_position, len(capture.faces)
+    face, splats, faces = state.face, state.splats(), len(capture.faces)
     if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
         raise StgaError(f"{folder}: its splats refer to triangles that {capture.root} does not have")
     if splats.sh_degree != settings.sh_degree:
         found = splats.sh_degree
         raise StgaError(f"{folder}: its splats have SH degree {found}, run.json says {settings.sh_degree}")
-    if bool(splats.strain_color.shape[1]) != settings.strain_color:
-        raise StgaError(f"{folder}: its splats and run.json disagree on the effect strain-color")
-    if (position is not None) != settings.strain_position:
-        raise StgaError(f"{folder}: its checkpoint and run.json disagree on the effect strain-position")
-    if position is not None and len(position.steps) != faces:
-        found = len(position.steps)
-        raise StgaError(f"{folder}: its positions follow {found} triangles, {capture.root} has {faces}")
+    for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
+        raise StgaError(f"{folder}: its splats and run.json disagree on {name}")
+    for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
+        raise StgaError(f"{folder}: its checkpoint and run.json disagree on the driven offset {name}")
+    for name, offset in state.driven_offsets.items():
+        found = len(offset.steps)
+        if found != faces:
+            raise StgaError(f"{folder}: its {name} is of {found} triangles, {capture.root} has {faces}")

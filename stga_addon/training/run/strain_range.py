@@ -13,8 +13,7 @@ from ...avatar.strain import COLOR_RANGE, color_range, seen_range, strain_basis
 from ...capture.model import Capture
 from ...errors import StgaError
 from ...files import read_npz, write_npz
-from ..settings import TrainingSettings
-from .folder import Continuation, Run
+from .folder import AVATAR, Continuation, Run
 
 STRAIN_RANGE = "strain_range.npz"
 OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
@@ -33,7 +32,7 @@ def trained_strain_range(
     seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     if continuation is None:
         return seen
-    parent = read_avatar(continuation.parent / "avatar.npz")
+    parent = read_avatar(continuation.parent / AVATAR)
     earlier = parent.strain_range
     if not parent.follows_strain:
         return seen  # it follows strain only from here on
@@ -48,7 +47,7 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
 
     None where nothing follows strain, and with refined tracking, which moves the meshes while it trains.
     """
-    if not follows_strain(run.settings) or run.settings.tracking:
+    if not run.settings.follows_strain or run.settings.tracking:
         return None
     assert run.identity is not None
     if (folder / STRAIN_RANGE).exists():
@@ -56,10 +55,6 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     limits = trained_strain_range(capture, capture.mesh, run.continuation)
     write_strain_range(folder, limits, run.identity.digest)
     return limits
-
-
-def follows_strain(settings: TrainingSettings) -> bool:
-    return settings.strain_color or settings.strain_position
 
 
 def write_strain_range(folder: Path, limits: np.ndarray, identity: str) -> None:

@@ -113,7 +113,7 @@ def make_head(
         model.faces,
         antialiased=antialiased,
         strain_range=limits if strain or strain_position else None,
-        strain_position=moves if strain_position else None,
+        driven_offsets={"strain_position": moves} if strain_position else {},
     )
     camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
     return Head(avatar, sequence, meshes, camera)

@@ -24,7 +24,7 @@ try {
       vertices: Array.from(rig.vertices),
       frames: Array.from(frames.world),
       strain: Array.from(frames.strain?.values ?? []),
-      nearby: Array.from(frames.nearby?.values ?? []),
+      smoothed: Array.from(frames.offsets[0]?.signal.values ?? []),
       order: Array.from(order),
     });
   }

@@ -62,11 +62,14 @@ def test_strain_moves_splats_by_less_than_their_own_step(convention, strain):
     assert np.abs(arrays["strain_range"].reshape(-1, 2, 3) - avatar.strain_range).max() <= 0.001 + 1e-6
     unit = avatar.frames(avatar.neutral).scale.max()
     found = arrays["strain_position"].reshape(-1, 3, 3)
-    assert np.abs(found - avatar.strain_position).max() * unit <= data_file.STRAIN_POSITION_STEP_M / 2 + 1e-9
-    stored = replace(avatar, strain_position=found)
+    assert (
+        np.abs(found - avatar.driven_offsets["strain_position"]).max() * unit
+        <= data_file.OFFSET_STEPS_M["strain_position"] / 2 + 1e-9
+    )
+    stored = replace(avatar, driven_offsets={"strain_position": found})
     for mesh in head.meshes:
         expected = avatar.frames(mesh)
-        moved = np.linalg.norm(expected.origin - replace(avatar, strain_position=None).frames(mesh).origin, axis=1)
+        moved = np.linalg.norm(expected.origin - replace(avatar, driven_offsets={}).frames(mesh).origin, axis=1)
         error = np.abs(stored.frames(mesh).origin - expected.origin).max(1) / np.maximum(expected.scale / unit, 1)
         assert moved.max() > 100 * data_file.POSITION_STEP_M
         assert error.max() < data_file.POSITION_STEP_M / 4

@@ -56,7 +56,7 @@ def test_pose_is_flames(head, baked, tmp_path):
 )
 def test_frames_and_strain_are_the_embedding(convention, strain, strain_position, tmp_path):
     """Catches another axis, scale, sliver rule or strain than the one that the splats were trained with, and origins
-    that do not move with the nearby strain, or with that of the frame before."""
+    that do not move with the smoothed strain, or with that of the frame before."""
     head = make_head(convention, strain=strain, strain_position=strain_position)
     results = evaluated(head.data(exact=True), tmp_path)["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
@@ -67,14 +67,14 @@ def test_frames_and_strain_are_the_embedding(convention, strain, strain_position
         error = np.abs(found[..., :3] - expected.rotation * expected.scale[:, None, None]).max((1, 2)) / scale
         assert np.quantile(error, 0.99) < 1e-3
         assert np.abs(found[..., 3] - expected.origin).max() < 1e-6
-        still = replace(head.avatar, strain_position=None).frames(mesh).origin
+        still = replace(head.avatar, driven_offsets={}).frames(mesh).origin
         assert (np.abs(expected.origin - still).max() > 1e-3) == strain_position
         assert np.quantile(np.abs(np.reshape(result["strain"], (-1, 3)) - expected.strain), 0.99) < 2e-3
         free = replace(head.avatar, strain_range=None).frames(mesh).strain
         assert (np.abs(free - expected.strain) > 0.01).mean() > 0.05  # the range matters here
 
 
-def test_nearby_strain_where_edges_have_any_number_of_triangles(tmp_path):
+def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
     """Catches neighbors that are lost, or counted another number of times, where more than two triangles share an edge,
     two share all edges, or one has an edge twice: against a search of all pairs of edges, and numpy's frames."""
     rng = np.random.default_rng(0)
@@ -83,7 +83,7 @@ def test_nearby_strain_where_edges_have_any_number_of_triangles(tmp_path):
     faces[30:33], faces[33] = faces[:3], faces[0, ::-1]
     faces[35:] = [[3, 3, 4], [3, 4, 4], [5, 6, 5], [7, 7, 7], [4, 3, 8]]
     moves = rng.normal(0, 0.01, (40, 3, 3)).astype(np.float32)
-    avatar = Avatar(random_splats(1, 60, 40, 0), "stga", neutral, faces, strain_position=moves)
+    avatar = Avatar(random_splats(1, 60, 40, 0), "stga", neutral, faces, driven_offsets={"strain_position": moves})
     meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
     data = data_file(avatar, baked_rig(meshes), Playback(), exact=True)
     edges = [{frozenset((face[k - 1], face[k])): 0 for k in range(3)} for face in faces]
@@ -97,7 +97,7 @@ def test_nearby_strain_where_edges_have_any_number_of_triangles(tmp_path):
         expected = np.reshape(result["strain"], (-1, 3))
         for _ in range(3):
             expected = weight @ expected / weight.sum(1, keepdims=True)
-        assert np.abs(np.reshape(result["nearby"], (-1, 3)) - expected).max() < 1e-9
+        assert np.abs(np.reshape(result["smoothed"], (-1, 3)) - expected).max() < 1e-9
         origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
         assert np.abs(origin - avatar.frames(mesh).origin).max() < 1e-5
 

@@ -11,7 +11,7 @@ from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
 from stga_addon.training.effects import rules
-from stga_addon.training.effects.catalog import EFFECT_NAMES
+from stga_addon.training.effects.catalog import EFFECTS
 from stga_addon.training.effects.decisions import parse_choices
 from stga_addon.training.effects.evidence import fit_cameras, stable_colors
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
@@ -70,9 +70,9 @@ def test_what_moves_over_triangles_with_strain(painted):
     """Catches positions that follow the mesh alone where its surface slides, and that choice where it is refused."""
     plan, settings = planned(painted(paint=sliding))
     assert plan["strain-position"].on
-    assert settings.strain_position
+    assert settings.driven_offsets == ("strain_position",)
     assert min(gains(plan["strain-position"])) > 4
-    assert not planned(painted(paint=sliding), strain_position="off")[1].strain_position
+    assert not planned(painted(paint=sliding), strain_position="off")[1].driven_offsets
     with pytest.raises(StgaError, match="strain-position=on: is not possible, because the mesh has the same shape"):
         planned(painted(timesteps=1, deformed=0.0), strain_position="on")
 
@@ -303,7 +303,7 @@ def test_overrides(painted):
 
 def test_names():
     """Catches an effect without a rule, and a rule without an effect."""
-    assert tuple(rules.RULES) == EFFECT_NAMES
+    assert list(rules.RULES) == list(EFFECTS)
     assert parse_choices(["jaw=off", "hull-points=on"]) == {"jaw": "off", "hull-points": "on"}
     for wrong in ("jaws=on", "jaw", "jaw=maybe"):
         with pytest.raises(StgaError, match=f"'{wrong}' is not NAME=on"):

@@ -3,6 +3,8 @@
 
 /** @import { Data, DataArray, Values } from './types.js' */
 
+import { SIGNALS } from './signals.js';
+
 export class DataError extends Error {}
 
 const VERSION = 1;
@@ -156,7 +158,9 @@ function checkData(header, arrays) {
   };
   if (arrays.selection) shapesOf.selection = [frames, Math.ceil(faces / 8)];
   if (arrays.strain_color) shapesOf.strain_color = [splats, 3 * CHANNELS];
-  if (arrays.strain_position) shapesOf.strain_position = [faces, 9];
+  for (const [name, { components }] of Object.entries(SIGNALS)) {
+    if (arrays[name]) shapesOf[name] = [faces, 3 * components];
+  }
   if (arrays.strain_range) shapesOf.strain_range = [faces, 6];
   if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
   for (const [name, shape] of Object.entries(shapesOf)) checkArray(arrays, name, shape);

@@ -4,7 +4,8 @@
 
 /** @import { Arrays, Values, Vector } from './types.js' */
 
-import { NearbyStrain, Strain } from './strain.js';
+import { SIGNALS } from './signals.js';
+import { Strain } from './strain.js';
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 const MIN_DIVISOR = 1e-30;
@@ -26,10 +27,18 @@ export class FaceFrames {
     this.isStga = convention === 'stga';
     this.world = new Float64Array(12 * this.count); // rotation · scale and origin, rows of a 3×4 matrix
     this.neutralArea = neutralAreas(faces, neutral);
-    const { strain_color, strain_position, strain_range } = arrays;
-    this.strain = strain_color || strain_position ? new Strain(faces, neutral, strain_range?.values) : null;
-    this.nearby = this.strain && strain_position ? new NearbyStrain(this.strain) : null;
-    this.strainPosition = strain_position?.values; // (9·F): for each component of strain a vector in the frame
+    const offsets = Object.entries(SIGNALS).filter(([name]) => arrays[name]);
+    const followsStrain = arrays.strain_color || offsets.length;
+    const strain = followsStrain ? new Strain(faces, neutral, arrays.strain_range?.values) : null;
+    this.strain = strain;
+    /** Signals and their coefficients (3·S·F): for each of S components a vector in the frame. */
+    this.offsets = strain
+      ? offsets.map(([name, Signal]) => ({
+          signal: new Signal(strain),
+          components: Signal.components,
+          coefficients: /** @type {Values} */ (arrays[name]?.values),
+        }))
+      : [];
   }
 
   /**
@@ -39,9 +48,10 @@ export class FaceFrames {
   update(vertices) {
     this.placeFrames(vertices);
     this.strain?.update(vertices);
-    if (!this.nearby || !this.strainPosition) return;
-    this.nearby.update();
-    this.moveOrigins(this.nearby.values, this.strainPosition);
+    for (const { signal, components, coefficients } of this.offsets) {
+      signal.update();
+      this.moveOrigins(signal.values, components, coefficients);
+    }
   }
 
   /**
@@ -114,20 +124,22 @@ export class FaceFrames {
   }
 
   /**
-   * Move the origins with the nearby strain (3·F), in each triangle's own axes and unit.
+   * Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and unit.
    * @param {Float64Array} values
-   * @param {Values} strainPosition
+   * @param {number} components
+   * @param {Values} coefficients
    */
-  moveOrigins(values, strainPosition) {
+  moveOrigins(values, components, coefficients) {
     const { count, world } = this;
     for (let f = 0; f < count; f++) {
-      const from = 9 * f;
-      const a = values[3 * f];
-      const b = values[3 * f + 1];
-      const c = values[3 * f + 2];
-      const x = a * strainPosition[from] + b * strainPosition[from + 3] + c * strainPosition[from + 6];
-      const y = a * strainPosition[from + 1] + b * strainPosition[from + 4] + c * strainPosition[from + 7];
-      const z = a * strainPosition[from + 2] + b * strainPosition[from + 5] + c * strainPosition[from + 8];
+      let x = 0;
+      let y = 0;
+      let z = 0;
+      for (let k = components * f; k < components * (f + 1); k++) {
+        x += values[k] * coefficients[3 * k];
+        y += values[k] * coefficients[3 * k + 1];
+        z += values[k] * coefficients[3 * k + 2];
+      }
       for (let to = 12 * f; to < 12 * f + 12; to += 4) {
         world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
       }

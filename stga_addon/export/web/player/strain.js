@@ -1,6 +1,6 @@
 // @ts-check
 // Green's strain of the triangles against the neutral mesh, averaged over neighbors: three components, clipped; and
-// nearby strain, the same less that at rest, averaged over triangles that share an edge.
+// smoothed strain, the same less that at rest, averaged over triangles that share an edge.
 // The rules are those of STGA for Blender's strain.py.
 
 /** @import { Values } from './types.js' */
@@ -9,7 +9,7 @@ import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 const STRAIN_GAIN = 5;
 const MAX_STRAIN = 2;
-const AVERAGING_ROUNDS = 3; // of nearby strain
+const AVERAGING_ROUNDS = 3; // of smoothed strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
 export class Strain {
@@ -127,7 +127,9 @@ export class Strain {
 }
 
 /** Strain around each triangle, which positions follow: 0 for a mesh at rest. */
-export class NearbyStrain {
+export class SmoothedStrain {
+  static components = 3;
+
   /**
    * Of `strain` (Strain), which is to be updated first.
    * @param {Strain} strain

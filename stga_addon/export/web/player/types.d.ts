@@ -74,8 +74,9 @@ export interface Arrays {
   selection?: DataArray;
   sh?: DataArray;
   strain_color?: DataArray;
-  strain_position?: DataArray;
   strain_range?: DataArray;
+  /** Coefficients of signals (signals.js). */
+  [offset: string]: DataArray | undefined;
 }
 
 export interface Data {

@@ -1,4 +1,4 @@
-"""Adam on positions that follow strain on a WebGPU device against the CPU's."""
+"""Adam on driven offsets on a WebGPU device against the CPU's."""
 
 from copy import deepcopy
 
@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from raster import gpu_device
-from stga_addon.raster.gpu import strain_position as on_device
+from stga_addon.raster.gpu import driven_offsets as on_device
 from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.driven_offsets import OffsetTables, splats_by_triangle
 from stga_addon.raster.gpu.layout import VIEW
 from stga_addon.raster.gpu.optimizer import upload_step
-from stga_addon.raster.gpu.strain_position import StrainPositionTables, splats_by_triangle
-from stga_addon.training.optimize import strain_position as on_cpu
+from stga_addon.training.optimize import driven_offsets as on_cpu
 from stga_addon.training.optimize.adam import BETA1, BETA2
-from stga_addon.training.optimize.state import StrainPosition
+from stga_addon.training.optimize.state import OffsetState
 
 from .test_gpu_optimizer import RATES, STRIDE
 
+NAME = "strain_position"
 TRIANGLES, SPLATS = 300, 900
 EPSILON, EMA_SHARE = np.float32(1e-3), 0.02
 
@@ -26,35 +27,34 @@ def device() -> Device:
     return gpu_device.device()
 
 
-def random_state(seed: int = 0) -> StrainPosition:
+def random_state(seed: int = 0) -> OffsetState:
     """Triangles of any age."""
     rng = np.random.default_rng(seed)
     value, first, second, average = rng.normal(size=(4, TRIANGLES, 3, 3)).astype(np.float32)
-    return StrainPosition(value, first, second**2, average, rng.integers(0, 3000, TRIANGLES).astype(np.int32))
+    return OffsetState(value, first, second**2, average, rng.integers(0, 3000, TRIANGLES).astype(np.int32))
 
 
 def stepped(
-    device: Device, state: StrainPosition, face: np.ndarray, wanted: np.ndarray, gradients: np.ndarray,
+    device: Device, state: OffsetState, face: np.ndarray, wanted: np.ndarray, gradients: np.ndarray,
     smoothed: np.ndarray, rate: float,
-) -> StrainPosition:  # fmt: skip
+) -> OffsetState:  # fmt: skip
     """The state after a step on the device."""
     view = np.zeros(1, VIEW)
     view["splats"], view["coefficients"], view["strain_colors"] = SPLATS, 4, 2
-    upload_step(
-        device, RATES, (BETA1, BETA2), EPSILON, EMA_SHARE, (0, 0, 0), False, TRIANGLES, on_cpu.RATE_SHARE * rate
-    )  # fmt: skip
-    tables = StrainPositionTables(
+    rates = {**RATES, "xyz": rate}
+    upload_step(device, rates, (BETA1, BETA2), EPSILON, EMA_SHARE, (0, 0, 0), False, TRIANGLES)
+    tables = OffsetTables(
         **{name: device.upload(f"test position {name}", table) for name, table in vars(state).items()},
         splats_of=device.upload("test splats by triangle", splats_by_triangle(face, TRIANGLES)),
     )
     with device.record() as work:
         on_device.step(
-            work, TRIANGLES, tables, view=device.upload("view", view, "uniform"),
+            work, TRIANGLES, {NAME: tables}, {NAME: device.upload("test signal", smoothed)},
+            view=device.upload("view", view, "uniform"), gradients=device.upload("test gradients", gradients),
             wanted=device.upload("test wanted", wanted.astype(np.uint32)),
-            gradients=device.upload("test gradients", gradients), smoothed=device.upload("test smoothed", smoothed),
         )  # fmt: skip
     arrays = vars(state).items()
-    return StrainPosition(**{k: device.read(getattr(tables, k), was.shape, was.dtype) for k, was in arrays})
+    return OffsetState(**{k: device.read(getattr(tables, k), was.shape, was.dtype) for k, was in arrays})
 
 
 def test_a_step_is_the_cpus(device: Device) -> None:
@@ -77,7 +77,7 @@ def test_a_step_is_the_cpus(device: Device) -> None:
         state = stepped(device, state, face, wanted, gradients, smoothed, 0.02)
         with np.errstate(invalid="ignore", over="ignore"):
             rows, xyz = np.flatnonzero(wanted).astype(np.int32), gradients[:, :3].copy()
-            on_cpu.step(expected, rows, face, xyz, smoothed, 0.02, EMA_SHARE, EPSILON)
+            on_cpu.step({NAME: expected}, rows, face, xyz, lambda _, s=smoothed: s, 0.02, EMA_SHARE, EPSILON)
         np.testing.assert_array_equal(state.steps, expected.steps, err_msg=str(number))
         for name in ("value", "first", "second", "average"):
             got, want = getattr(state, name), getattr(expected, name)

@@ -1,4 +1,4 @@
-"""Training of positions that follow strain: gradient, step, run folder."""
+"""Training of driven offsets: gradient, step, run folder."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.avatar.offsets.strain_position import RATE_SHARE
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.render.render import render_avatar
-from stga_addon.training.optimize import adam, strain_position
-from stga_addon.training.optimize.state import new_strain_position
+from stga_addon.training.optimize import adam, driven_offsets
+from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state
@@ -32,10 +33,9 @@ def squeezed(toy: Capture) -> Capture:
 
 
 def make_trainer(capture: Capture, seed: int = 0) -> Trainer:
-    settings = quick_settings("global", lattice=1, strain_position=True, random_background=False)
+    settings = quick_settings("global", lattice=1, driven_offsets=("strain_position",), random_background=False)
     trainer = Trainer(capture, settings, {})
-    position = trainer.state.strain_position
-    assert position is not None
+    position = trainer.state.driven_offsets["strain_position"]
     position.value[:] = np.random.default_rng(seed).normal(0, 1e-3, position.value.shape)
     return trainer
 
@@ -48,8 +48,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
     view = capture.views["train"][0]
     target = np.random.default_rng(1).integers(0, 255, (view.camera.height, view.camera.width, 3), np.uint8)
     state = trainer.state
-    position = state.strain_position
-    assert position is not None
+    position = state.driven_offsets["strain_position"]
     before = position.value.copy()
     kept = [t.clone() for t in state.parameters]
 
@@ -78,7 +77,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
             ends.append(loss(changed))
         slope = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
-    rate = strain_position.RATE_SHARE * trainer.settings.rates.xyz
+    rate = RATE_SHARE * trainer.settings.rates.xyz
     moved = (stepped - before)[strongest]
     np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.05)  # Adam's first step is as long as the rate
     assert (np.sign(moved) == -np.sign(gradient[strongest])).all()
@@ -88,7 +87,7 @@ def test_the_step_is_adam_in_float64() -> None:
     """Catches a bias correction, an average or a count that is not each triangle's own, gradients of splats that were
     not trained, and a broken gradient that gets in."""
     rng, faces, rate, ema_share, epsilon = np.random.default_rng(2), 6, 0.02, 0.1, np.float32(1e-3)
-    state = new_strain_position(rng.normal(0, 1, (faces, 3, 3)))
+    state = new_offset(rng.normal(0, 1, (faces, 3, 3)))
     value, average = state.value.astype(np.float64), state.value.astype(np.float64)
     first, second, steps = np.zeros_like(value), np.zeros_like(value), np.zeros(faces, int)
     for number in range(8):
@@ -100,7 +99,10 @@ def test_the_step_is_adam_in_float64() -> None:
         )
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
-        strain_position.step(state, rows, face, gradient, smoothed, rate, ema_share, epsilon)
+        driven_offsets.step(
+            {"strain_position": state}, rows, face, gradient, {"strain_position": smoothed}.__getitem__, rate,
+            ema_share, epsilon,
+        )  # fmt: skip
         for f in np.unique(face[rows]):
             steps[f] += 1
             summed = sum(gradient[i].astype(np.float64) for i in rows if face[i] == f)
@@ -110,7 +112,7 @@ def test_the_step_is_adam_in_float64() -> None:
             first[f] = 0.9 * first[f] + 0.1 * g
             second[f] = 0.999 * second[f] + 0.001 * g**2
             m, v = first[f] / (1 - 0.9 ** steps[f]), second[f] / (1 - 0.999 ** steps[f])
-            value[f] -= strain_position.RATE_SHARE * rate * m / (np.sqrt(v) + epsilon)
+            value[f] -= RATE_SHARE * rate * m / (np.sqrt(v) + epsilon)
             average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
     np.testing.assert_array_equal(state.steps, steps)
     assert steps.min() == 0
@@ -123,28 +125,27 @@ def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
     """Catches a trainer whose splats move otherwise than those of the avatar that it writes."""
     capture = squeezed(toy)
     trainer = make_trainer(capture)
-    position = trainer.state.strain_position
-    assert position is not None
+    position = trainer.state.driven_offsets["strain_position"]
     position.average[:] = 10 * position.value
     view = capture.views["val"][0]
     seen = trained_strain_range(capture, capture.mesh, None)
     avatar = Avatar(
         trainer.state.averaged(), "stga", capture.neutral.astype(np.float32), capture.faces,
-        strain_range=seen, strain_position=position.average,
+        strain_range=seen, driven_offsets={"strain_position": position.average},
     )  # fmt: skip
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     np.testing.assert_allclose(drawn, expected, atol=2e-5)
-    still = render_avatar(
-        replace(avatar, strain_position=None), capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0)
-    )
+    still = render_avatar(replace(avatar, driven_offsets={}), capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     assert np.abs(still - drawn).max() > 0.005
 
 
 def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
     """Catches triangles that are not selected, whose splats would move in all frames."""
     capture = squeezed(toy)
-    settings = quick_settings("selective", lattice=1, strain_position=True, warm_up_share=0.0, global_interval=1000)
+    settings = quick_settings(
+        "selective", lattice=1, driven_offsets=("strain_position",), warm_up_share=0.0, global_interval=1000
+    )
     selected = np.zeros(len(capture.faces), bool)
     selected[:200] = True
     trainer = Trainer(capture, settings, dict.fromkeys(capture.timesteps, selected))
@@ -152,8 +153,7 @@ def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
     target = np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
     for _ in range(3):
         trainer.step(view, target, 0.5)
-    position = trainer.state.strain_position
-    assert position is not None
+    position = trainer.state.driven_offsets["strain_position"]
     assert position.steps[:200].max() > 0
     assert not position.steps[200:].any()
     assert not position.value[200:].any()
@@ -163,7 +163,7 @@ def trained(capture: Capture, out: Path, **changes: Any) -> Path:
     settings = quick_settings(
         "global",
         lattice=1,
-        strain_position=True,
+        driven_offsets=("strain_position",),
         iterations=40,
         density_interval=10,
         density_span=(0.0, 1.0),
@@ -180,23 +180,23 @@ def test_a_run_keeps_them(toy: Capture, tmp_path: Path) -> None:
     capture = replace(capture, views={"train": capture.views["train"]})  # the avatar is then that of the last state
     out = trained(capture, tmp_path / "run")
     avatar, kept = read_avatar(out / "avatar.npz"), read_checkpoint(out)
-    position = kept.state.strain_position
-    assert avatar.strain_position is not None
+    position = kept.state.driven_offsets["strain_position"]
     assert avatar.strain_range is not None
-    assert position is not None
-    assert np.abs(avatar.strain_position).max() > 0
-    np.testing.assert_array_equal(avatar.strain_position, position.average)
+    assert np.abs(avatar.driven_offsets["strain_position"]).max() > 0
+    np.testing.assert_array_equal(avatar.driven_offsets["strain_position"], position.average)
     continuation = Continuation(out, file_digest(out / "avatar.npz"), 0, 9)
-    settings = quick_settings("global", strain_position=True)
+    settings = quick_settings("global", driven_offsets=("strain_position",))
     state = starting_state(continuation, settings, len(capture.faces))
-    assert state.strain_position is not None
-    np.testing.assert_array_equal(state.strain_position.value, avatar.strain_position)
-    np.testing.assert_array_equal(state.strain_position.second, position.second)
+    np.testing.assert_array_equal(
+        state.driven_offsets["strain_position"].value, avatar.driven_offsets["strain_position"]
+    )
+    np.testing.assert_array_equal(state.driven_offsets["strain_position"].second, position.second)
     (out / CHECKPOINT).unlink()
     state = starting_state(continuation, settings, len(capture.faces))
-    assert state.strain_position is not None
-    np.testing.assert_array_equal(state.strain_position.average, avatar.strain_position)
-    assert not state.strain_position.second.any()
+    np.testing.assert_array_equal(
+        state.driven_offsets["strain_position"].average, avatar.driven_offsets["strain_position"]
+    )
+    assert not state.driven_offsets["strain_position"].second.any()
 
 
 def test_a_resumed_run_ends_where_an_unbroken_one_does(toy: Capture, tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(toy: Capture, tmp_path: P
     assert read_checkpoint(tmp_path / "parts").iteration == 17
     train(capture, tmp_path / "parts", run, resume=True)
     parts = read_avatar(tmp_path / "parts" / "avatar.npz")
-    np.testing.assert_array_equal(parts.strain_position, whole.strain_position)
+    np.testing.assert_array_equal(parts.driven_offsets["strain_position"], whole.driven_offsets["strain_position"])
     np.testing.assert_array_equal(parts.splats.xyz, whole.splats.xyz)
 
 
@@ -241,5 +241,5 @@ def test_a_checkpoint_of_another_choice(toy: Capture, tmp_path: Path) -> None:
     out = trained(capture, tmp_path / "run")
     arrays = {n: a for n, a in read_npz(out / CHECKPOINT).items() if not n.startswith("strain_position/")}
     write_npz(out / CHECKPOINT, arrays)
-    with pytest.raises(StgaError, match=r"its checkpoint and run\.json disagree on the effect strain-position"):
+    with pytest.raises(StgaError, match=r"its checkpoint and run\.json disagree on the driven offset strain_position"):
         train(capture, out, read_run(out), resume=True)

@@ -1,5 +1,5 @@
-// One step of Adam on how each triangle's splats move with strain, a thread a triangle, before the limits change the
-// splats' gradients.
+// One step of Adam on a driven offset's coefficients, a thread a triangle, before the limits change the splats'
+// gradients.
 //
 // A triangle of which no splat is wanted keeps every bit.
 
@@ -9,15 +9,16 @@
 @group(0) @binding(3) var<storage, read> gradients: array<f32>; // of the splats
 // (F + 1 + N): where each triangle's splats begin in this array, then those splats.
 @group(0) @binding(4) var<storage, read> splats_of: array<u32>;
-@group(0) @binding(5) var<storage, read> smoothed: array<f32>; // (F, 3) see smoothed_strain.wgsl
+@group(0) @binding(5) var<storage, read> driving: array<f32>; // (F, S): its signal
 @group(0) @binding(6) var<storage, read_write> steps: array<u32>; // (F,)
-// (F, 3, 3), as are the moments and the exponential moving average.
+// (F, S, 3), as are the moments and the exponential moving average.
 @group(0) @binding(7) var<storage, read_write> value: array<f32>;
 @group(0) @binding(8) var<storage, read_write> first: array<f32>;
 @group(0) @binding(9) var<storage, read_write> second: array<f32>;
 @group(0) @binding(10) var<storage, read_write> average: array<f32>;
 
-const COEFFICIENTS: u32 = 3u * STRAIN_COMPONENTS; // of a triangle
+override SIGNALS: u32; // S
+override RATE_SHARE: f32; // learning rate, as a share of that of the splats' positions
 
 @compute @workgroup_size(WORKGROUP)
 fn main(
@@ -46,23 +47,22 @@ fn main(
   if !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z)) {
     return;
   }
-  var gradient: array<f32, COEFFICIENTS>;
   var broken = false;
-  for (var c = 0u; c < COEFFICIENTS; c++) {
-    gradient[c] = smoothed[f * STRAIN_COMPONENTS + c / 3u] * moved[c % 3u];
-    broken = broken || is_too_large(gradient[c]);
+  for (var c = 0u; c < 3u * SIGNALS; c++) {
+    broken = broken || is_too_large(driving[f * SIGNALS + c / 3u] * moved[c % 3u]);
   }
   if broken {
     return;
   }
   let correct = corrections_at(step, steps[f]);
-  for (var c = 0u; c < COEFFICIENTS; c++) {
-    let n = f * COEFFICIENTS + c;
-    let m = step.beta1 * first[n] + (1.0 - step.beta1) * gradient[c];
-    let v = step.beta2 * second[n] + (1.0 - step.beta2) * gradient[c] * gradient[c];
+  for (var c = 0u; c < 3u * SIGNALS; c++) {
+    let n = 3u * SIGNALS * f + c;
+    let gradient = driving[f * SIGNALS + c / 3u] * moved[c % 3u];
+    let m = step.beta1 * first[n] + (1.0 - step.beta1) * gradient;
+    let v = step.beta2 * second[n] + (1.0 - step.beta2) * gradient * gradient;
     first[n] = m;
     second[n] = v;
-    let stepped = value[n] - step.strain_position_rate * m * correct.x / (sqrt(v) * correct.y + step.epsilon);
+    let stepped = value[n] - RATE_SHARE * step.rates[0].x * m * correct.x / (sqrt(v) * correct.y + step.epsilon);
     value[n] = stepped;
     average[n] += correct.z * (stepped - average[n]);
   }

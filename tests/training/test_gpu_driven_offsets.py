@@ -1,4 +1,4 @@
-"""Training of positions that follow strain by the WebGPU kernels, on software Vulkan where there is no GPU, against the
+"""Training of driven offsets by the WebGPU kernels, on software Vulkan where there is no GPU, against the
 CPU's."""
 
 from dataclasses import replace
@@ -17,30 +17,29 @@ from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.losses import limit_units
-from stga_addon.training.optimize.state import StrainPosition, TrainState, keep_rows, tensors_of
+from stga_addon.training.optimize.state import OffsetState, TrainState, keep_rows, tensors_of
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.loop import train
 from stga_addon.training.settings import TrainingSettings
 
+from .test_driven_offsets import squeezed
 from .test_gpu_backend import batch_of, disturbed, settings_of
 from .test_run import assert_same_state, make_run, stop_at
-from .test_strain_position import squeezed
 from .test_trainer import view_of
 from .toys import bits
 
 WHITE = np.ones(3, np.float32)
 
 
-def following(state: TrainState) -> StrainPosition:
-    assert state.strain_position is not None
-    return state.strain_position
+def following(state: TrainState) -> OffsetState:
+    return state.driven_offsets["strain_position"]
 
 
 def state_of(capture: Capture, settings: TrainingSettings) -> TrainState:
     """In the middle of training; the average of how positions follow strain is far from the latest values."""
     state, rng = disturbed(capture, settings), np.random.default_rng(5)
     shape = len(capture.faces), 3, 3
-    state.strain_position = StrainPosition(
+    state.driven_offsets["strain_position"] = OffsetState(
         value=rng.normal(0, 2e-3, shape).astype(np.float32),
         first=np.zeros(shape, np.float32),
         second=np.zeros(shape, np.float32),
@@ -59,7 +58,7 @@ def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuB
 
 
 def position_settings(**changes: Any) -> TrainingSettings:
-    return settings_of(strain_position=True, **changes)
+    return settings_of(driven_offsets=("strain_position",), **changes)
 
 
 def every_bit(state: TrainState) -> dict[str, np.ndarray]:
@@ -157,9 +156,9 @@ def test_states_are_the_same_bits_on_both(toy: Capture) -> None:
     cpu.state = gpu.state
     np.testing.assert_array_equal(every_bit(state)["strain_position/value"], kept["strain_position/value"])
     cpu.step(batch_of(capture, settings))  # which fails where an array has another type or is read-only
-    gpu.state = replace(state, strain_position=None)
+    gpu.state = replace(state, driven_offsets={})
     gpu.step(batch_of(capture, settings))
-    assert gpu.state.strain_position is None
+    assert not gpu.state.driven_offsets
 
 
 def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,7 +199,7 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, tmp_path: Path) -
     """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums in the order of
     chance: every bit must agree, across density control."""
     gpu_device.device()  # or skip
-    run = replace(make_run(squeezed(toy), iterations=14, strain_position=True), device="gpu")
+    run = replace(make_run(squeezed(toy), iterations=14, driven_offsets=("strain_position",)), device="gpu")
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     train(squeezed(toy), whole, run)
     train(squeezed(toy), broken, run, report=stop_at(6))

@@ -1,0 +1,1 @@
+"""Driven offsets: positions of splats that follow a signal of the pose."""

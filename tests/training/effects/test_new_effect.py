@@ -1,0 +1,152 @@
+"""The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy that the product does not know."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.embedding import FaceFrames, face_frames, to_world
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.offsets.offset import DrivenOffset
+from stga_addon.avatar.offsets.table import OFFSETS
+from stga_addon.avatar.strain import StrainBasis
+from stga_addon.capture.model import Capture
+from stga_addon.errors import StgaError
+from stga_addon.export.formats import FORMATS, export_avatar
+from stga_addon.export.ply import read_ply
+from stga_addon.training.effects.catalog import EFFECTS, Effect
+from stga_addon.training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
+from stga_addon.training.effects.rules import RULES, Verdict
+from stga_addon.training.optimize.trainer import Trainer
+from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.continuation import starting_state
+from stga_addon.training.run.folder import Continuation, Run
+from stga_addon.training.run.identity import file_digest
+from stga_addon.training.run.loop import train
+
+from ..test_driven_offsets import squeezed
+from ..toys import bits, quick_settings
+
+NAME = "toy_growth"
+
+
+def growth(basis: StrainBasis, frames: FaceFrames) -> np.ndarray:
+    """(F, 2): how much larger a triangle is than at rest, and the square of that."""
+    larger = frames.scale - 1
+    return np.stack([larger, larger**2], axis=1).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
+    monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, 2, growth, 1.0))
+    monkeypatch.setitem(EFFECTS, "toy-growth", Effect("toy-growth", "6 numbers", offset=NAME, added_later=True))
+    monkeypatch.setitem(RULES, "toy-growth", lambda facts: Verdict(facts.timesteps > 1, "the head grows"))
+
+
+@pytest.fixture
+def capture(toy: Capture) -> Capture:
+    """Without evaluation views: the avatar is then that of the last state."""
+    return replace(squeezed(toy), views={"train": toy.views["train"]})
+
+
+def planned(capture: Capture) -> Run:
+    choices = dict.fromkeys(("strain-color", "strain-position", "view-color", "exposure"), "off")
+    settings = quick_settings("global", lattice=1, iterations=30, effects={**choices, "tracking": "auto"})
+    settings = replace(settings, density_interval=10, density_span=(0.0, 1.0))
+    return with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
+
+
+def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
+    """An avatar with the toy's coefficients, and a posed mesh."""
+    rng = np.random.default_rng(seed)
+    neutral = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.3]]) / 10
+    faces = np.int32([[0, 1, 2], [1, 3, 2]])
+    values = {NAME: rng.normal(0, 0.05, (2, 2, 3)).astype(np.float32)}
+    return Avatar(lattice_splats(neutral, faces, 1), "stga", neutral, faces, driven_offsets=values), neutral * 1.3
+
+
+def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture: Capture, tmp_path: Path) -> None:
+    """Catches a parameter that the plan, training, density control, the checkpoint, the avatar file or a continuation
+    loses, because one of them goes by names instead of the tables."""
+    run = planned(capture)
+    assert run.settings.driven_offsets == (NAME,)
+    assert dict(describe_effects(run.effect_plan))["toy-growth"] == "on: the head grows [6 numbers]"
+    train(capture, tmp_path / "whole", run)
+    train(capture, tmp_path / "parts", run, report=lambda progress: progress.iteration == 13)
+    assert read_checkpoint(tmp_path / "parts").iteration == 13
+    train(capture, tmp_path / "parts", run, resume=True)
+    whole, parts = (read_checkpoint(tmp_path / name).state for name in ("whole", "parts"))
+    for name, expected in bits(whole).items():
+        np.testing.assert_array_equal(bits(parts)[name], expected, err_msg=name)
+    for name, expected in vars(whole.driven_offsets[NAME]).items():
+        np.testing.assert_array_equal(getattr(parts.driven_offsets[NAME], name), expected, err_msg=name)
+    avatar = read_avatar(tmp_path / "parts" / "avatar.npz")
+    np.testing.assert_array_equal(avatar.driven_offsets[NAME], whole.driven_offsets[NAME].average)
+    assert np.abs(avatar.driven_offsets[NAME]).max() > 1e-4
+    folder = tmp_path / "whole"
+    continuation = Continuation(folder, file_digest(folder / "avatar.npz"), 0, 9)
+    state = starting_state(continuation, run.settings, len(capture.faces))
+    np.testing.assert_array_equal(state.driven_offsets[NAME].second, whole.driven_offsets[NAME].second)
+
+
+def test_a_continuation_adds_it(capture: Capture) -> None:
+    """Catches an effect that only runs which began with it can have."""
+    run = planned(capture)
+    (decision,) = (each for each in run.effect_plan if each.effect == "toy-growth")
+    without = replace(
+        run, settings=replace(run.settings, driven_offsets=()), effect_plan=(replace(decision, on=False),)
+    )
+    assert with_effects_of_takes(without, capture).settings.driven_offsets == (NAME,)
+
+
+def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:
+    """Catches an effect that trains without its parameter on a GPU."""
+    with pytest.raises(StgaError, match=f"driven offset {NAME}: is trained on the CPU only, not on gpu"):
+        Trainer(capture, quick_settings("global", lattice=0, driven_offsets=(NAME,)), {}, device="gpu")
+
+
+@pytest.mark.parametrize("format", [name for name, row in FORMATS.items() if row.source != "motion"])
+def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) -> None:
+    """Catches an export that shows the avatar without the effect."""
+    if format == "usd":
+        pytest.importorskip("pxr")
+    avatar, posed = made()
+    path = tmp_path / f"avatar{(FORMATS[format].suffixes or ('',))[0]}"
+    if FORMATS[format].is_page:
+        with pytest.raises(StgaError, match=f"the web player has no driven offset {NAME}"):
+            export_avatar(path, avatar, format, [(0, posed)])
+        return
+    files = export_avatar(path, avatar, format, [(0, posed)])
+    moved = [file.read_bytes() for file in files]
+    export_avatar(path, replace(avatar, driven_offsets={}), format, [(0, posed)])
+    assert moved != [file.read_bytes() for file in files]
+
+
+def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
+    """Catches an offset in other axes or units than those of the triangle: against float64, by hand."""
+    avatar, posed = made()
+    [file] = export_avatar(tmp_path / "a.ply", avatar, "ply", [(0, posed)])
+    frames = face_frames(posed, avatar.faces, avatar.neutral)
+    np.testing.assert_allclose(frames.scale, 1.3, rtol=1e-6)
+    local = 0.3 * avatar.driven_offsets[NAME][:, 0] + 0.09 * avatar.driven_offsets[NAME][:, 1]
+    moves = 1.3 * np.einsum("fij,fj->fi", frames.rotation, local.astype(np.float64))
+    expected = to_world(avatar.splats, frames).xyz + moves[avatar.splats.face]
+    np.testing.assert_allclose(read_ply(file).xyz, expected, atol=1e-6)
+    assert np.abs(moves).max() > 0.01
+
+
+def test_blender_keeps_it() -> None:
+    """Catches a parameter that is lost in a .blend file, which is what the viewport and renders pose."""
+    bpy = pytest.importorskip("bpy")
+    from stga_addon.scene.arrays import triangle_mesh
+    from stga_addon.scene.display.splat_object import show_avatar, stored_avatar
+
+    avatar, posed = made()
+    head = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
+    bpy.context.scene.collection.objects.link(head)
+    stored = stored_avatar(show_avatar(avatar, head))
+    np.testing.assert_array_equal(stored.driven_offsets[NAME], avatar.driven_offsets[NAME])
+    np.testing.assert_allclose(stored.frames(posed).origin, avatar.frames(posed).origin, atol=1e-7)
