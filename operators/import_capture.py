@@ -124,8 +124,8 @@ def bring_in(
 
 def _open(context: Any, source: Path, flame: str, principal_point: str) -> Capture:
     """The capture, with the FLAME model that is given, else its own, else that of the preferences. Raises StgaError."""
-    own = not flame and any((source / name).is_file() for name in OWN_MODELS)
-    model = None if own else flame_model_path(context, flame)
+    has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
+    model = None if has_model else flame_model_path(context, flame)
     return open_capture(source, flame=model, principal_point=principal_point)
 
 

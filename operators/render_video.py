@@ -204,8 +204,8 @@ class _Recording:
                 self._scene.frame_set(frame)
                 layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
                 self._posed = frame, [layer.posed() for layer in layers]
-            own = self._cameras is None
-            camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[self._recorded]
+            given = None if self._cameras is None else self._cameras[self._recorded]
+            camera = given or scene_camera(bpy.context.evaluated_depsgraph_get())
         self._recorder.add(self._posed[1], camera)
         self._recorded += 1
         self.is_cancelled = self._status.update(self._recorded / len(self._frames), "Recording")

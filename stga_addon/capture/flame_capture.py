@@ -99,8 +99,8 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
 
 def _model_file(root: Path, given: Path | None) -> Path:
     """The FLAME model file that is given, else the one in the capture's folder."""
-    own = (root / name for name in OWN_MODELS)
-    found = given or next((path for path in own if path.is_file()), None)
+    beside = (root / name for name in OWN_MODELS)
+    found = given or next((path for path in beside if path.is_file()), None)
     if found is None:
         raise StgaError(
             f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame or in the"

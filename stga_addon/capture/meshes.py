@@ -81,15 +81,16 @@ def tracked_meshes(
 
     def mesh(timestep: int) -> np.ndarray:
         path = file_of(files, timestep)
-        vertices, own = read(path)
-        if own.shape != faces.shape:
+        vertices, triangles = read(path)
+        if triangles.shape != faces.shape:
             raise StgaError(
-                f"{path}: has {len(own)} triangles, but {canonical} has {len(faces)}; the topology must not change"
+                f"{path}: has {len(triangles)} triangles, but {canonical} has {len(faces)}; "
+                "the topology must not change"
             )
-        if not np.array_equal(own, faces):
-            different = int(np.argmax((own != faces).any(axis=1)))
+        if not np.array_equal(triangles, faces):
+            different = int(np.argmax((triangles != faces).any(axis=1)))
             raise StgaError(
-                f"{path}: triangle {different} joins vertices {own[different].tolist()}, "
+                f"{path}: triangle {different} joins vertices {triangles[different].tolist()}, "
                 f"but {faces[different].tolist()} in {canonical}; the topology must not change"
             )
         if len(vertices) != count:

@@ -76,7 +76,9 @@ def summary(out: Path, blend: Path | None) -> list[str]:
     report = read_json(out / CAPTURE / REPORT_FILE)
     try:
         errors = report["reprojection_px"]
-        timesteps = {timestep for own in errors.values() for timestep in own} | set(map(str, report["interpolated"]))
+        timesteps = {timestep for by_timestep in errors.values() for timestep in by_timestep} | set(
+            map(str, report["interpolated"])
+        )
         lines = [f"warning: {warning}" for warning in report["warnings"]]
         lines += [f"footage: cameras {len(errors)}, timesteps {len(timesteps)}"]
         lines += [f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"]

@@ -55,9 +55,9 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) 
     timesteps = tuple(timestep for timestep in capture.timesteps if first <= timestep <= last)
     if not timesteps:
         raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
-    own = min(capture.timesteps), max(capture.timesteps)
-    if first < own[0] or last > own[1]:
-        say(f"--frames {first}:{last}: the capture has timesteps {own[0]} to {own[1]}")
+    begin, end = min(capture.timesteps), max(capture.timesteps)
+    if first < begin or last > end:
+        say(f"--frames {first}:{last}: the capture has timesteps {begin} to {end}")
     return timesteps
 
 

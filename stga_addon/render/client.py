@@ -49,7 +49,7 @@ class RenderClient:
                 if device != self._server_device:
                     self.close()
                 return self._request(layers, camera, with_depth)
-            if device != self._composer.wanted:
+            if device != self._composer.requested:
                 self._composer = Composer(device)
             image = self._composer.compose(layers, camera, with_depth)
             self.failure = self._composer.failure
@@ -97,9 +97,9 @@ class RenderClient:
         try:
             return self._find_python()
         except StgaError as error:
-            own = f"{sys.executable}, {sys.version.split()[0]}"
+            this = f"{sys.executable}, {sys.version.split()[0]}"
             raise StgaError(
-                f"Rendering splats needs {' and '.join(missing_packages())} in Blender's own Python ({own}), "
+                f"Rendering splats needs {' and '.join(missing_packages())} in Blender's own Python ({this}), "
                 "or a training environment, which the add-on's preferences or `stga environment` make or choose"
             ) from error
 

@@ -12,18 +12,18 @@ from .device import GPU, choose_device, first_line
 class Composer:
     """Renders layers on a device, which is chosen with the first image.
 
-    wanted   see `choose_device`; with "auto", the CPU renders from a GPU's first failure on
+    requested   see `choose_device`; with "auto", the CPU renders from a GPU's first failure on
     device   the one that was chosen; "" before
     failure  why the CPU took over; "" where it did not
     """
 
-    def __init__(self, wanted: str = "auto") -> None:
-        self.wanted, self.device, self.failure = wanted, "", ""
+    def __init__(self, requested: str = "auto") -> None:
+        self.requested, self.device, self.failure = requested, "", ""
 
     def choose(self) -> str:
         """The device of the next image. Raises StgaError where the one that is asked for by name does not work."""
         if not self.device:
-            self.device, _ = choose_device(self.wanted, "Rendering")
+            self.device, _ = choose_device(self.requested, "Rendering")
         return self.device
 
     def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
@@ -34,7 +34,7 @@ class Composer:
             try:
                 return gpu.compose(self.device.removeprefix(GPU), layers, camera, with_depth)
             except Exception as error:  # a driver raises what it likes
-                if self.wanted != "auto":
+                if self.requested != "auto":
                     raise
                 cause = error.cause if isinstance(error, DeviceError) else f"{self.device}: {first_line(error)}"
                 self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")

@@ -24,21 +24,21 @@ def is_device(value: Any) -> bool:
     return value in DEVICES or (value.startswith(GPU) and len(GPU) < len(value) <= MAX_DEVICE_LENGTH)
 
 
-def choose_device(wanted: str, task: str = "Training") -> tuple[str, str]:
+def choose_device(requested: str, task: str = "Training") -> tuple[str, str]:
     """The device, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
 
-    wanted: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with this
-    part in its name). "auto" takes the first adapter that is not software, right and faster than the CPU. task: what is
-    done there. Raises StgaError if a GPU is wanted and none works.
+    requested: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with
+    this part in its name). "auto" takes the first adapter that is not software, right and faster than the CPU.
+    task: what is done there. Raises StgaError if a GPU is requested and none works.
     """
-    if wanted == "cpu":
+    if requested == "cpu":
         return "cpu", f"{task} on the CPU (--device cpu)"
-    if wanted == "auto":
+    if requested == "auto":
         return _fastest(task)
-    adapter = adapter_name(wanted)
+    adapter = adapter_name(requested)
     trial = _trial(adapter)
     if not trial.is_right:
-        raise StgaError(f"--device {wanted}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu")
+        raise StgaError(f"--device {requested}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu")
     return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
 
 
@@ -57,10 +57,10 @@ def adapter_names(software: bool = True) -> list[str]:
 
 def adapter_name(device: str) -> str:
     """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError where there is none, or several."""
-    names, wanted = adapter_names(), device.removeprefix(GPU)
-    if device == "gpu" or wanted in names:
-        return names[0] if device == "gpu" else wanted
-    found = [name for name in names if wanted.lower() in name.lower()]
+    names, part = adapter_names(), device.removeprefix(GPU)
+    if device == "gpu" or part in names:
+        return names[0] if device == "gpu" else part
+    found = [name for name in names if part.lower() in name.lower()]
     if len(found) == 1:
         return found[0]
     which = "several adapters" if found else "no adapter"

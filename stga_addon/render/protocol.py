@@ -49,10 +49,10 @@ def unpack_layers(arrays: Mapping[str, np.ndarray], before: Sequence[PosedSplats
     """The inverse of `pack_layers`. Raises KeyError where splats are missing from the arrays and from `before`."""
     names = [[f"{index} splats {name}" for name in SPLAT_FIELDS] for index in range(int(arrays["layers"]))]
     splats = [
-        Splats(**{field: arrays[name] for field, name in zip(SPLAT_FIELDS, own, strict=True)})
-        if own[0] in arrays or index >= len(before)
+        Splats(**{field: arrays[name] for field, name in zip(SPLAT_FIELDS, stored, strict=True)})
+        if stored[0] in arrays or index >= len(before)
         else before[index].splats
-        for index, own in enumerate(names)
+        for index, stored in enumerate(names)
     ]
     return [
         PosedSplats(

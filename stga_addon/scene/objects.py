@@ -41,10 +41,10 @@ COLLECTIONS = {tags.RIG: "bones", tags.CAMERA: "cameras"}
 
 def collection_of(root: Any, kind: str) -> Any:
     """The collection of the root's objects of this kind; None where none was placed yet."""
-    own = root.users_collection[0]
+    collection = root.users_collection[0]
     if kind not in COLLECTIONS:
-        return own
-    return next((child for child in own.children if child.get(tags.KIND) == kind), None)
+        return collection
+    return next((child for child in collection.children if child.get(tags.KIND) == kind), None)
 
 
 def _make_collection(root: Any, kind: str) -> Any:

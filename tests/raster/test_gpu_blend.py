@@ -66,7 +66,9 @@ def on_device(
     with device.record() as work:
         chosen = choose_tiles(work, count, tiles, **given)
         projected = shared["projected"]
-        lists = list_pairs(work, count, tiles, CAPACITY, depth_key=keys, projected=projected, chosen=chosen, **given)
+        lists = list_pairs(
+            work, count, tiles, CAPACITY, depth_key=keys, projected=projected, tile_table=chosen, **given
+        )
         shared |= {"tile_range": chosen.tile_range, "pair_slot": lists.pair_slot, "slot_splat": lists.slot_splat}
         image, pixels = blend_forward(work, area, tiles, rendered=chosen.rendered, **shared)
         v_pixels = {"v_image": v_image, "v_transmittance": v_transmittance}

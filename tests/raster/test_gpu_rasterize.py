@@ -104,7 +104,7 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient() -> Non
     image = raw.image(rendering)
     full, all_written, full_screen = raw.gradients(rendering)
     part = raw.forward(focus, reach=10)
-    rendered = raw.read(part.chosen.rendered, 5, 7, dtype=np.uint32) > 0
+    rendered = raw.read(part.tile_table.rendered, 5, 7, dtype=np.uint32) > 0
     assert 0 < rendered.sum() < rendered.size
     pixels = np.kron(rendered, np.ones((16, 16), bool))[:70, :100]
     np.testing.assert_array_equal(raw.image(part)[:, pixels], image[:, pixels])
@@ -167,7 +167,7 @@ def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def loses_a_tile(self, work, rendering, *arguments):
         work.clear(work.device.buffer("pair_gradients", 0))  # which hold the right ones of the first trial
-        work.clear(rendering.chosen.touched, 12)
+        work.clear(rendering.tile_table.touched, 12)
         return backward(self, work, rendering, *arguments)
 
     monkeypatch.setattr(Rasterizer, "backward", loses_a_tile)

@@ -74,7 +74,9 @@ def listed(
     with device.record() as work:
         chosen = choose_tiles(work, count, tiles, **given)
         projected = device.upload("projected", columns)
-        lists = list_pairs(work, count, tiles, capacity, depth_key=keys, projected=projected, chosen=chosen, **given)
+        lists = list_pairs(
+            work, count, tiles, capacity, depth_key=keys, projected=projected, tile_table=chosen, **given
+        )
     counts = device.read(counts_buffer(device), (COUNTS,), np.uint32)
     shapes = {"touched": (tiles,), "rendered": (tiles,), "tile_range": (tiles, 2)}
     shapes |= dict.fromkeys(("pair_slot", "slot_splat"), (int(counts[PAIRS]),))

@@ -100,15 +100,15 @@ def _similarity_row(moments, stride, span, first, past, slopes):
 
 
 @inline_jit
-def _gradient_row(image, wanted, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient):
+def _gradient_row(image, target_row, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient):
     """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`. Returns Σ |difference|.
 
-    image, gradient (W,): the row; wanted: the target's, from `keep` on; blurred: the three blurred slopes, `stride`
+    image, gradient (W,): the row; target_row: the target's, from `keep` on; blurred: the three blurred slopes, `stride`
     apart.
     """
     absolute = ZERO
     for n in range(np.uint64(first), np.uint64(past)):
-        x, y = image[np.uint64(left) + n], wanted[np.uint64(keep) + n]
+        x, y = image[np.uint64(left) + n], target_row[np.uint64(keep) + n]
         sign = ONE if x > y else (-ONE if x < y else ZERO)
         absolute += abs(x - y)
         slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
@@ -133,7 +133,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
         left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
         span = right - left
         stride = span + 2 * WINDOW_RADIUS_PX
-        wanted = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
+        target_row = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
         source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
         first = np.zeros(4 * RING_ROWS * stride, np.float32)
         moments = np.zeros(4 * stride, np.float32)
@@ -147,9 +147,9 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
             if inside:
                 keep = (row % RING_ROWS) * stride
                 for n in range(span):
-                    wanted[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
+                    target_row[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
                 for n in range(np.uint64(span)):
-                    x, y = image[c, row, np.uint64(left) + n], wanted[np.uint64(keep) + n]
+                    x, y = image[c, row, np.uint64(left) + n], target_row[np.uint64(keep) + n]
                     source[np.uint64(WINDOW_RADIUS_PX) + n] = x
                     source[np.uint64(stride + WINDOW_RADIUS_PX) + n] = y
                     source[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = x * x + y * y
@@ -186,7 +186,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                 _blur_column(second, plane, stride, out, blurred, plane * stride, span)
             keep = (out % RING_ROWS) * stride
             absolute = _gradient_row(
-                image[c, out], wanted, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
+                image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
                 gradient[c, out],
             )  # fmt: skip
             difference += absolute

@@ -53,10 +53,10 @@ class _Composition:
         if not with_depth:
             return ComposedImage(rgb, alpha, None)
         with self._device.record() as work:
-            seen, lists, chosen = self._project(work, depth_as_color=True), rendering.lists, rendering.chosen
+            seen, lists, tile_table = self._project(work, depth_as_color=True), rendering.lists, rendering.tile_table
             image, _ = blend_forward(
-                work, camera.width * camera.height, rendering.tiles, view=rendering.view, rendered=chosen.rendered,
-                tile_range=chosen.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
+                work, camera.width * camera.height, rendering.tiles, view=rendering.view, rendered=tile_table.rendered,
+                tile_range=tile_table.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
                 projected=seen.projected,
             )  # fmt: skip
         depth = read(image, (camera.height, camera.width))

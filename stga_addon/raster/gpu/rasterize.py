@@ -68,7 +68,7 @@ class Rendering:
     image: Any
     pixels: Any
     projected: Any
-    chosen: Tiles
+    tile_table: Tiles
     lists: PairLists
     view: Any
     frames: Any
@@ -101,14 +101,16 @@ class Rasterizer:
         """Record the rendering of `count` projected splats; frames: kept for the backward pass."""
         columns, rows = tile_grid(camera.width, camera.height)
         tiles = columns * rows
-        chosen = choose_tiles(work, count, tiles, rect=seen.rect, view=view, focus=focus)
-        lists = list_pairs(work, count, tiles, self.capacity, chosen=chosen, focus=focus, view=view, **seen._asdict())
+        tile_table = choose_tiles(work, count, tiles, rect=seen.rect, view=view, focus=focus)
+        lists = list_pairs(
+            work, count, tiles, self.capacity, tile_table=tile_table, focus=focus, view=view, **seen._asdict()
+        )
         image, pixels = blend_forward(
-            work, camera.width * camera.height, tiles, view=view, rendered=chosen.rendered,
-            tile_range=chosen.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
+            work, camera.width * camera.height, tiles, view=view, rendered=tile_table.rendered,
+            tile_range=tile_table.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
             projected=seen.projected,
         )  # fmt: skip
-        return Rendering(image, pixels, seen.projected, chosen, lists, view, frames, tiles)
+        return Rendering(image, pixels, seen.projected, tile_table, lists, view, frames, tiles)
 
     def backward(
         self, work: Recording, rendering: Rendering, splats: SplatTable, v_image: Any, gradients: Any,
@@ -119,11 +121,11 @@ class Rasterizer:
         v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of `gradients`. Returns
         `screen`, see `project_backward`.
         """
-        lists, chosen = rendering.lists, rendering.chosen
+        lists, tile_table = rendering.lists, rendering.tile_table
         shared = {"view": rendering.view, "projected": rendering.projected}
         pair_gradients = blend_backward(
             work, self.capacity, rendering.tiles, v_image=v_image, v_transmittance=v_transmittance,
-            touched=chosen.touched, tile_range=chosen.tile_range, pair_slot=lists.pair_slot,
+            touched=tile_table.touched, tile_range=tile_table.tile_range, pair_slot=lists.pair_slot,
             slot_splat=lists.slot_splat, pixels=rendering.pixels, **shared,
         )  # fmt: skip
         return project_backward(

@@ -39,28 +39,28 @@ def counts_buffer(device: Device) -> Any:
 def choose_tiles(work: Recording, count: int, tiles: int, *, view: Any, rect: Any, focus: Any | None) -> Tiles:
     """Record which of `tiles` tiles are rendered of `count` splats; focus (N,): see `mark_focus`, None for all."""
     device = work.device
-    chosen = Tiles(
+    tile_table = Tiles(
         device.buffer("touched", tiles), device.buffer("rendered", tiles), device.buffer("ranges", 2 * tiles)
     )
     given = {"view": view, "rect": rect, "focus": rect if focus is None else focus}
     if focus is not None:
-        work.clear(chosen.touched, tiles)
-        work.dispatch(device.kernel("tiles", "mark"), device.groups(count), **given, **chosen._asdict())
-    work.dispatch(device.kernel("tiles", "choose"), device.groups(tiles), **given, **chosen._asdict())
-    return chosen
+        work.clear(tile_table.touched, tiles)
+        work.dispatch(device.kernel("tiles", "mark"), device.groups(count), **given, **tile_table._asdict())
+    work.dispatch(device.kernel("tiles", "choose"), device.groups(tiles), **given, **tile_table._asdict())
+    return tile_table
 
 
 def list_pairs(
     work: Recording, count: int, tiles: int, capacity: int, *, view: Any, depth_key: Any, rect: Any, projected: Any,
-    chosen: Tiles, focus: Any | None,
+    tile_table: Tiles, focus: Any | None,
 ) -> PairLists:  # fmt: skip
-    """Record the lists of the chosen tiles, with room for `capacity` pairs, and fill `chosen.tile_range`."""
+    """Record the lists of the rendered tiles, with room for `capacity` pairs, and fill `tile_table.tile_range`."""
     device, counts, groups = work.device, counts_buffer(work.device), work.device.groups(count)
     kernel, buffer = device.kernel, device.buffer
     _, order = sort_keys(work, depth_key, count, DEPTH_BITS, view=view)
     wanted, slots = buffer("wanted", count), buffer("slots", 2 * count)
     counted = {
-        "view": view, "order": order, "rect": rect, "projected": projected, "rendered": chosen.rendered,
+        "view": view, "order": order, "rect": rect, "projected": projected, "rendered": tile_table.rendered,
         "counts": counts, "pairs_until": buffer("pairs_until", count + -(-count // WORKGROUP)), "wanted": wanted,
     }  # fmt: skip
     given = {**counted, "focus": rect if focus is None else focus}
@@ -74,7 +74,7 @@ def list_pairs(
     pair_tile, pair_slot = sort_keys(work, slot_tile, capacity, tiles.bit_length(), view=view, of_pairs=True)
     work.dispatch(
         kernel("tile_lists"), (counts, 4 * PAIR_GROUPS), counts=counts, pair_tile=pair_tile,
-        tile_range=chosen.tile_range,
+        tile_range=tile_table.tile_range,
     )  # fmt: skip
     return PairLists(pair_slot, slot_splat, slots, wanted)
 

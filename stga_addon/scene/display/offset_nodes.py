@@ -36,12 +36,13 @@ def displayed_offsets(names: Collection[str]) -> tuple[str, ...]:
 
 @cache
 def shifted(offset: str, convention: str) -> NodeGroup:
-    """The group that moves frames by an offset: a mesh from FRAMES, with the signal, to the same mesh."""
+    """The group that moves frames by an offset: a mesh from STRAIN with FRAMES to the same mesh."""
     name = f"STGA Driven Offset ({SIGNALS[offset].label}, {convention})"
     return NodeGroup(name, {"Frames": "Geometry"}, "Geometry", partial(_shifted, offset, convention))
 
 
 def _shifted(offset: str, convention: str, nodes: Nodes, mesh: Any) -> Any:
+    mesh = nodes.group(SIGNALS[offset].group, mesh)
     signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute, "FLOAT_VECTOR"))
     terms = (
         nodes.scale(nodes.attribute(DRIVEN_OFFSET.format(offset, index), "FLOAT_VECTOR"), factor)

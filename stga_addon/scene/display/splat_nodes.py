@@ -50,7 +50,7 @@ class TreeOptions(NamedTuple):
     @property
     def tree_name(self) -> str:
         """At most 59 characters: Blender before 5.0 has room for 63, and adds ".001" to a name that is taken."""
-        driven = [*(["strain color"] if self.strain_color else []), *(SIGNALS[name].label for name in self.offsets)]
+        driven = [*(["color"] if self.strain_color else []), *(SIGNALS[name].label for name in self.offsets)]
         return f"STGA Splats ({', '.join([self.convention or 'world', f'SH {self.degree}', *driven])})"
 
 
@@ -157,10 +157,7 @@ def _frames(nodes: Nodes, head: Any, strained: Any, convention: str, offsets: tu
     """The mesh with the frames that place splats; strained: from `_strained`, where there are driven offsets."""
     if not offsets:
         return nodes.group(FRAMES[convention], head)
-    mesh = strained
-    for name in offsets:
-        mesh = nodes.group(SIGNALS[name].group, mesh)
-    mesh = nodes.group(FRAMES[convention], mesh)
+    mesh = nodes.group(FRAMES[convention], strained)
     for name in offsets:
         mesh = nodes.group(shifted(name, convention), mesh)
     return mesh

@@ -47,8 +47,8 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
     """
     check_head(avatar, head)
     prepared = prepared or avatar_attributes(avatar)
-    own = (collection for collection in head.users_collection if collection.library is None)  # or all are linked
-    collection = next(own, bpy.context.scene.collection)
+    local = (collection for collection in head.users_collection if collection.library is None)  # or all are linked
+    collection = next(local, bpy.context.scene.collection)
     splat_object = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
     splat_object[tags.CONVENTION], splat_object[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
     _add_modifier(splat_object, _tree_options(avatar))

@@ -92,8 +92,8 @@ def _rendered_objects(layer: Any) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
-    own = [candidate for candidate in layer.collection.objects if not candidate.hide_render]
-    return list(dict.fromkeys([*own, *(each for child in layer.children for each in _rendered_objects(child))]))
+    shown = [candidate for candidate in layer.collection.objects if not candidate.hide_render]
+    return list(dict.fromkeys([*shown, *(each for child in layer.children for each in _rendered_objects(child))]))
 
 
 def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:

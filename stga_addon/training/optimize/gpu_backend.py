@@ -194,7 +194,7 @@ class GpuBackend:
             rendering = self._render(work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected)
             v_image, loss = image_loss(
                 work, camera.width, camera.height, view=rendering.view, image=rendering.image,
-                touched=rendering.chosen.touched, whole=whole,
+                touched=rendering.tile_table.touched, whole=whole,
             )  # fmt: skip
             screen = self._rasterizer.backward(work, rendering, splats, v_image, self._gradients)
             offset_stage.step(

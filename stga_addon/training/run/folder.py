@@ -24,7 +24,7 @@ from ...schema import complaint, from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effects.decisions import EffectDecision
 from ..settings import TrainingSettings
-from .identity import Identity
+from .identity import RunIdentity
 
 FORMAT, VERSION = "stga-run", 4
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
@@ -36,7 +36,7 @@ class Take:
 
     capture: Path
     start: int
-    identity: Identity
+    identity: RunIdentity
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Run:
     settings: TrainingSettings
     effect_plan: tuple[EffectDecision, ...] = ()
     device: str = setting("cpu", accepts=is_device, expected=EXPECTED_DEVICE)
-    identity: Identity | None = field(default=None, compare=False)
+    identity: RunIdentity | None = field(default=None, compare=False)
     takes: tuple[Take, ...] = ()
     continuation: Continuation | None = None
 

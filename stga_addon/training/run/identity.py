@@ -19,7 +19,7 @@ bits. It is irrational, so that neither decimals nor binary fractions lie at the
 
 
 @dataclass(frozen=True)
-class Identity:
+class RunIdentity:
     """What a run was trained with. Digests are SHA-256.
 
     principal_point  convention of the capture
@@ -46,10 +46,10 @@ class Identity:
         return _digest(json.dumps(asdict(self)).encode())
 
 
-def identity_of(capture: Capture, principal_point: str, settings: TrainingSettings) -> Identity:
+def identity_of(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
     """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises StgaError."""
     views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
-    return Identity(
+    return RunIdentity(
         principal_point,
         _summary([view for _, view in views]),
         _digest(json.dumps([_image(split, view) for split, view in views]).encode()),
@@ -61,7 +61,7 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
     )
 
 
-def difference(trained: Identity, given: Identity) -> str | None:
+def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
     """The first part of `given` that differs from `trained`, as in "has other images"; None where they agree."""
     phrases = {
         "faces": "has a mesh with other triangles",

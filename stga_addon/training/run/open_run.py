@@ -9,7 +9,7 @@ from ...capture.takes import join_takes
 from ...errors import StgaError
 from ...render.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, has_run, read_run
-from .identity import Identity, difference, identity_of
+from .identity import RunIdentity, difference, identity_of
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _open_take(folder: Path, run: Run, take: Take) -> Capture:
     return capture
 
 
-def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
+def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
     """The identity of `run` on `capture`.
 
     Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
@@ -83,21 +83,23 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> Identity:
     raise StgaError(f"{folder}: was begun with other settings; restore them in run.json, or train into another folder")
 
 
-def device_of(run: Run, wanted: str = "auto") -> tuple[str, str]:
-    """The device to continue a run on, and why: its own, unless `wanted` names another (`choose_device`).
+def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
+    """The device to continue a run on, and why: its own, unless `requested` names another (`choose_device`).
 
     A run of a GPU that this machine lacks continues on the first one.
     Raises StgaError where that device does not work or cannot train this run.
     """
-    own = run.device if _has(run.device) else run.device.partition(":")[0]
+    trained_on = run.device if _has(run.device) else run.device.partition(":")[0]
     try:
-        device, reason = choose_device(own if wanted == "auto" else wanted)
+        device, reason = choose_device(trained_on if requested == "auto" else requested)
     except StgaError as error:
-        if wanted != "auto":
+        if requested != "auto":
             raise
-        raise StgaError(f"this run was trained on {own}: {error}; give --device cpu to continue on the CPU") from error
+        raise StgaError(
+            f"this run was trained on {trained_on}: {error}; give --device cpu to continue on the CPU"
+        ) from error
     if run.settings.tracking and device != "cpu":
-        raise StgaError(f"--device {wanted}: this run refines the tracking, which works on the CPU only")
+        raise StgaError(f"--device {requested}: this run refines the tracking, which works on the CPU only")
     return device, reason
 
 
