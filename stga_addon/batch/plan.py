@@ -28,6 +28,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import product
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +216,8 @@ def _variants(where: str, name: str, given: Mapping[str, Any], table: Mapping[st
     if not isinstance(sweep, dict):
         raise StgaError(f"{where}: sweep: expected lists of values by field, got {shorten(sweep)}")
     swept = {key: _swept(f"{where}: sweep: {key}", key, items) for key, items in sweep.items()}
+    if len(cases) * prod(map(len, swept.values())) > MAX_JOBS:
+        raise StgaError(f"{where}: makes more than {MAX_JOBS} jobs")
     for number, case in enumerate(cases):
         own = case.get("name", str(number) if case else "")
         if case and (not isinstance(own, str) or not NAME.fullmatch(own)):
@@ -239,7 +242,9 @@ def _swept(where: str, key: str, items: Any) -> list[tuple[str, Any]]:
     first, last, size = (items[name] for name in RANGE_KEYS)
     whole = all(isinstance(number, int) and not isinstance(number, bool) for number in (first, last, size))
     if not whole or not 0 <= first <= last or size < 1:
-        raise StgaError(f"{where}: expected whole numbers, 'first' up to 'last' and 'size' from 1, got {shorten(items)}")
+        raise StgaError(
+            f"{where}: expected whole numbers, 'first' up to 'last' and 'size' from 1, got {shorten(items)}"
+        )
     if (last - first) // size >= MAX_JOBS:
         raise StgaError(f"{where}: makes more than {MAX_JOBS} jobs")
     short, digits = key.rpartition(".")[2], len(str(last))

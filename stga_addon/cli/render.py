@@ -26,7 +26,8 @@ NAME, HELP = "render", "render an avatar as pictures, video or turntable"
 COVERED = 0.0
 """Degrees of a turntable that covers what the cameras saw."""
 SAME_FIELDS = (
-    "cameras", "turntable", "camera", "fps", "frames", "capture", "flame", "motion", "background", "principal_point", "device",
+    "cameras", "turntable", "camera", "fps", "frames", "capture", "flame", "motion", "background", "principal_point",
+    "device",
 )  # fmt: skip
 """Options that are fields of the request."""
 

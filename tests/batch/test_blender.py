@@ -1,4 +1,4 @@
-"""Frames of an animation on workers, by a real Blender: STGA_BLENDER holds the command that starts it (docs/blender.md)."""
+"""Frames of an animation on workers, by a real Blender, which the command in STGA_BLENDER starts (docs/blender.md)."""
 
 import os
 import shlex
@@ -75,8 +75,9 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         write_avatar(folder / "avatar.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), faces))
         (folder / "make.py").write_text(MAKE.format(folder=str(folder)))
         blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
+        names = folder / "whole/######"
         blender(
-            "--background", folder / "head.blend", "--engine", "STGA_SPLATS", "--render-output", folder / "whole/######",
+            "--background", folder / "head.blend", "--engine", "STGA_SPLATS", "--render-output", names,
             "--render-format", "PNG", "--frame-start", 0, "--frame-end", 4, "--render-anim",
         )  # fmt: skip
         yield folder

@@ -199,7 +199,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
     """Catches two batches that write into each other's jobs, also where the storage knows no file locks."""
     if locks == "fail":
 
-        def no_lock(path: Path) -> None:
+        def no_lock(path: Path, beats: bool) -> None:
             raise OSError(errno.ENOLCK, "No locks available")
 
         monkeypatch.setattr(leases, "hold_lock", no_lock)

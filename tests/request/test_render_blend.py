@@ -1,4 +1,4 @@
-"""Rendering a .blend file's frames with a program in the place of Blender; `tests/batch/test_blender.py` has a real one."""
+"""Rendering a .blend file's frames with a program in place of Blender; `tests/batch/test_blender.py` has a real one."""
 
 import os
 import signal
@@ -73,11 +73,13 @@ def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> 
 def test_what_went_wrong_is_a_sentence(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a film that counts as finished although frames are missing, and a Blender that is not there."""
     monkeypatch.setenv("FAILS", "10")
-    with pytest.raises(StgaError, match=r"shot.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"):
+    with pytest.raises(
+        StgaError, match=r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"
+    ):
         perform(shot, ignore, lambda line: None)
     assert sorted(pictures(shot.output)) == ["000008.png", "000009.png"]
     monkeypatch.setenv("STGA_BLENDER", str(tmp_path / "nowhere"))
-    with pytest.raises(StgaError, match="nowhere: Blender cannot be started .*; expected it on PATH, or .* STGA_BLENDER"):
+    with pytest.raises(StgaError, match=r"nowhere: Blender cannot be started .*; expected it on PATH"):
         perform(shot, ignore, lambda line: None)
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ...batch.plan import Plan
+from ...batch.plan import MAX_JOBS, Plan
+from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
 from ...report.run_summary import evaluation_share
@@ -53,8 +54,11 @@ Unfitted: without fitted exposure."""
 def benchmark_table(request: Benchmark, seeds: int) -> dict[str, Any]:
     """The table of a plan that carries out a benchmark: a slice for each seed.
 
-    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants.
+    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants, and more seeds than
+    a plan can have jobs.
     """
+    if seeds > MAX_JOBS:
+        raise StgaError(f"--seeds {seeds}: expected up to {MAX_JOBS}")
     count = len(variants_of(request))
     given = {name: value for name, value in to_json(request).items() if name not in ("out", "seed", "flame")}
     if request.flame is not None:

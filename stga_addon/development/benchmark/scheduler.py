@@ -26,6 +26,7 @@ TURN_S = 2.0
 SAVE_TIMEOUT_S = 60.0
 """Longest wait for an interrupted worker to save its run."""
 
+
 @dataclass(frozen=True)
 class BenchmarkRun:
     """A training whose effects are decided.
