@@ -17,7 +17,7 @@ from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.job import Job
 from stga_addon.batch.run import JobState
 from stga_addon.cli.main import main
-from stga_addon.training.run.folder import read_run
+from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE, read_status
 
@@ -31,8 +31,8 @@ KILLS = int(os.environ.get("STGA_BATCH_KILLS", 6))
 """Workers that are killed; 20 in the measurement of docs/batch.md."""
 
 
-def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str]) -> None:
-    """Kill workers at random moments, so many in all, none more than three times."""
+def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str], resumable: list[str]) -> None:
+    """Kill workers at random moments, none more than three times. resumable: those that had a checkpoint."""
     chance = random.Random(3)
     while len(killed) < kills and not ended.wait(chance.uniform(0.2, 1.5)):
         folders = {job.name: job.request_folder for job in jobs}
@@ -45,26 +45,29 @@ def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: li
             except ProcessLookupError:
                 continue
             killed.append(name)
+            resumable += [name] if (folders[name].parent / CHECKPOINT).exists() else []
 
 
-def test_killed_workers_resume_to_the_same_bits(tmp_path: Path) -> None:
+def test_killed_workers_resume_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
+    monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     (tmp_path / "whole").mkdir()
     (tmp_path / "killed").mkdir()
     seeds = max(2, KILLS // 3)
     whole, plan = tiny_plan(tmp_path / "whole", seeds, iterations=400), None
     carry_out(whole, LocalEngine(2, 8.0, sys.executable))
     plan = tiny_plan(tmp_path / "killed", seeds, iterations=400)
-    ended, killed = threading.Event(), list[str]()
-    thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed))
+    ended, killed, resumable = threading.Event(), list[str](), list[str]()
+    thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
     thread.start()
     try:
         batch, _ = carry_out(plan, LocalEngine(2, 8.0, sys.executable))
     finally:
         ended.set()
         thread.join()
-    print(f"killed: {killed}")
+    print(f"{len(killed)} killed, {len(resumable)} of them with a checkpoint")
     assert len(killed) >= KILLS // 2
+    assert resumable
     assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}
     for seed in range(seeds):
         name = f"train-seed{seed}"

@@ -132,7 +132,7 @@ MISTAKES = {
     'out = "r"\n' + ONE + 'after = ["one"]\n': "these jobs wait for each other: one → one",
     'out = "r"\n' + ONE + "sweep = 3\n": r"\[job.one\]: sweep: expected lists",
     'out = "r"\n' + ONE + "sweep = { seed = [] }\n": "sweep: seed: expected a list of values, or a table",
-    'out = "r"\n' + ONE + "sweep = { f = { first = 1, last = 2 } }\n": "sweep: f: expected a list of values, or a table",
+    'out = "r"\n' + ONE + "sweep = { f = { first = 1, last = 2 } }\n": "sweep: f: expected a list of values, or",
     'out = "r"\n' + ONE + "sweep = { f = { first = 3, last = 2, size = 1 } }\n": "sweep: f: expected whole numbers",
     'out = "r"\n' + ONE + f"sweep = {{ a = {[*range(400)]}, b = {[*range(400)]} }}\n": "more than 100000",
     'out = "r"\n' + ONE + "cases = 3\n": r"\[job.one\]: cases: expected a list of tables",

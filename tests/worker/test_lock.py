@@ -120,7 +120,7 @@ def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
-    """Catches workers that cannot run on such storage, two of them in one folder, and a lock that outlives its worker."""
+    """Catches workers that cannot run on such storage, two in one folder, and a lock that outlives its worker."""
     path = tmp_path / "worker.lock"
     with hold_lock(path):
         assert lock_owner(path) == os.getpid()

@@ -1,14 +1,16 @@
 """A slice of a benchmark: every variant with one seed, trained in turns."""
 
 from dataclasses import replace
+from pathlib import Path
 
 from ...errors import StgaError
 from ...perform.training import prepare
 from ...progress import Progress, Report, Say, ignore
 from ...requests.results import Written
 from ...requests.values import Benchmark, Train
+from ...training.settings import TrainingSettings
 from .scheduler import BenchmarkRun, train_in_turns
-from .variants import Changes, settings_of, variants_of, without_choices
+from .variants import settings_of, variants_of, without_choices
 
 
 def train_slice(request: Benchmark, report: Report, say: Say) -> Written:
@@ -28,17 +30,18 @@ def train_slice(request: Benchmark, report: Report, say: Say) -> Written:
 
 
 def runs_of(request: Benchmark) -> list[BenchmarkRun]:
-    """A run of each variant, with its effects decided; a variant with the settings of an earlier one is left out."""
-    requests: list[Train] = []
+    """A run of each variant; a variant with the settings of an earlier one is left out. Effects are decided as for
+    every other seed."""
+    decided: dict[str, TrainingSettings] = {}
     for name, changes in variants_of(request).items():
-        asked = _training(request, name, changes)
-        settings = without_choices(prepare(asked, ignore, lambda line: None).run.settings)
-        if not any(replace(settings, preset=other.settings.preset) == other.settings for other in requests):
-            requests.append(replace(asked, settings=settings))
-    fits = any(each.settings.exposure for each in requests)  # for all variants or none, so that they compare
-    return [BenchmarkRun(each, fits) for each in requests]
+        undecided = _training(request, request.out / "undecided" / name, settings_of(changes, request.seconds))
+        settings = without_choices(prepare(undecided, ignore, lambda line: None).run.settings)
+        if not any(replace(settings, preset=other.preset) == other for other in decided.values()):
+            decided[name] = settings
+    fits = any(settings.exposure for settings in decided.values())  # for all variants or none, so that they compare
+    seeded = {name: replace(settings, seed=request.seed) for name, settings in decided.items()}
+    return [BenchmarkRun(_training(request, request.out / name, settings), fits) for name, settings in seeded.items()]
 
 
-def _training(request: Benchmark, name: str, changes: Changes) -> Train:
-    settings = replace(settings_of(changes, request.seconds), seed=request.seed)
-    return Train(request.out / name, request.capture, settings, request.flame, request.principal_point, device="cpu")
+def _training(request: Benchmark, run: Path, settings: TrainingSettings) -> Train:
+    return Train(run, request.capture, settings, request.flame, request.principal_point, device="cpu")
