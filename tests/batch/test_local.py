@@ -1,14 +1,11 @@
 """The engine of this machine with real workers: results, kills, Ctrl-C, the command and its report."""
 
-import json
 import os
 import random
 import re
 import signal
-import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -19,10 +16,10 @@ from stga_addon.batch.run import JobState
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
-from stga_addon.worker.status import LOCK_FILE, read_status
+from stga_addon.worker.status import LOCK_FILE
 
 from .simulated import carry_out
-from .tiny import splats_of, tiny_plan
+from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
@@ -79,32 +76,7 @@ def test_killed_workers_resume_to_the_same_bits(tmp_path: Path, monkeypatch: pyt
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a batch whose failure nobody sees, Ctrl-C that loses work, and a report that needs more than itself."""
     tiny_plan(tmp_path)
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "plan.toml").write_text(
-        'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n[job.train]\nrequest = "train"\ndevice = "cpu"\n'
-        'principal_point = "opencv"\nminutes = 0.1\n'
-        'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
-        'cases = [{ name = "good", capture = "capture" }, { name = "bad", capture = "bad" }]\n'
-    )
-    command = [sys.executable, "-m", "stga_addon", "batch", str(tmp_path / "plan.toml")]
-    started = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    run = tmp_path / "runs/train-good"
-    deadline = time.monotonic() + 300
-    while time.monotonic() < deadline:
-        status = read_status(run / "job")
-        failed = read_status(tmp_path / "runs/train-bad/job")
-        if status and status.message == "Training" and status.progress and failed and failed.error:
-            break
-        time.sleep(0.2)
-    time.sleep(1)
-    started.send_signal(signal.SIGINT)
-    output, _ = started.communicate(timeout=120)
-    assert started.returncode == 130, output
-    assert "train-good: stopped" in output
-    assert re.search(r"train-bad: failed: .*bad", output)
-    before = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["iteration"]
-    assert (run / "checkpoint.npz").exists()
-    assert 0 < before < 100000
+    check_interrupted(tmp_path, *interrupt_batch(tmp_path))
     report = (tmp_path / "runs/report.html").read_text()
     assert "train-bad" in report
     assert "1 failed, 1 stopped" in report

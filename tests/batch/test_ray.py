@@ -14,7 +14,7 @@ from stga_addon.batch.engines.table import make_engine
 from stga_addon.errors import StgaError
 
 from .simulated import carry_out
-from .tiny import splats_of, tiny_plan
+from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
@@ -120,6 +120,15 @@ def test_same_results_through_ray(tmp_path: Path) -> None:
     carry_out(here, LocalEngine(2, 8.0))
     for seed in range(2):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+
+
+@pytest.mark.slow
+def test_ctrl_c_through_ray(tmp_path: Path) -> None:
+    """Catches Ctrl-C that Ray's tasks do not hear, or that takes the cluster away before they have saved."""
+    pytest.importorskip("torch")
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
+    tiny_plan(tmp_path)
+    check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "ray"))
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from stga_addon.worker.status import LOCK_FILE
 
 from .simulated import carry_out, empty_jobs
 from .slurm_cluster import Cluster, missing_programs, running_cluster
-from .tiny import splats_of, tiny_plan
+from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
@@ -109,6 +109,12 @@ def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Pat
     states = {name: entry.state for name, entry in batch.entries.items()}
     assert states["train-seed0"] == states["evaluate-seed0"] == JobState.FINISHED
     assert (states[name], states["evaluate-seed1"]) == (JobState.FAILED, JobState.BLOCKED)
+
+
+def test_ctrl_c_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
+    """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have saved."""
+    tiny_plan(tmp_path)
+    check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "slurm"))
 
 
 def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -> None:
