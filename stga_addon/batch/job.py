@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from ..requests.folder import request_folder
-from ..requests.values import Extend, Refine, Request, Resume, Train
+from ..requests.values import Extend, Refine, RenderBlend, Request, Resume, Train
 from ..schema import IS_PATH, setting
 from ..training.run.folder import AVATAR
 
@@ -72,6 +72,13 @@ class Job:
         path = None if name is None else getattr(self.request, name)
         return path if isinstance(path, Path) else None
 
+    @property
+    def is_written(self) -> bool:
+        """Whether what the request writes is there."""
+        if isinstance(self.request, RenderBlend):
+            return all(picture.exists() for picture in self.request.pictures.values())
+        return self.product is None or self.product.exists()
+
 
 def output_field(kind: type[Any]) -> str | None:
     """The field that says where requests of a kind write; None where they have none."""
@@ -85,7 +92,7 @@ def output_field(kind: type[Any]) -> str | None:
 def path_fields(kind: type[Any]) -> frozenset[str]:
     """The fields of a request that hold a path, or several."""
     return frozenset(name for name, hint in get_type_hints(kind).items() if _holds_path(hint))
-
+  # type: ignore[arg-type]
 
 def is_path(kind: type[Any], name: str, value: Any) -> bool:
     """Whether a field's plain value is a path, or a list of them, rather than a name."""

@@ -14,12 +14,10 @@ from tempfile import TemporaryDirectory
 from ..errors import StgaError
 from ..progress import Cancelled, Progress, Report, Say
 from ..requests.results import Written
-from ..requests.values import RenderBlend
+from ..requests.values import FRAME_DIGITS, RenderBlend
 from ..worker.environment import BLENDER_VARIABLE, PYTHON_VARIABLE
 from ..worker.launch import end_with_this_process
 
-DIGITS = 6
-"""Of a picture's name."""
 PARTIAL = ".rendering-"
 """Start of the name of the folder that Blender writes into; a picture leaves it when it is whole."""
 SAVED = re.compile(r"Saved: '(?P<path>.+)'")
@@ -37,8 +35,7 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     """
     if not request.blend.is_file():
         raise StgaError(f"{request.blend}: is not a file; expected a .blend file")
-    first, last = request.frames
-    pictures = {frame: picture(request.output, frame) for frame in range(first, last + 1)}
+    pictures = request.pictures
     missing = [frame for frame, path in pictures.items() if not path.exists()]
     done = len(pictures) - len(missing)
     report(Progress(done / len(pictures), "Rendering"))
@@ -49,11 +46,6 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
             if report(Progress(done / len(pictures), "Rendering", detail)) and done < len(pictures):
                 raise Cancelled
     return Written(request.output)
-
-
-def picture(folder: Path, frame: int) -> Path:
-    """The file of a frame."""
-    return folder / f"{frame:0{DIGITS}d}.png"
 
 
 def _spans(frames: Iterable[int]) -> Iterator[tuple[int, int]]:
@@ -79,18 +71,17 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
     with TemporaryDirectory(prefix=PARTIAL, dir=request.output) as partial:
         process = _start(_command(request, first, last, Path(partial)))
         printed: deque[str] = deque(maxlen=LAST_LINES)
-        expected = first
+        pictures, expected = request.pictures, first
         try:
             assert process.stdout is not None
             for line in process.stdout:
                 printed.append(line.strip())
                 say(line.rstrip())
-                path = Path(partial, f"{expected:0{DIGITS}d}.png")
-                found = SAVED.search(line)
-                if found is not None and Path(found["path"]).name == path.name:
-                    os.replace(path, request.output / path.name)
+                picture, found = pictures[min(expected, last)], SAVED.search(line)
+                if found is not None and Path(found["path"]).name == picture.name:
+                    os.replace(Path(partial, picture.name), picture)
                     expected += 1
-                    yield request.output / path.name
+                    yield picture
             code = process.wait()
         finally:
             _stop(process)
@@ -99,7 +90,7 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
 
 
 def _command(request: RenderBlend, first: int, last: int, folder: Path) -> list[str]:
-    blend, names = str(request.blend.absolute()), str(folder.absolute() / ("#" * DIGITS))
+    blend, names = str(request.blend.absolute()), str(folder.absolute() / ("#" * FRAME_DIGITS))
     return [
         *blender_command(), "--background", blend, "--engine", request.engine,
         "--render-output", names, "--render-format", "PNG", "--use-extension", "1",

@@ -27,6 +27,8 @@ SPLATS_ENGINE = "STGA_SPLATS"
 """Blender's name of the add-on's render engine."""
 MAX_FRAME = 1_048_574
 """Blender's last frame."""
+FRAME_DIGITS = 6
+"""Of the name of a frame's picture, as many as this at least."""
 
 
 def device_field() -> Any:
@@ -293,6 +295,12 @@ class RenderBlend:
             raise StgaError(f"{self.blend}: expected a name that ends in {BLEND_SUFFIX}")
         if self.frames[0] > self.frames[1]:
             raise StgaError(f"frames: expected the first and then the last, got {self.frames[0]}, {self.frames[1]}")
+
+    @property
+    def pictures(self) -> dict[int, Path]:
+        """Frame -> its file."""
+        first, last = self.frames
+        return {frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in range(first, last + 1)}
 
 
 @dataclass(frozen=True)
