@@ -92,14 +92,14 @@ def output_field(kind: type[Any]) -> str | None:
 def path_fields(kind: type[Any]) -> frozenset[str]:
     """The fields of a request that hold a path, or several."""
     return frozenset(name for name, hint in get_type_hints(kind).items() if _holds_path(hint))
-  # type: ignore[arg-type]
+
 
 def is_path(kind: type[Any], name: str, value: Any) -> bool:
     """Whether a field's plain value is a path, or a list of them, rather than a name."""
     names_path = kind.__dataclass_fields__[name].metadata.get(IS_PATH)
     if names_path is not None:
         return isinstance(value, str) and value != "" and bool(names_path(value))
-    return name in path_fields(kind)
+    return name in path_fields(kind)  # type: ignore[arg-type]
 
 
 def _holds_path(hint: Any) -> bool:
