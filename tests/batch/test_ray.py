@@ -93,7 +93,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     for name in ("local", "ray"):
         (tmp_path / name).mkdir()
-    seeds, iterations = max(2, KILLS // 2), max(1000, 200 * KILLS)
+    seeds, iterations = max(2, KILLS // 2), max(600, 200 * KILLS)
     variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "STGA_CHECKPOINT_S": "0.3"}
     killed, states = run_script(NODES, tmp_path / "ray", KILLS, seeds, iterations, **variables)[-2:]
     names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))

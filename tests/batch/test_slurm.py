@@ -75,7 +75,7 @@ def test_jobs_of_a_dead_node_resume_elsewhere(
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     for name in ("local", "slurm"):
         (tmp_path / name).mkdir()
-    here, there = (tiny_plan(tmp_path / name, iterations=800) for name in ("local", "slurm"))
+    here, there = (tiny_plan(tmp_path / name, iterations=500) for name in ("local", "slurm"))
     killed: list[str] = []
 
     class Watched(SlurmEngine):
