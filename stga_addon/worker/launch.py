@@ -81,7 +81,7 @@ def start_python(
 
 
 def end_with_this_process() -> Callable[[], None] | None:
-    """A `preexec_fn` by which Linux kills the started process when the one that starts it has gone, killed or not.
+    """A `preexec_fn` by which Linux kills the started process when the thread that starts it has gone, killed or not.
 
     None on other systems, where such a process goes on to its end.
     """

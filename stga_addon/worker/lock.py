@@ -93,7 +93,7 @@ def lock_owner(path: Path) -> int:
 def _hold_by_beats(path: Path) -> Iterator[None]:
     """Hold the file by renewing its time every BEAT_S. Raises BlockingIOError while another process does."""
     content = f" {os.getpid():<20d}{platform.node()} {secrets.token_hex(8)}".encode()
-    if path.is_symlink() or _is_beating(path):
+    if _is_beating(path):
         raise BlockingIOError(f"{path} is held by another process")
     path.write_bytes(content)
     time.sleep(CLAIM_S)
