@@ -99,8 +99,11 @@ def _command(request: RenderBlend, first: int, last: int, folder: Path) -> list[
 
 
 def blender_command() -> list[str]:
-    """What starts this machine's Blender: the command in STGA_BLENDER, else the program `blender`."""
-    return shlex.split(os.environ.get(BLENDER_VARIABLE, ""), posix=os.name != "nt") or ["blender"]
+    """What starts this machine's Blender: the program or command in STGA_BLENDER, else the program `blender`."""
+    text = os.environ.get(BLENDER_VARIABLE, "")
+    if os.path.isfile(text):  # whose path may hold spaces
+        return [text]
+    return shlex.split(text, posix=os.name != "nt") or ["blender"]
 
 
 def _start(command: list[str]) -> subprocess.Popen[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.perform.blend import blender_command
 from stga_addon.perform.perform import perform
 from stga_addon.progress import Cancelled, Progress, ignore
 from stga_addon.requests.folder import worker_arguments, write_request
@@ -68,6 +69,18 @@ def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> 
     assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
     perform(shot, ignore, lambda line: None)
     assert len(calls(tmp_path)) == 2
+
+
+def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches "C:/Program Files/…/blender.exe" that is taken apart, and a command that is not."""
+    program = tmp_path / "Blender Foundation" / "blender"
+    program.parent.mkdir()
+    program.touch()
+    for text, command in ((str(program), [str(program)]), ("xvfb-run -a blender", ["xvfb-run", "-a", "blender"])):
+        monkeypatch.setenv("STGA_BLENDER", text)
+        assert blender_command() == command
+    monkeypatch.delenv("STGA_BLENDER")
+    assert blender_command() == ["blender"]
 
 
 def test_what_went_wrong_is_a_sentence(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
