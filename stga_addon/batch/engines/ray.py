@@ -42,12 +42,11 @@ class RayEngine:
         import ray  # reads the environment
 
         try:
+            quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
             if address:
-                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-            else:
-                ray.init(
-                    num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
-                )
+                ray.init(address=address, **quiet)
+            else:  # "local": also where another cluster is running on this machine
+                ray.init(address="local", num_cpus=processors(), include_dashboard=False, **quiet)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
         self._ray = ray
