@@ -5,6 +5,10 @@
 The first capture answers every question, further ones the comparison at equal time and how an avatar is extended. A
 FLAME capture brings its model as `flame_model.npz` in its folder, as the demo's does. Takes about three quarters of an
 hour per capture on an otherwise idle machine. Runs stay in --folder; finished ones are not repeated.
+
+The trainings, evaluations and slices of benchmarks are the jobs of one batch (docs/batch.md): one after another on this
+machine, each with all its processors; --engine, --address and --threads carry them out on several. --dry-run shows
+them.
 """
 
 import argparse
@@ -14,8 +18,15 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from stga_addon import __version__
+from stga_addon.batch.engines.local import processors
+from stga_addon.batch.plan import Plan, make_plan
+from stga_addon.cli.arguments import duration
+from stga_addon.cli.batch import add_engine, carry_out_plan, print_plan, with_threads
+from stga_addon.development.benchmark.benchmark import benchmark_table, slices_of, write_report
+from stga_addon.requests.values import Benchmark
 
 HEADER = """# Results
 
@@ -32,6 +43,8 @@ one with 10 training timesteps and 11 training cameras at 550×802.
 """
 PARTS = (("whole image", ""), ("head", "_mask"), ("moving region", "_moving"))
 """Row of the table and suffix of the metrics, as `stga eval` writes them."""
+DEFAULT, KNOBS, KNOBS_BUDGET = "default", "knobs", "10s"
+"""Tables of the plan, and the training time of each run of the latter."""
 
 EXTEND_ARGUMENTS = (
     *("--base", "1200", "--seconds", "20", "--seeds", "0", "1", "2", "--refine", "mouth"),
@@ -55,21 +68,50 @@ def main() -> None:
     parser.add_argument("--budget", default="30s", help="training time of each run of the comparison at equal time")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--long", default="2m", help="training time of the default settings' run")
+    add_engine(parser)
     options = parser.parse_args()
+    plan = with_threads(results_plan(options), options.threads or processors())
+    if options.dry_run:
+        print_plan(plan)
+        return
+    carry_out_plan(plan, options.engine, options.address)
     first, folder = options.captures[0], options.folder
     names = " ".join(capture.name for capture in options.captures)
     sections = [HEADER.format(command=f"python benchmarks/results.py {names}", version=__version__, machine=machine())]
-    sections += default_section(first, folder / "default", options.long)
+    sections += default_section(first, folder / DEFAULT, options.long)
     for capture in options.captures:
-        arguments = ["--budget", options.budget, "--seeds", str(options.seeds)]
         title = f"Which strategy or preset is best at equal time? ({capture.name})"
-        sections += benchmark_section(title, capture, folder / f"benchmark-{capture.name}", arguments)
+        arguments = f"--budget {options.budget} --seeds {options.seeds}"
+        sections += benchmark_section(title, capture, plan, equal_time(capture), folder, arguments)
     title = f"What does a single setting cost or bring? ({first.name})"
-    sections += benchmark_section(title, first, folder / "knobs", ["--knobs", "--budget", "10s", "--seeds", "1"])
+    sections += benchmark_section(title, first, plan, KNOBS, folder, f"--knobs --budget {KNOBS_BUDGET} --seeds 1")
     for capture in options.captures:
         sections += extend_section(capture, folder / f"extend-{capture.name}")
     options.out.write_text("\n".join(sections), encoding="utf-8")
     print(options.out)
+
+
+def results_plan(options: argparse.Namespace) -> Plan:
+    """The jobs of all questions but that of extending."""
+    first, flame = options.captures[0].resolve(), flame_of(options.captures[0])
+    train = {"request": "train", "capture": str(first), "settings": {"seconds": duration(options.long)}}
+    tables: dict[str, Any] = {
+        DEFAULT: {**train, **({} if flame is None else {"flame": str(flame)})},
+        "quality": {"request": "evaluate", "run": f"{{{DEFAULT}}}", "sweep": {"split": ["val", "test"]}},
+        KNOBS: benchmark_table(slices(options.captures[0], KNOBS_BUDGET, True), 1),
+    }
+    for capture in options.captures:
+        tables[equal_time(capture)] = benchmark_table(slices(capture, options.budget), options.seeds)
+    return make_plan({"out": str(options.folder.resolve()), "job": tables}, Path.cwd(), "results")
+
+
+def slices(capture: Path, budget: str, knobs: bool = False) -> Benchmark:
+    return Benchmark(Path(), capture.resolve(), duration(budget), flame_of(capture), knobs=knobs)
+
+
+def equal_time(capture: Path) -> str:
+    """Table of the plan that compares presets and strategies."""
+    return f"benchmark-{capture.resolve().name}"
 
 
 def machine() -> str:
@@ -83,11 +125,7 @@ def machine() -> str:
 
 
 def default_section(capture: Path, run: Path, budget: str) -> list[str]:
-    """Quality of the default settings: train once, evaluate on both held-out splits."""
-    if not (run / "quality_test.json").exists():
-        stga("train", str(capture), *flame_of(capture), "--out", str(run), "--budget", budget)
-        for split in ("val", "test"):
-            stga("eval", str(run), "--split", split)
+    """Quality of the default settings on both held-out splits."""
     rows = ["| split | pixels | PSNR | SSIM | LPIPS |", "|---|---|---|---|---|"]
     for split in ("val", "test"):
         quality = json.loads((run / f"quality_{split}.json").read_text(encoding="utf-8"))
@@ -107,11 +145,10 @@ def default_section(capture: Path, run: Path, budget: str) -> list[str]:
     return [title, "", command, "", *rows, "", remark, ""]
 
 
-def benchmark_section(title: str, capture: Path, out: Path, arguments: list[str]) -> list[str]:
-    """The report of `stga benchmark`, which interleaves its runs and goes on where an earlier call stopped."""
-    stga("benchmark", str(capture), *flame_of(capture), *arguments, "--out", str(out))
-    report = (out / "report.txt").read_text(encoding="utf-8").strip()
-    return [f"## {title}", "", f"`stga benchmark {capture.name} {' '.join(arguments)}`", "", report, ""]
+def benchmark_section(title: str, capture: Path, plan: Plan, table: str, folder: Path, arguments: str) -> list[str]:
+    """The report of the slices of a table."""
+    report = write_report(slices_of(plan, table), folder / "reports" / table).strip()
+    return [f"## {title}", "", f"`stga benchmark {capture.name} {arguments}`", "", report, ""]
 
 
 def extend_section(capture: Path, folder: Path) -> list[str]:
@@ -119,7 +156,7 @@ def extend_section(capture: Path, folder: Path) -> list[str]:
     report, arguments = folder / "report.md", EXTEND_ARGUMENTS
     if not report.exists():
         call(
-            str(Path(__file__).with_name("extend.py")), str(capture), *flame_of(capture), *arguments,
+            str(Path(__file__).with_name("extend.py")), str(capture), *flame_option(capture), *arguments,
             "--folder", str(folder), "--report", str(report),
         )  # fmt: skip
     title = f"## What do extending and refining a trained avatar bring? ({capture.name})"
@@ -127,13 +164,14 @@ def extend_section(capture: Path, folder: Path) -> list[str]:
     return [title, "", command + EXTEND_WORDS, "", report.read_text(encoding="utf-8")]
 
 
-def flame_of(capture: Path) -> list[str]:
-    model = capture / "flame_model.npz"
-    return ["--flame", str(model)] if model.exists() else []
+def flame_of(capture: Path) -> Path | None:
+    model = capture.resolve() / "flame_model.npz"
+    return model if model.exists() else None
 
 
-def stga(*arguments: str) -> None:
-    call("-m", "stga_addon", *arguments)
+def flame_option(capture: Path) -> list[str]:
+    model = flame_of(capture)
+    return [] if model is None else ["--flame", str(model)]
 
 
 def call(*arguments: str) -> None:

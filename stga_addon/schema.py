@@ -20,6 +20,8 @@ KIND = "kind"
 """Key that names the dataclass where a field may hold one of several."""
 ARRAY = "array"
 """Key of an array's place in JSON: its name among the arrays beside it."""
+IS_PATH = "is_path"
+"""Key of a field's metadata: of `setting`."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -32,14 +34,16 @@ def setting(
     choices: Collection[str] | None = None,
     accepts: Callable[[Any], bool] | None = None,
     expected: str = "",
+    is_path: Callable[[str], bool] | None = None,
 ) -> Any:
     """A dataclass field with its allowed values; the bounds hold for each number of a tuple.
 
     minimum, maximum  inclusive; above: exclusive lower bound
     accepts           whether a value of the right type is allowed, and `expected`: what it accepts, for the message
+    is_path           whether a text is that of a path, where it can be a name as well
     """
     limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices}
-    return field(default=default, metadata={**limits, "accepts": accepts, "expected": expected})
+    return field(default=default, metadata={**limits, "accepts": accepts, "expected": expected, IS_PATH: is_path})
 
 
 # Validation

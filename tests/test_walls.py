@@ -41,7 +41,7 @@ LAYERS = (
     {"development"},
     {"__main__", "__init__"},
 )
-NAMED_WHERE_THERE = {"stga_addon/cli/main.py": "development"}
+NAMED_WHERE_THERE = {"stga_addon/cli/main.py": "development", "stga_addon/perform/perform.py": "development"}
 """Files that name modules of a room after their own, because the extension's zip leaves that room out."""
 LIGHT = (
     "errors",

@@ -56,8 +56,7 @@ def is_done(job: Job, digest: str) -> bool:
     if record is None or record.digest != digest:
         return False
     status = read_status(job.request_folder)
-    written = job.product is None or job.product.exists()
-    return status is not None and status.state == WorkerState.FINISHED and written
+    return status is not None and status.state == WorkerState.FINISHED and job.is_written
 
 
 def is_running(job: Job, digest: str) -> bool:

@@ -1,13 +1,14 @@
 """Jobs of a batch: a request each, what it comes after and what it needs."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from ..requests.folder import request_folder
-from ..requests.values import Extend, Refine, Request, Resume, Train
-from ..schema import setting
+from ..requests.values import Extend, Refine, RenderBlend, Request, Resume, Train
+from ..schema import IS_PATH, setting
 from ..training.run.folder import AVATAR
 
 KINDS: dict[str, type[Any]] = {}
@@ -71,6 +72,13 @@ class Job:
         path = None if name is None else getattr(self.request, name)
         return path if isinstance(path, Path) else None
 
+    @property
+    def is_written(self) -> bool:
+        """Whether what the request writes is there."""
+        if isinstance(self.request, RenderBlend):
+            return all(picture.exists() for picture in self.request.pictures.values())
+        return self.product is None or self.product.exists()
+
 
 def output_field(kind: type[Any]) -> str | None:
     """The field that says where requests of a kind write; None where they have none."""
@@ -80,9 +88,18 @@ def output_field(kind: type[Any]) -> str | None:
     return next((name for name in OUTPUT_FIELDS if name in names), None)
 
 
-def path_fields(kind: type[Any]) -> Collection[str]:
+@cache
+def path_fields(kind: type[Any]) -> frozenset[str]:
     """The fields of a request that hold a path, or several."""
-    return [name for name, hint in get_type_hints(kind).items() if _holds_path(hint)]
+    return frozenset(name for name, hint in get_type_hints(kind).items() if _holds_path(hint))
+
+
+def is_path(kind: type[Any], name: str, value: Any) -> bool:
+    """Whether a field's plain value is a path, or a list of them, rather than a name."""
+    names_path = kind.__dataclass_fields__[name].metadata.get(IS_PATH)
+    if names_path is not None:
+        return isinstance(value, str) and value != "" and bool(names_path(value))
+    return name in path_fields(kind)  # type: ignore[arg-type]
 
 
 def _holds_path(hint: Any) -> bool:
@@ -92,7 +109,12 @@ def _holds_path(hint: Any) -> bool:
 def input_paths(request: Request) -> Mapping[str, tuple[Path, ...]]:
     """Field -> the paths that a request reads, of those that are given."""
     kind = type(request)
-    names = [name for name in path_fields(kind) if name != output_field(kind)]
-    values = {name: getattr(request, name) for name in names}
-    paths = {name: value if isinstance(value, tuple) else (value,) for name, value in values.items()}
-    return {name: found for name, items in paths.items() if (found := tuple(p for p in items if isinstance(p, Path)))}
+    found: dict[str, tuple[Path, ...]] = {}
+    for spec in fields(kind):
+        value = getattr(request, spec.name)
+        if value is None or spec.name == output_field(kind) or not is_path(kind, spec.name, value):
+            continue
+        items = value if isinstance(value, tuple) else (value,)
+        if items:
+            found[spec.name] = tuple(map(Path, items))
+    return found

@@ -6,7 +6,6 @@ batch.lease  who works here, with a count that rises every BEAT_S: for storage w
              the lease to another batch; it notices at its next beat.
 """
 
-import errno
 import os
 import platform
 import secrets
@@ -19,14 +18,10 @@ from typing import Any
 
 from ..errors import StgaError
 from ..files import read_json, write_json
-from ..worker.lock import hold_lock, lock_owner
+from ..worker.lock import BEAT_S, EXPIRY_S, NO_LOCKS, hold_lock, lock_owner
 
 LOCK, LEASE = "batch.lock", "batch.lease"
-BEAT_S, EXPIRY_S = 5.0, 30.0
-"""Seconds between two beats, and without one until a lease counts as left behind."""
 LOOK_INTERVAL_S = 0.5
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""What a file system without working locks answers."""
 
 
 class Lease:
@@ -84,7 +79,7 @@ def hold_folder(folder: Path) -> Iterator[Lease]:
         has_lock = True
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock.enter_context(hold_lock(folder / LOCK))
+            lock.enter_context(hold_lock(folder / LOCK, beats=False))
         except BlockingIOError as error:
             owner = f"process {lock_owner(folder / LOCK)}"
             raise StgaError(f"{folder}: another batch is working in this folder ({owner})") from error

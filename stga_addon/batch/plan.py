@@ -9,7 +9,8 @@
     request = "train"                  # a request (`job.KINDS`); the other keys are its fields
     capture = "captures/anna"
     settings = { preset = "standard" }
-    sweep = { "settings.seed" = [0, 1, 2] }     # a job for each combination
+    sweep = { "settings.seed" = [0, 1, 2] }     # a job for each combination; or of ranges:
+                                       # { frames = { first = 1, last = 900, size = 100 } }
     cases = [{ name = "…", capture = "…" }]     # a job for each set of fields
 
     [job.evaluate]
@@ -27,6 +28,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import product
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +37,15 @@ from ..files import file_size
 from ..requests.values import Request
 from ..schema import complaint, from_json, to_json
 from ..training.settings import TrainingSettings, make_settings
-from .job import KINDS, Job, Resources, input_paths, output_field, path_fields
+from .job import KINDS, Job, Resources, input_paths, is_path, output_field
 
 MAX_PLAN_BYTES = 16 << 20
 MAX_JOBS = 100_000
 PLAN_KEYS = ("out", "resources", "job")
 TABLE_KEYS = ("request", "sweep", "cases", "after", "resources", "minutes")
 """Keys of a job's table that are not fields of its request."""
+RANGE_KEYS = ("first", "last", "size")
+"""Keys of a sweep over ranges: [first, first + size - 1] and so on up to the last."""
 REPLACED = "replaced"
 """Folder of the batch that keeps what changed jobs wrote before."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", re.ASCII)
@@ -209,20 +213,43 @@ def _variants(where: str, name: str, given: Mapping[str, Any], table: Mapping[st
     cases, sweep = table.get("cases", [{}]), table.get("sweep", {})
     if not isinstance(cases, list) or not cases or not all(isinstance(case, dict) for case in cases):
         raise StgaError(f"{where}: cases: expected a list of tables, got {shorten(cases)}")
-    if not isinstance(sweep, dict) or not all(isinstance(items, list) and items for items in sweep.values()):
+    if not isinstance(sweep, dict):
         raise StgaError(f"{where}: sweep: expected lists of values by field, got {shorten(sweep)}")
+    swept = {key: _swept(f"{where}: sweep: {key}", key, items) for key, items in sweep.items()}
+    if len(cases) * prod(map(len, swept.values())) > MAX_JOBS:
+        raise StgaError(f"{where}: makes more than {MAX_JOBS} jobs")
     for number, case in enumerate(cases):
         own = case.get("name", str(number) if case else "")
         if case and (not isinstance(own, str) or not NAME.fullmatch(own)):
             raise StgaError(f"{where}: cases.{number}.name: expected letters, digits, '_', '.' and '-', got {own!r}")
         of_case = {f"{name}": own} if case else {}
-        for chosen in product(*sweep.values()):
+        for chosen in product(*swept.values()):
             values = _merged(given, {key: item for key, item in case.items() if key != "name"})
             choices = dict(of_case)
-            for key, item in zip(sweep, chosen, strict=True):
+            for key, (label, item) in zip(swept, chosen, strict=True):
                 values = _merged(values, _nested(key, item))
-                choices[f"{name}.{key}"] = _label(key, item)
+                choices[f"{name}.{key}"] = label
             yield _Variant(values, choices)
+
+
+def _swept(where: str, key: str, items: Any) -> list[tuple[str, Any]]:
+    """Label and value of each step of a sweep: of a list's items, or of the ranges that a table asks for."""
+    if isinstance(items, list) and items:
+        return [(_label(key, item), item) for item in items]
+    if not isinstance(items, dict) or set(items) != set(RANGE_KEYS):
+        expected = f"expected a list of values, or a table of {', '.join(RANGE_KEYS)}"
+        raise StgaError(f"{where}: {expected}; got {shorten(items)}")
+    first, last, size = (items[name] for name in RANGE_KEYS)
+    whole = all(isinstance(number, int) and not isinstance(number, bool) for number in (first, last, size))
+    if not whole or not 0 <= first <= last or size < 1:
+        raise StgaError(
+            f"{where}: expected whole numbers, 'first' up to 'last' and 'size' from 1, got {shorten(items)}"
+        )
+    if (last - first) // size >= MAX_JOBS:
+        raise StgaError(f"{where}: makes more than {MAX_JOBS} jobs")
+    short, digits = key.rpartition(".")[2], len(str(last))
+    spans = [(begin, min(begin + size - 1, last)) for begin in range(first, last + 1, size)]
+    return [(f"{short}{begin:0{digits}d}-{end:0{digits}d}", [begin, end]) for begin, end in spans]
 
 
 def _nested(key: str, value: Any) -> dict[str, Any]:
@@ -306,8 +333,9 @@ def _request(where: str, kind: type[Any], values: Mapping[str, Any], base: Path,
     values = dict(values)
     if output is not None:
         values.setdefault(output, ".")
-    for name in path_fields(kind):
-        values[name] = _resolved(folder if name == output else base, values.get(name))
+    for name, value in values.items():
+        if is_path(kind, name, value):
+            values[name] = _resolved(folder if name == output else base, value)
     if "settings" in specs:
         _set_training(where, values)
     plain = {name: _completed(spec, values.get(name)) for name, spec in specs.items()}

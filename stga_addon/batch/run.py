@@ -107,7 +107,8 @@ class Batch:
         record = read_record(entry.job)
         entry.status = read_status(entry.job.request_folder) or entry.status
         if record is not None:
-            entry.seconds, entry.forecast_s, entry.machine = record.seconds, record.forecast_s, record.machine
+            entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
+            entry.machine = record.machine or entry.status.machine
 
     def set_forecasts(self, seconds: Mapping[str, float]) -> None:
         for name, expected in seconds.items():
@@ -238,6 +239,7 @@ class _Loop:
         for name in sorted(ended, key=self._position.__getitem__):  # a job's end before that of those after it
             entry, end = self._entries[name], ended[name]
             entry.status = end.snapshot.status
+            entry.machine = entry.machine or entry.status.machine
             self._add_seconds(entry)
             missing = next((other for other in entry.job.after if not self._entries[other].state.is_done), None)
             if end.snapshot.state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
@@ -293,8 +295,8 @@ class _Loop:
             return
         for name, machine in self._engine.running().items():
             entry = self._entries[name]
-            entry.machine = machine
             entry.status = read_status(entry.job.request_folder) or entry.status
+            entry.machine = machine or entry.status.machine
         self._show(self._batch)
         self._shown_s = time.monotonic()
 

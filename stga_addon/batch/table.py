@@ -104,7 +104,8 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     unknown = len(unfinished) - len(known)
     text = f"{len(rows)} jobs, {len(unfinished)} to do"
     text += f"; {format_duration(total)} of work" if known else ""
-    shared = total / max(1, min(cores, len(known)))
+    on_cores = sum(entry.forecast_s * min(max(entry.job.resources.threads, 1), cores) for entry in unfinished)
+    shared = max(on_cores / max(1, cores), *known, 0.0)
     text += f", about {format_duration(shared)} on this machine" if known else ""
     text += f"; of {unknown} jobs the time is not known before one of their table is finished" if unknown else ""
     return [*lines, text]

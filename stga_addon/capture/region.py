@@ -11,8 +11,15 @@ from .meshes import read_regions
 from .model import Capture
 
 WEIGHTS = "weights"
+FILES = (".npz", ".json")
+"""Suffixes of region files."""
 SELECTED_WEIGHT = 0.5
 """Least weight of a triangle that belongs to the region."""
+
+
+def is_region_file(name: str) -> bool:
+    """Whether a region is named by its file."""
+    return Path(name).suffix.lower() in FILES
 
 
 def find_region(capture: Capture, name: str) -> np.ndarray:

@@ -30,26 +30,31 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument("--flame", type=usable_path, metavar="FILE", help="FLAME model file of the captures")
     add_principal_point(parser)
     add_device(parser)
-    parser.add_argument("--threads", type=whole_number(1), metavar="N", help="threads of each job that names none")
-    parser.add_argument("--dry-run", action="store_true", help="print the jobs, and how long they are expected to take")
-    what = "; ".join(f"{name}: {row.what}" for name, row in ENGINES.items())
-    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{what} (default local)")
+    add_engine(parser)
     files = "; ".join(f"{name}: {row.what}" for name, row in EMITTERS.items())
     parser.add_argument(
         "--emit", choices=tuple(EMITTERS), help=f"write a file by which a farm carries out the jobs: {files}"
     )
+
+
+def add_engine(parser: ArgumentParser) -> None:
+    """Options of how the jobs of a plan are carried out."""
+    parser.add_argument("--threads", type=whole_number(1), metavar="N", help="threads of each job that names none")
+    parser.add_argument("--dry-run", action="store_true", help="print the jobs, and how long they are expected to take")
+    what = "; ".join(f"{name}: {row.what}" for name, row in ENGINES.items())
+    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{what} (default local)")
     parser.add_argument("--address", default="", help="of a running cluster (ray)")
 
 
 def run(options: Namespace) -> None:
-    plan = _with_threads(batch_plan(options), options)
+    plan = batch_plan(options)
+    plan = with_threads(plan, options.threads or _shared_threads(plan, options))
     if options.dry_run:
-        _print_plan(plan)
-        return
-    if options.emit is not None:
+        print_plan(plan)
+    elif options.emit is not None:
         _emit(plan, options.emit)
-        return
-    _carry_out(plan, options)
+    else:
+        carry_out_plan(plan, options.engine, options.address)
 
 
 def batch_plan(options: Namespace) -> Plan:
@@ -95,12 +100,16 @@ def _plan_of_captures(options: Namespace) -> Plan:
     return plan_of_captures(options.sources, options.out, settings, fields)
 
 
-def _with_threads(plan: Plan, options: Namespace) -> Plan:
-    """The plan with threads for the jobs that name none: this machine's processors, shared among them."""
+def _shared_threads(plan: Plan, options: Namespace) -> int:
+    """This machine's processors, shared among the jobs; 1 on every other engine."""
     from ..batch.engines.local import processors
 
     is_here = options.engine == "local" and options.emit is None
-    threads = options.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1)
+    return max(1, processors() // len(plan.jobs)) if is_here else 1
+
+
+def with_threads(plan: Plan, threads: int) -> Plan:
+    """The plan with so many threads for the jobs that name none."""
     jobs = [
         job if job.resources.threads else replace(job, resources=replace(job.resources, threads=threads))
         for job in plan.jobs
@@ -108,7 +117,8 @@ def _with_threads(plan: Plan, options: Namespace) -> Plan:
     return replace(plan, jobs=tuple(jobs))
 
 
-def _print_plan(plan: Plan) -> None:
+def print_plan(plan: Plan) -> None:
+    """Print the jobs, and how long they are expected to take."""
     from ..batch.engines.local import processors
     from ..batch.forecast import forecast_seconds
     from ..batch.run import Batch
@@ -132,7 +142,11 @@ def _emit(plan: Plan, name: str) -> None:
             print("every job is finished")
 
 
-def _carry_out(plan: Plan, options: Namespace) -> None:
+def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
+    """Carry out what is not finished, with the live table and the report.
+
+    Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have stopped.
+    """
     from ..batch.engines.table import make_engine
     from ..batch.forecast import forecast_seconds
     from ..batch.lease import hold_folder
@@ -142,7 +156,7 @@ def _carry_out(plan: Plan, options: Namespace) -> None:
 
     with hold_folder(plan.out) as lease:
         batch = Batch(plan)
-        engine = make_engine(options.engine, options.address)
+        engine = make_engine(engine_name, address)
         batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
         table = LiveTable(sys.stderr, shutil.get_terminal_size().columns)
         try:

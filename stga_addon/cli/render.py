@@ -14,6 +14,7 @@ from .arguments import (
     add_principal_point,
     color,
     degrees,
+    frame_span,
     real_number,
     usable_path,
     whole_number,
@@ -25,7 +26,8 @@ NAME, HELP = "render", "render an avatar as pictures, video or turntable"
 COVERED = 0.0
 """Degrees of a turntable that covers what the cameras saw."""
 SAME_FIELDS = (
-    "cameras", "turntable", "camera", "fps", "capture", "flame", "motion", "background", "principal_point", "device",
+    "cameras", "turntable", "camera", "fps", "frames", "capture", "flame", "motion", "background", "principal_point",
+    "device",
 )  # fmt: skip
 """Options that are fields of the request."""
 
@@ -55,6 +57,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--seconds", type=real_number, metavar="S",
         help=f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
     )  # fmt: skip
+    parser.add_argument(
+        "--frames", type=frame_span, metavar="FIRST:LAST", help="timesteps to render (default: all), not of a turntable"
+    )
     parser.add_argument("--capture", type=usable_path, help="whose meshes drive the avatar (default: the run's)")
     parser.add_argument("--flame", type=usable_path, help="FLAME model file of that capture, or of the motion")
     parser.add_argument(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -29,14 +30,17 @@ WORK: dict[type[Any], tuple[str, str]] = {
     values.Track: (".tracking", "perform_tracking"),
     values.SolveAgain: (".tracking", "solve_again"),
     values.Render: (".render", "render"),
+    values.RenderBlend: (".blend", "render_blend"),
     values.ConvertMotion: (".conversion", "convert_motion"),
     values.RenderRecording: (".recording", "render_recording"),
     values.Export: (".export", "export"),
     values.Analyze: (".analysis", "analyze"),
     values.TimePresets: (".analysis", "time_each_preset"),
     values.Evaluate: (".evaluation", "evaluate_run"),
+    values.Benchmark: ("..development.benchmark.slice", "train_slice"),
 }
-"""Request -> the module that carries it out, loaded when it is needed, and its function."""
+"""Request -> the module that carries it out, loaded when it is needed, and its function. The extension's zip leaves
+`development` out."""
 
 
 def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
@@ -48,6 +52,8 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     """
     validate(request)
     module, function = WORK[type(request)]
+    if module.startswith("..") and find_spec("..development", __package__) is None:
+        raise StgaError(f"{type(request).__name__}: can be carried out in a checkout only")
     work: Callable[[Request, Report, Say], Result] = getattr(import_module(module, __package__), function)
     return work(request, report, say)
 

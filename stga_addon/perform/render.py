@@ -50,7 +50,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
     else:
         assert views is not None
         pictured = views if request.motion is None else _every_timestep(subject, views)
-        _write_pictures(request.output, subject, pictured, report)
+        _write_pictures(request.output, subject, _within(request, pictured), report)
     return Written(request.output)
 
 
@@ -86,7 +86,7 @@ def _write_pictures(folder: Path, subject: _Subject, views: Sequence[View], repo
 def _film(request: Render, subject: _Subject, views: Sequence[View], report: Report) -> None:
     """Write the subject's motion as one camera sees it, which stands still or orbits."""
     start = _chosen_camera(request, views)
-    timesteps: Sequence[int] = subject.timesteps or (0,)
+    timesteps: Sequence[int] = _timesteps(request, subject.timesteps) or (0,)
     path = [start] * len(timesteps)
     if request.turntable is not None:
         count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
@@ -98,6 +98,23 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
     with writer as write:
         for view in counted(path, len(path), report, "Rendering", "Image"):
             write(to_uint8(subject.image(view)))
+
+
+def _within(request: Render, views: Sequence[View]) -> list[View]:
+    """The views of the timesteps that are asked for. Raises StgaError where there is none."""
+    timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
+    return [view for view in views if view.timestep in timesteps]
+
+
+def _timesteps(request: Render, timesteps: tuple[int, ...]) -> tuple[int, ...]:
+    """Those from the first to the last of `frames`. Raises StgaError where there is none."""
+    if request.frames is None:
+        return timesteps
+    first, last = request.frames
+    found = tuple(timestep for timestep in timesteps if first <= timestep <= last)
+    if not found:
+        raise StgaError(f"--frames {first}:{last}: there is no such timestep to render")
+    return found
 
 
 def _turntable_images(request: Render, fps: float) -> int:

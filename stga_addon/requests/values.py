@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera_path import TURNTABLE_S
+from ..capture.region import is_region_file
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..driving.open_motion import MotionOptions
 from ..errors import StgaError
@@ -21,6 +22,13 @@ from ..training.settings import MAX_GROWTH, TrainingSettings
 SHAPES_SUFFIX = ".csv"
 MATTES = ("auto", "none")
 """What `Track.mattes` may be but a folder."""
+BLEND_SUFFIX = ".blend"
+SPLATS_ENGINE = "STGA_SPLATS"
+"""Blender's name of the add-on's render engine."""
+MAX_FRAME = 1_048_574
+"""Blender's last frame."""
+FRAME_DIGITS = 6
+"""Of the name of a frame's picture, as many as this at least."""
 
 
 def device_field() -> Any:
@@ -88,7 +96,7 @@ class Refine:
 
     run: Path
     parent: Path
-    region: str = ""
+    region: str = setting("", is_path=is_region_file)
     weights: np.ndarray | None = None
     frames: tuple[int, int] | None = setting(None, 0)
     growth: float = setting(0.0, 0, MAX_GROWTH)
@@ -178,7 +186,7 @@ class Track:
     meshes: bool = False
     world: str = setting("auto", choices=WORLDS)
     sync: str = setting("none", choices=SYNC)
-    mattes: str = "auto"
+    mattes: str = setting("auto", is_path=lambda text: text not in MATTES)
 
 
 @dataclass(frozen=True)
@@ -225,6 +233,7 @@ class Render:
     camera          index of the camera of a video or turntable; None: the central one
     fps             frames per second of a video or turntable; None: the capture's
     seconds         least duration of a turntable
+    frames          first and last timestep that are rendered; None: all
     capture, flame  whose meshes drive the avatar; None: those of the run
     motion          another person's motion, which drives the avatar instead, with `motion_options`; `flame`: the file
                     of its model
@@ -241,6 +250,7 @@ class Render:
     camera: int | None = setting(None, 0)
     fps: float | None = setting(None, 0)
     seconds: float = setting(TURNTABLE_S, 0)
+    frames: tuple[int, int] | None = setting(None, 0)
     capture: Path | None = None
     flame: Path | None = None
     motion: Path | None = None
@@ -261,6 +271,36 @@ class Render:
             raise StgaError(f"{self.output}: a video's name ends in .mp4")
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
+        if self.frames is not None and self.turntable is not None:
+            raise StgaError("--frames: has no effect with --turntable, which plays all of the motion")
+
+
+@dataclass(frozen=True)
+class RenderBlend:
+    """Render frames of a .blend file with the Blender of the machine, as PNGs called by their numbers (000012.png).
+
+    output          folder; pictures that it holds already stay
+    frames          first and last
+    engine          as Blender's --engine takes it
+    """
+
+    blend: Path
+    output: Path
+    frames: tuple[int, int] = setting(minimum=0, maximum=MAX_FRAME)
+    engine: str = SPLATS_ENGINE
+
+    def check(self) -> None:
+        """Raise StgaError for a file of another name, and frames in the wrong order."""
+        if self.blend.suffix.lower() != BLEND_SUFFIX:
+            raise StgaError(f"{self.blend}: expected a name that ends in {BLEND_SUFFIX}")
+        if self.frames[0] > self.frames[1]:
+            raise StgaError(f"frames: expected the first and then the last, got {self.frames[0]}, {self.frames[1]}")
+
+    @property
+    def pictures(self) -> dict[int, Path]:
+        """Frame -> its file."""
+        first, last = self.frames
+        return {frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in range(first, last + 1)}
 
 
 @dataclass(frozen=True)
@@ -399,9 +439,30 @@ class Evaluate:
     capture: Path | None = None
 
 
+@dataclass(frozen=True)
+class Benchmark:
+    """Train variants of the settings in turns, so that other load on the machine slows all of them alike, and measure
+    their avatars. Exists in a checkout only.
+
+    out             folder; each variant's run is in a folder of its name
+    seconds         of training for each variant
+    knobs           compare single settings instead of presets and strategies
+    only            names of some of the variants; empty: all
+    """
+
+    out: Path
+    capture: Path
+    seconds: float = setting(above=0)
+    flame: Path | None = None
+    principal_point: str = setting(DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
+    seed: int = setting(0, 0)
+    knobs: bool = False
+    only: tuple[str, ...] = ()
+
+
 Request = (
-    Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderRecording | Export
-    | ConvertMotion | Analyze | TimePresets | Evaluate
+    Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderBlend
+    | RenderRecording | Export | ConvertMotion | Analyze | TimePresets | Evaluate | Benchmark
 )  # fmt: skip
 
 

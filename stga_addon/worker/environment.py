@@ -17,6 +17,8 @@ from .requirements import REQUIREMENTS, package_name
 
 PYTHON_VARIABLE = "STGA_PYTHON"
 """Environment variable that names the interpreter that trains, above every other choice: for render farms."""
+BLENDER_VARIABLE = "STGA_BLENDER"
+"""Environment variable with the command that starts Blender on a machine that renders .blend files."""
 CHOICE_FILE = "choice.json"
 ADAPTERS_FILE = "adapters.json"
 

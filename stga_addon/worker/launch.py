@@ -1,9 +1,10 @@
 """Starts processes in another Python interpreter: workers with a status folder, and others."""
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS = 5
 """Added to a worker's nice value on Linux and macOS, so that Blender has precedence."""
+PR_SET_PDEATHSIG = 1
+"""Of prctl(2)."""
 # Windows: own process group, so that closing the console does not end the worker; no console window; and
 # BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
 _DETACHED: dict[str, Any] = (
@@ -75,6 +78,25 @@ def start_python(
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         reason = getattr(error, "strerror", None) or error
         raise StgaError(f"{python}: cannot be started as a Python interpreter ({reason})") from error
+
+
+def end_with_this_process() -> Callable[[], None] | None:
+    """A `preexec_fn` by which Linux kills the started process when the thread that starts it has gone, killed or not.
+
+    None on other systems, where such a process goes on to its end.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    import ctypes  # before the fork, after which nothing may be imported
+
+    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
+
+    def ask() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it had gone before it was asked
+            os._exit(1)
+
+    return ask
 
 
 def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, str]:

@@ -8,6 +8,7 @@ cancel        exists once the worker was asked to stop
 
 import math
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,7 @@ class WorkerStatus:
     message   what the worker is doing; detail: a second line about it
     error     one sentence, and the traceback where a bug caused it
     figures   named numbers that depend on the kind of work
+    machine   name of the computer
     """
 
     state: str = WorkerState.WORKING
@@ -72,6 +74,7 @@ class WorkerStatus:
     error: str = ""
     traceback: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)
+    machine: str = ""
 
 
 @dataclass(frozen=True)
@@ -132,15 +135,16 @@ def read_status(folder: Path) -> WorkerStatus | None:
         values = read_json(folder / STATUS_FILE)
         status = WorkerStatus(**values)
         texts = (status.message, status.detail, status.error, status.traceback)
+        machine = status.machine
         figures = {str(name): float(value) for name, value in status.figures.items()}
         states = (WorkerState.WORKING, WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
-        if status.state not in states or not all(isinstance(text, str) for text in texts):
+        if status.state not in states or not all(isinstance(text, str) for text in (*texts, machine)):
             return None
         if not 0 <= status.progress <= 1:
             return None
     except (StgaError, TypeError, ValueError, AttributeError):
         return None
-    return WorkerStatus(status.state, float(status.progress), *texts, figures)
+    return WorkerStatus(status.state, float(status.progress), *texts, figures, machine)
 
 
 def log_lines(folder: Path, count: int) -> list[str]:
@@ -208,7 +212,7 @@ class StatusWriter:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.cancel_requested = False
-        self._status, self._written_s = WorkerStatus(), -math.inf
+        self._status, self._written_s = WorkerStatus(machine=platform.node()), -math.inf
 
     def update(
         self, progress: float, message: str, detail: str = "", figures: Callable[[], Mapping[str, float]] = dict
@@ -222,7 +226,10 @@ class StatusWriter:
         if message != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
             finite = {name: value for name, value in figures().items() if math.isfinite(value)}
             progress = min(max(progress, 0.0), 1.0)
-            self._status = WorkerStatus(WorkerState.WORKING, progress, message, detail, figures=finite)
+            working = WorkerState.WORKING
+            self._status = replace(
+                self._status, state=working, progress=progress, message=message, detail=detail, figures=finite
+            )
             self._written_s = now
             with suppress(StgaError):  # a missing status stops no work; the work itself reports a full disk
                 write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)  # the next one comes soon

@@ -3,6 +3,7 @@
 import os
 import pwd
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -85,6 +86,22 @@ class Cluster:
 
     def start_node(self, name: str) -> None:
         self.nodes[name] = self._spawn(["slurmd", "-D", "-N", name])
+
+    def kill_node(self, name: str) -> None:
+        """Kill everything of a node, as when a machine loses power."""
+        self.nodes[name].kill()
+        self.nodes[name].wait()
+        marks = (f"SLURMD_NODENAME={name}".encode(), f"SLURM_CONF={self.folder}".encode())
+        for process in Path("/proc").glob("[0-9]*"):
+            try:
+                variables = (process / "environ").read_bytes().split(b"\0")
+                if all(any(found.startswith(mark) for found in variables) for mark in marks):
+                    parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
+                    if "slurmstepd" in Path(f"/proc/{parent}/comm").read_text():
+                        os.kill(parent, signal.SIGKILL)
+                    os.kill(int(process.name), signal.SIGKILL)
+            except (OSError, ProcessLookupError):  # it has ended meanwhile
+                continue
 
     def stop(self) -> None:
         for process in [*self.nodes.values(), *reversed(self._others)]:

@@ -81,7 +81,9 @@ def test_flamenco_compiles(tmp_path: Path) -> None:
     node = shutil.which("node")
     if node is None:
         pytest.skip("Node is not installed")
-    plan = empty_jobs(tmp_path, 2, {"last": {"request": "analyze", "capture": "{look}"}})
+    (tmp_path / "shot.blend").touch()
+    film = {"request": "render-blend", "blend": "shot.blend", "frames": [1, 2], "after": ["look"]}
+    plan = empty_jobs(tmp_path, 2, {"last": {"request": "analyze", "capture": "{look}"}, "film": film})
     carry_out(plan, SimulatedEngine())
     (tmp_path / "runs/look-00001/job/status.json").unlink()
     path = emit("flamenco", Batch(plan))
@@ -91,13 +93,13 @@ def test_flamenco_compiles(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["settings"] == []
-    assert [(task["name"], task["after"]) for task in found["made"]] == [
-        ("look-00001", []),
-        ("last-00001", ["look-00001"]),
-    ]
+    assert {(task["name"], task["type"], *task["after"]) for task in found["made"]} == {
+        ("look-00001", "misc"),
+        ("last-00001", "misc", "look-00001"),
+        ("film", "blender", "look-00001"),
+    }
     (command,) = found["made"][0]["commands"]
     assert command["name"] == "exec"
     assert command["parameters"]["exe"] == "env"
-    assert found["made"][0]["type"] == "misc"
     tail = ["stga_addon", "perform", str(tmp_path / "runs/look-00001/job"), "--resume"]
     assert command["parameters"]["args"][2:] == ["-m", *tail]

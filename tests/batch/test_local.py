@@ -1,14 +1,11 @@
 """The engine of this machine with real workers: results, kills, Ctrl-C, the command and its report."""
 
-import json
 import os
 import random
 import re
 import signal
-import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -17,12 +14,12 @@ from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.job import Job
 from stga_addon.batch.run import JobState
 from stga_addon.cli.main import main
-from stga_addon.training.run.folder import read_run
+from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
-from stga_addon.worker.status import LOCK_FILE, read_status
+from stga_addon.worker.status import LOCK_FILE
 
 from .simulated import carry_out
-from .tiny import splats_of, tiny_plan
+from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
@@ -31,8 +28,8 @@ KILLS = int(os.environ.get("STGA_BATCH_KILLS", 6))
 """Workers that are killed; 20 in the measurement of docs/batch.md."""
 
 
-def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str]) -> None:
-    """Kill workers at random moments, so many in all, none more than three times."""
+def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str], resumable: list[str]) -> None:
+    """Kill workers at random moments, none more than three times. resumable: those that had a checkpoint."""
     chance = random.Random(3)
     while len(killed) < kills and not ended.wait(chance.uniform(0.2, 1.5)):
         folders = {job.name: job.request_folder for job in jobs}
@@ -45,26 +42,29 @@ def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: li
             except ProcessLookupError:
                 continue
             killed.append(name)
+            resumable += [name] if (folders[name].parent / CHECKPOINT).exists() else []
 
 
-def test_killed_workers_resume_to_the_same_bits(tmp_path: Path) -> None:
+def test_killed_workers_resume_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
+    monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     (tmp_path / "whole").mkdir()
     (tmp_path / "killed").mkdir()
     seeds = max(2, KILLS // 3)
     whole, plan = tiny_plan(tmp_path / "whole", seeds, iterations=400), None
     carry_out(whole, LocalEngine(2, 8.0, sys.executable))
     plan = tiny_plan(tmp_path / "killed", seeds, iterations=400)
-    ended, killed = threading.Event(), list[str]()
-    thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed))
+    ended, killed, resumable = threading.Event(), list[str](), list[str]()
+    thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
     thread.start()
     try:
         batch, _ = carry_out(plan, LocalEngine(2, 8.0, sys.executable))
     finally:
         ended.set()
         thread.join()
-    print(f"killed: {killed}")
+    print(f"{len(killed)} killed, {len(resumable)} of them with a checkpoint")
     assert len(killed) >= KILLS // 2
+    assert resumable
     assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}
     for seed in range(seeds):
         name = f"train-seed{seed}"
@@ -76,32 +76,7 @@ def test_killed_workers_resume_to_the_same_bits(tmp_path: Path) -> None:
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a batch whose failure nobody sees, Ctrl-C that loses work, and a report that needs more than itself."""
     tiny_plan(tmp_path)
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "plan.toml").write_text(
-        'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n[job.train]\nrequest = "train"\ndevice = "cpu"\n'
-        'principal_point = "opencv"\nminutes = 0.1\n'
-        'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
-        'cases = [{ name = "good", capture = "capture" }, { name = "bad", capture = "bad" }]\n'
-    )
-    command = [sys.executable, "-m", "stga_addon", "batch", str(tmp_path / "plan.toml")]
-    started = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    run = tmp_path / "runs/train-good"
-    deadline = time.monotonic() + 300
-    while time.monotonic() < deadline:
-        status = read_status(run / "job")
-        failed = read_status(tmp_path / "runs/train-bad/job")
-        if status and status.message == "Training" and status.progress and failed and failed.error:
-            break
-        time.sleep(0.2)
-    time.sleep(1)
-    started.send_signal(signal.SIGINT)
-    output, _ = started.communicate(timeout=120)
-    assert started.returncode == 130, output
-    assert "train-good: stopped" in output
-    assert re.search(r"train-bad: failed: .*bad", output)
-    before = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["iteration"]
-    assert (run / "checkpoint.npz").exists()
-    assert 0 < before < 100000
+    check_interrupted(tmp_path, *interrupt_batch(tmp_path))
     report = (tmp_path / "runs/report.html").read_text()
     assert "train-bad" in report
     assert "1 failed, 1 stopped" in report

@@ -11,7 +11,7 @@ from stga_addon.batch.identity import _input_digest, job_digest
 from stga_addon.batch.plan import Plan, make_plan, plan_of_captures, read_plan
 from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.errors import StgaError
-from stga_addon.requests.values import Evaluate, Export, Extend, Refine, Render, Track, Train
+from stga_addon.requests.values import Evaluate, Export, Extend, Refine, Render, RenderBlend, Track, Train
 from stga_addon.training.settings import make_settings
 
 PLAN = """
@@ -130,7 +130,11 @@ MISTAKES = {
     'out = "r"\n' + ONE + 'after = ["two"]\n': r"\[job.one\]: refers to the job 'two', which the plan does not have",
     'out = "r"\n' + ONE + 'after = "two"\n': r"\[job.one\]: after: expected a list",
     'out = "r"\n' + ONE + 'after = ["one"]\n': "these jobs wait for each other: one → one",
-    'out = "r"\n' + ONE + "sweep = { seed = [] }\n": r"\[job.one\]: sweep: expected lists",
+    'out = "r"\n' + ONE + "sweep = 3\n": r"\[job.one\]: sweep: expected lists",
+    'out = "r"\n' + ONE + "sweep = { seed = [] }\n": "sweep: seed: expected a list of values, or a table",
+    'out = "r"\n' + ONE + "sweep = { f = { first = 1, last = 2 } }\n": "sweep: f: expected a list of values, or",
+    'out = "r"\n' + ONE + "sweep = { f = { first = 3, last = 2, size = 1 } }\n": "sweep: f: expected whole numbers",
+    'out = "r"\n' + ONE + f"sweep = {{ a = {[*range(400)]}, b = {[*range(400)]} }}\n": "more than 100000",
     'out = "r"\n' + ONE + "cases = 3\n": r"\[job.one\]: cases: expected a list of tables",
     'out = "r"\n' + ONE + 'cases = [{ flame = "x" }, { name = "a b" }]\n': r"\[job.one\]: cases.1.name: expected",
     'out = "r"\n' + ONE + "resources = { threads = -1 }\n": r"\[job.one\]: resources: setting threads: expected",
@@ -196,6 +200,55 @@ def test_a_run_counts_by_its_content(base: Path) -> None:
     assert changed(before, digests(make_plan(values, base, "plan"))) == set()
     (run / "avatar.npz").write_text("2")
     assert changed(before, digests(make_plan(values, base, "plan"))) == {"a"}
+
+
+def test_texts_that_name_files(base: Path) -> None:
+    """Catches a region file or a folder of mattes that is looked for where the worker happens to run, or whose change
+    goes unnoticed; and names that are taken for files."""
+    text = """
+out = "runs"
+[job.track]
+request = "track"
+model = "head.npz"
+footage = "footage/anna"
+sweep = { mattes = ["none", "mattes"] }
+[job.refine]
+request = "refine"
+parent = "footage"
+seconds = 3
+sweep = { region = ["mouth", "brow.JSON"] }
+"""
+    (base / "mattes").mkdir()
+    (base / "brow.JSON").write_text("{}")
+    jobs = {job.name: job.request for job in plan_of(base, text).jobs}
+    assert [jobs[f"track-{name}"].mattes for name in ("none", "mattes")] == ["none", str(base / "mattes")]
+    assert [jobs[f"refine-{name}"].region for name in ("mouth", "brow.JSON")] == ["mouth", str(base / "brow.JSON")]
+    before = digests(plan_of(base, text))
+    (base / "brow.JSON").write_text("{ }")
+    (base / "mattes/0.png").touch()
+    assert changed(before, digests(plan_of(base, text))) == {"track-mattes", "refine-brow.JSON"}
+    (base / "brow.JSON").unlink()
+    with pytest.raises(StgaError, match=r"\[job.refine\]: region: .*brow.JSON does not exist"):
+        plan_of(base, text)
+
+
+def test_ranges_of_frames(base: Path) -> None:
+    """Catches frames that no job renders, or two; and jobs whose names do not sort as their frames do."""
+    text = """
+out = "runs"
+[job.film]
+request = "render-blend"
+blend = "shot.blend"
+sweep = { frames = { first = 1, last = 10, size = 4 } }
+"""
+    (base / "shot.blend").touch()
+    jobs = plan_of(base, text).jobs
+    names = ["film-frames01-04", "film-frames05-08", "film-frames09-10"]
+    assert [job.name for job in jobs] == names
+    assert [job.request for job in jobs] == [
+        RenderBlend(base / "shot.blend", base / "runs" / name, frames)
+        for name, frames in zip(names, ((1, 4), (5, 8), (9, 10)), strict=True)
+    ]
 
 
 def test_options_inside_a_request(tmp_path):

@@ -1,6 +1,7 @@
 """The Ray engine on a cluster that is started here, with its token; skipped by name where Ray is not installed."""
 
 import os
+import secrets
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from stga_addon.batch.engines.table import make_engine
 from stga_addon.errors import StgaError
 
 from .simulated import carry_out
-from .tiny import splats_of, tiny_plan
+from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
@@ -37,6 +38,72 @@ for token, code in ((os.environ["RAY_AUTH_TOKEN"], 0), ("0" * 64, 1)):
 batch, _ = carry_out(tiny_plan(Path(sys.argv[2]), iterations=100), engine)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
+NODES = """
+import random, sys, threading
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tests"]
+from pathlib import Path
+from ray.cluster_utils import Cluster
+from batch.simulated import carry_out
+from batch.tiny import tiny_plan
+from stga_addon.batch.engines.table import make_engine
+from stga_addon.worker.lock import is_locked
+from stga_addon.worker.status import LOCK_FILE
+
+kills, seeds, size = int(sys.argv[3]), int(sys.argv[4]), {"num_cpus": 1, "object_store_memory": 80_000_000}
+cluster = Cluster(initialize_head=True, head_node_args={**size, "num_cpus": 0})
+nodes = [cluster.add_node(**size) for _ in range(2)]
+plan = tiny_plan(Path(sys.argv[2]), seeds, iterations=int(sys.argv[5]))
+chance, ended, killed = random.Random(5), threading.Event(), []
+
+def kill():
+    while len(killed) < kills and not ended.wait(chance.uniform(0.5, 2)):
+        if any(is_locked(job.request_folder / LOCK_FILE) for job in plan.jobs):
+            node = nodes.pop(0)
+            cluster.remove_node(node, allow_graceful=False)
+            killed.append(node)
+            nodes.append(cluster.add_node(**size))
+
+engine = make_engine("ray", cluster.address)
+thread = threading.Thread(target=kill)
+thread.start()
+batch, said = carry_out(plan, engine)
+ended.set()
+thread.join()
+cluster.shutdown()
+print(len(killed), "nodes killed", flush=True)
+print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
+"""
+KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
+"""Nodes that are killed; 20 in the measurement of docs/batch.md."""
+
+
+def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
+    """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    command = [sys.executable, "-c", script, str(ROOT), *map(str, arguments)]
+    done = subprocess.run(command, env={**kept, **variables}, capture_output=True, text=True, timeout=1200, cwd=ROOT)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    return done.stdout.splitlines()
+
+
+@pytest.mark.slow
+def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path) -> None:
+    """Catches a cluster with a token that cannot be used, jobs that are lost with a node, and two workers on one."""
+    pytest.importorskip("torch")
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
+    for name in ("local", "ray"):
+        (tmp_path / name).mkdir()
+    seeds, iterations = max(2, KILLS // 2), max(600, 200 * KILLS)
+    variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "STGA_CHECKPOINT_S": "0.3"}
+    killed, states = run_script(NODES, tmp_path / "ray", KILLS, seeds, iterations, **variables)[-2:]
+    names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))
+    assert states == str([(name, "finished", "") for name in names])
+    print(killed)
+    assert int(killed.split()[0]) >= KILLS // 2
+    here, there = (tiny_plan(tmp_path / name, seeds, iterations=iterations) for name in ("local", "ray"))
+    carry_out(here, LocalEngine(2, 8.0))
+    for seed in range(seeds):
+        assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
 
 
 @pytest.mark.slow
@@ -46,16 +113,22 @@ def test_same_results_through_ray(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     for name in ("local", "ray"):
         (tmp_path / name).mkdir()
-    variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    command = [sys.executable, "-c", BATCH, str(ROOT), str(tmp_path / "ray")]
-    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=400, cwd=ROOT)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    printed = run_script(BATCH, tmp_path / "ray")
     names = ("evaluate-seed0", "evaluate-seed1", "train-seed0", "train-seed1")
-    assert done.stdout.splitlines()[-1] == str([(name, "finished", "") for name in names])
+    assert printed[-1] == str([(name, "finished", "") for name in names])
     here, there = (tiny_plan(tmp_path / name, iterations=100) for name in ("local", "ray"))
     carry_out(here, LocalEngine(2, 8.0))
     for seed in range(2):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+
+
+@pytest.mark.slow
+def test_ctrl_c_through_ray(tmp_path: Path) -> None:
+    """Catches Ctrl-C that Ray's tasks do not hear, or that takes the cluster away before they have saved."""
+    pytest.importorskip("torch")
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
+    tiny_plan(tmp_path)
+    check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "ray"))
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:

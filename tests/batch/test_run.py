@@ -17,9 +17,11 @@ from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.folder import is_done
 from stga_addon.batch.job import Job, Resources
 from stga_addon.batch.lease import LEASE, hold_folder
+from stga_addon.batch.plan import make_plan
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.batch.table import plan_lines, table_lines
 from stga_addon.errors import StgaError
+from stga_addon.requests.values import RenderBlend
 from stga_addon.worker.status import WorkerState
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
@@ -61,6 +63,28 @@ def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) ->
     moved = tmp_path / "runs/replaced/look-00001"
     assert f"look-00001: has changed; what it wrote before is in {moved}" in said
     assert (moved / "job/request.json").exists()
+
+
+def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
+    """Catches a picture that was removed to be rendered anew, and counts as finished."""
+
+    def outcome(job: Job) -> tuple[WorkerState, str]:
+        assert isinstance(job.request, RenderBlend)
+        for picture in job.request.pictures.values():
+            picture.touch()
+        return WorkerState.FINISHED, ""
+
+    (tmp_path / "shot.blend").touch()
+    sweep = {"frames": {"first": 1, "last": 4, "size": 2}}
+    film = {"request": "render-blend", "blend": "shot.blend", "sweep": sweep}
+    plan = make_plan({"out": "runs", "job": {"film": film}}, tmp_path, "plan")
+    both = ["film-frames1-2", "film-frames3-4"]
+    for gone, submitted in ((None, both), ("film-frames3-4/000004.png", both[1:])):
+        if gone is not None:
+            (plan.out / gone).unlink()
+        engine = SimulatedEngine(outcome)
+        carry_out(plan, engine)
+        assert engine.submitted == submitted
 
 
 @pytest.mark.parametrize("takes_all", [False, True])
@@ -199,7 +223,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
     """Catches two batches that write into each other's jobs, also where the storage knows no file locks."""
     if locks == "fail":
 
-        def no_lock(path: Path) -> None:
+        def no_lock(path: Path, beats: bool) -> None:
             raise OSError(errno.ENOLCK, "No locks available")
 
         monkeypatch.setattr(leases, "hold_lock", no_lock)

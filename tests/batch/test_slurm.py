@@ -18,7 +18,7 @@ from stga_addon.worker.status import LOCK_FILE
 
 from .simulated import carry_out, empty_jobs
 from .slurm_cluster import Cluster, missing_programs, running_cluster
-from .tiny import splats_of, tiny_plan
+from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
@@ -68,6 +68,37 @@ def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
 
 
+def test_jobs_of_a_dead_node_resume_elsewhere(
+    on_cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a job that is lost with its machine, or is another one when it was resumed on the next."""
+    monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
+    for name in ("local", "slurm"):
+        (tmp_path / name).mkdir()
+    here, there = (tiny_plan(tmp_path / name, iterations=500) for name in ("local", "slurm"))
+    killed: list[str] = []
+
+    class Watched(SlurmEngine):
+        def ended(self):  # type: ignore[no-untyped-def]
+            found = super().ended()
+            node = self.running().get("train-seed0")
+            if node and not killed and (there.out / "train-seed0/checkpoint.npz").exists():
+                on_cluster.kill_node(node)
+                killed.append(node)
+            return found
+
+    try:
+        batch, _ = carry_out(there, Watched())
+    finally:
+        for node in killed:
+            on_cluster.start_node(node)
+    assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
+    assert killed
+    carry_out(here, LocalEngine(2, 8.0))
+    for seed in range(2):
+        assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+
+
 def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Path) -> None:
     """Catches an array that one failed job takes down, and jobs after it that count as failed themselves."""
     plan = tiny_plan(tmp_path, iterations=3)
@@ -78,6 +109,12 @@ def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Pat
     states = {name: entry.state for name, entry in batch.entries.items()}
     assert states["train-seed0"] == states["evaluate-seed0"] == JobState.FINISHED
     assert (states[name], states["evaluate-seed1"]) == (JobState.FAILED, JobState.BLOCKED)
+
+
+def test_ctrl_c_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
+    """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have saved."""
+    tiny_plan(tmp_path)
+    check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "slurm"))
 
 
 def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -> None:

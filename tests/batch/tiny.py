@@ -1,5 +1,12 @@
-"""A batch of trainings that take a moment each."""
+"""A batch of trainings that take a moment each, and one that is interrupted."""
 
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +16,9 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.files import read_npz
 from stga_addon.training.run.folder import AVATAR
+from stga_addon.worker.status import read_status
+
+ROOT = Path(__file__).resolve().parents[2]
 
 SETTINGS = {"strategy": "selective", "iterations": 40, "hull_points": False}
 
@@ -36,3 +46,41 @@ def splats_of(plan: Plan, name: str) -> dict[str, bytes]:
     path = plan.out / name / AVATAR
     read_avatar(path)
     return {key: array.tobytes() for key, array in read_npz(path).items()}
+
+
+def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
+    """Exit code and output of `stga batch` on `base`/plan.toml after Ctrl-C, which came when its job `train-good` was
+    training and its job `train-bad` had failed."""
+    (base / "bad").mkdir()
+    (base / "plan.toml").write_text(
+        'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n[job.train]\nrequest = "train"\ndevice = "cpu"\n'
+        'principal_point = "opencv"\nminutes = 0.1\n'
+        'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
+        'cases = [{ name = "good", capture = "capture" }, { name = "bad", capture = "bad" }]\n'
+    )
+    command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    started = subprocess.Popen(
+        command, cwd=ROOT, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline:
+        status, failed = (read_status(base / f"runs/train-{name}/job") for name in ("good", "bad"))
+        if status and status.message == "Training" and status.progress and failed and failed.error:
+            break
+        time.sleep(0.2)
+    time.sleep(1)
+    started.send_signal(signal.SIGINT)
+    output, _ = started.communicate(timeout=120)
+    return started.returncode, output
+
+
+def check_interrupted(base: Path, code: int, output: str) -> None:
+    """What `interrupt_batch` has to leave: the failure of one job, and a checkpoint of the other."""
+    assert code == 130, output
+    assert "train-good: stopped" in output
+    assert re.search(r"train-bad: failed: .*bad", output)
+    run = base / "runs/train-good"
+    before = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["iteration"]
+    assert (run / "checkpoint.npz").exists()
+    assert 0 < before < 100000

@@ -57,6 +57,25 @@ def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
         assert errors[timestep] < 12  # colors at half the resolution: splats are a few pixels wide
 
 
+def test_a_range_of_frames(parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches ranges that leave a frame to nobody, render it twice, or change it."""
+    cameras = ["--cameras", parts["capture"] / "transforms_train.json"]
+    names = {}
+    for span in ("0:3", "0:0", "1-3"):
+        assert render(parts, *cameras, "--out", tmp_path / span, "--frames", span) == 0
+        names[span] = {path.name: path.read_bytes() for path in (tmp_path / span).iterdir()}
+    assert names["0:0"]
+    assert names["1-3"]
+    assert names["0:0"].keys().isdisjoint(names["1-3"])
+    assert {**names["0:0"], **names["1-3"]} == names["0:3"]
+    assert render(parts, "--video", tmp_path / "v.mp4", "--frames", "1:3") == 0
+    assert len(decoded(tmp_path / "v.mp4")[1]) == 2
+    assert render(parts, *cameras, "--out", tmp_path / "none", "--frames", "7:9") == 2
+    assert "--frames 7:9: there is no such timestep" in capsys.readouterr().err
+    assert render(parts, "--turntable", 90, "--out", tmp_path / "none", "--frames", "1:3") == 2
+    assert "--frames: has no effect with --turntable" in capsys.readouterr().err
+
+
 def test_video_at_the_rate_of_the_footage(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches footage of 60 frames a second that plays 2.4 times too slowly."""
     assert render(parts, "--video", tmp_path / "unknown.mp4") == 0

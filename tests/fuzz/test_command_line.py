@@ -35,6 +35,7 @@ from stga_addon.report import preset_timing
 from stga_addon.requests.folder import write_request
 from stga_addon.requests.values import (
     Analyze,
+    Benchmark,
     ConvertMotion,
     Evaluate,
     Export,
@@ -42,6 +43,7 @@ from stga_addon.requests.values import (
     Played,
     Refine,
     Render,
+    RenderBlend,
     RenderRecording,
     Request,
     Resume,
@@ -172,6 +174,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "fps": 24.0,
     }
     (case / "head/head.json").write_text(json.dumps(head))
+    (case / "take.blend").write_bytes(b"BLENDER")
     write_performance(case / "take.csv", Performance(np.arange(3) / 30, np.full((3, 52), 0.3), None, 30.0))
     np.savez(case / "motion.npz", expr=np.zeros((2, 2)), pose=np.zeros((2, 15)), shape=np.zeros(4))
     case.rename(folder / "template")
@@ -207,6 +210,8 @@ def requests_about(case: Path) -> dict[str, Request]:
         ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
         Select(capture),
         TimePresets(capture),
+        RenderBlend(case / "take.blend", case / "asked", (1, 2)),
+        Benchmark(case / "asked", capture, 1.0, only=("draft",)),
     )
     return {type(request).__name__: request for request in requests}
 
@@ -214,7 +219,10 @@ def requests_about(case: Path) -> dict[str, Request]:
 @pytest.fixture(autouse=True)
 def _without_what_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_, **__: 1e-5)
-    monkeypatch.setattr("stga_addon.development.benchmark.benchmark.run_benchmark", lambda *_: "")
+    monkeypatch.setattr("stga_addon.development.benchmark.command.carry_out_plan", lambda *_: None)
+    monkeypatch.setattr("stga_addon.development.benchmark.benchmark.write_report", lambda *_: "")
+    monkeypatch.setattr("stga_addon.development.benchmark.slice.train_in_turns", lambda *_: {})
+    monkeypatch.setenv("STGA_BLENDER", "no-such-blender")
     monkeypatch.setattr("stga_addon.development.demo.command.run", lambda _: None)
 
 
@@ -385,6 +393,7 @@ def render(rng: random.Random, case: Path) -> list[str]:
     arguments += option(rng, 0.2, "--camera", "0", "2", *NUMBERS)
     # A turntable always has few images: each takes as long as one of any other render.
     arguments += ["--seconds", rng.choice(["0", "0.1"]), *option(rng, 0.1, "--fps", "10", "0", "-1", "nan")]
+    arguments += option(rng, 0.2, "--frames", "0:3", "2-2", "9:12", *TEXTS)
     arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
     arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
     arguments += option(rng, 0.2, "--motion", some_path(rng, case, "motion.npz", "flame", "take.csv"))

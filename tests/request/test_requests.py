@@ -42,6 +42,7 @@ from stga_addon.requests.open_head import FOLDER
 from stga_addon.requests.results import Analyzed, Result, Selected, Written
 from stga_addon.requests.values import (
     Analyze,
+    Benchmark,
     ConvertMotion,
     Evaluate,
     Export,
@@ -49,6 +50,7 @@ from stga_addon.requests.values import (
     Played,
     Refine,
     Render,
+    RenderBlend,
     RenderRecording,
     Request,
     Resume,
@@ -104,6 +106,8 @@ REQUESTS: tuple[Request, ...] = (
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Render(Path("r"), Path("v.mp4"), True, turntable=90.0, camera=2, seconds=3.0, played=PLAYED),
     Render(Path("a.npz"), Path("p"), cameras=Path("t.json"), motion=Path("m.npz"), background=(0.0, 1.0, 0.5)),
+    Benchmark(Path("b"), HEAD, 30.0, seed=2, only=("draft", "final")),
+    RenderBlend(Path("/shots/head.blend"), Path("p"), (3, 12), "CYCLES"),
     Export(Path("r"), Path("a.html"), "web", HEAD, played=PLAYED, frames=(3, 12), fps=30.0, motion_only=True),
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),

@@ -1,5 +1,6 @@
 """Lock files: held while a process lives, and only then."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -12,8 +13,10 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
+from stga_addon.errors import StgaError
 from stga_addon.worker import lock
 from stga_addon.worker.lock import hold_lock, is_locked, lock_owner
+from stga_addon.worker.status import WorkerState, inspect_worker, status_writer
 
 HOLD = (
     "import sys; from pathlib import Path; from stga_addon.worker.lock import hold_lock\n"
@@ -100,3 +103,49 @@ def test_owner_of_a_pipe_is_unknown(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "worker.lock")
     assert lock_owner(tmp_path / "worker.lock") == 0
     assert not is_locked(tmp_path / "worker.lock")
+
+
+@pytest.fixture
+def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Storage that answers as an NFS without its lock service does."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def flock(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr(lock, "CLAIM_S", 0.05)
+    monkeypatch.setattr(lock, "BEAT_S", 0.05)
+    monkeypatch.setattr(lock, "EXPIRY_S", 1.0)
+
+
+def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
+    """Catches workers that cannot run on such storage, two in one folder, and a lock that outlives its worker."""
+    path = tmp_path / "worker.lock"
+    with hold_lock(path):
+        assert lock_owner(path) == os.getpid()
+        time.sleep(1.5)  # longer than a lock without a heartbeat lasts
+        assert is_locked(path)
+        with pytest.raises(BlockingIOError), hold_lock(path):
+            pass
+        assert is_locked(path)
+        assert [found.name for found in tmp_path.iterdir()] == [path.name]
+    assert not path.exists()
+    path.write_bytes(b" 123                 node left")  # what a killed process leaves
+    assert is_locked(path)
+    os.utime(path, (time.time() - 2, time.time() - 2))
+    assert not is_locked(path)
+    with hold_lock(path):
+        assert is_locked(path)
+    with pytest.raises(OSError, match="No locks"), hold_lock(path, beats=False):
+        pass
+
+
+def test_a_worker_on_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
+    """Catches work that fails, or counts as lost while it goes on, where locks do not work."""
+    with status_writer(tmp_path / "job") as writer:
+        writer.update(0.5, "Working")
+        assert inspect_worker(tmp_path / "job").state == WorkerState.WORKING
+        with pytest.raises(StgaError, match="another worker is running here"), status_writer(tmp_path / "job"):
+            pass
+    assert inspect_worker(tmp_path / "job").state == WorkerState.FINISHED

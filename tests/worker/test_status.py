@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -291,7 +292,7 @@ def test_damaged_status_is_ignored(tmp_path, text):
 
 def test_status_round_trip(tmp_path):
     """Catches a field that is lost between worker and panel."""
-    expected = WorkerStatus(WorkerState.WORKING, 0.25, "training", "enough", "", "", {"psnr": 30.5})
+    expected = WorkerStatus(WorkerState.WORKING, 0.25, "training", "enough", "", "", {"psnr": 30.5}, platform.node())
     with status_writer(tmp_path) as writer:
         writer.update(0.25, "training", "enough", lambda: {"psnr": 30.5})
         assert read_status(tmp_path) == expected

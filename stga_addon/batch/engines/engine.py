@@ -40,7 +40,7 @@ class Engine(Protocol):
         """Watch the worker that an earlier start of the batch left running."""
 
     def running(self) -> Mapping[str, str]:
-        """Name of each job that a machine carries out -> the machine."""
+        """Name of each job that a machine carries out -> the machine, "" where only the worker knows it."""
 
     def ended(self) -> Mapping[str, Ended]:
         """The jobs whose workers have ended since this was called last."""

@@ -6,6 +6,7 @@ https://flamenco.blender.org/usage/job-types/: the manager reads JOB_TYPE and ca
 import json
 from collections.abc import Sequence
 
+from ...requests.values import RenderBlend
 from ...worker.launch import PACKAGES_FOLDER
 from ..job import Job
 from ..plan import Plan
@@ -24,7 +25,7 @@ const JOB_TYPE = {
 function compileJob(job) {
   const tasks = {};
   for (const each of BATCH.jobs) {
-    const task = author.Task(each.name, "misc");
+    const task = author.Task(each.name, each.type);
     task.addCommand(author.Command("exec", { exe: "env", args: ["PYTHONPATH=" + BATCH.packages, ...each.command] }));
     for (const other of each.after) {
       task.addDependency(tasks[other]);
@@ -40,7 +41,12 @@ def flamenco_job_type(plan: Plan, jobs: Sequence[Job]) -> str:
     """The JavaScript of the jobs, which follow those that they come after."""
     names = {job.name for job in jobs}
     listed = [
-        {"name": job.name, "after": [other for other in job.after if other in names], "command": job_command(job)}
+        {
+            "name": job.name,
+            "type": "blender" if isinstance(job.request, RenderBlend) else "misc",  # which workers take it
+            "after": [other for other in job.after if other in names],
+            "command": job_command(job),
+        }
         for job in jobs
     ]
     batch = {"name": plan.out.name, "packages": str(PACKAGES_FOLDER), "jobs": listed}

@@ -42,19 +42,17 @@ class RayEngine:
         import ray  # reads the environment
 
         try:
+            quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
             if address:
-                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-            else:
-                ray.init(
-                    num_cpus=processors(), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
-                )
+                ray.init(address=address, **quiet)
+            else:  # "local": also where another cluster is running on this machine
+                ray.init(address="local", num_cpus=processors(), include_dashboard=False, **quiet)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
         self._ray = ray
         self._task = ray.remote(max_retries=NODE_RETRIES)(_task(PYTHON_VARIABLE))
         self._adopted: dict[str, Job] = {}
         self._jobs: dict[Any, Job] = {}
-        self._machines: dict[str, str] = {}
 
     def has_room(self, job: Job) -> bool:
         return len(self._jobs) < MAX_WAITING
@@ -74,7 +72,7 @@ class RayEngine:
         """The jobs that have written a status: Ray does not tell cheaply which tasks wait for a machine."""
         jobs = [*self._jobs.values(), *self._adopted.values()]
         begun = [job for job in jobs if read_status(job.request_folder) is not None]
-        return {job.name: self._machines.get(job.name, "ray") for job in begun}
+        return dict.fromkeys((job.name for job in begun), "")
 
     def ended(self) -> Mapping[str, Ended]:
         found = {}
@@ -85,12 +83,18 @@ class RayEngine:
                 found[name] = Ended(snapshot, is_lost=True)
         if self._jobs:
             ready, _ = self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=0)
-            found.update({job.name: self._end(task, job) for task in ready for job in [self._jobs.pop(task)]})
+            for task in ready:
+                job = self._jobs.pop(task)
+                end = self._end(task, job)
+                if end.snapshot.state.is_alive:  # on a machine that Ray had given up
+                    self.adopt(job)
+                else:
+                    found[job.name] = end
         return found
 
     def _end(self, task: Any, job: Job) -> Ended:
         try:
-            code, self._machines[job.name] = self._ray.get(task)
+            code = self._ray.get(task)
         except self._ray.exceptions.RayError:  # its machine or Ray's worker has gone, more often than NODE_RETRIES
             code = -1
         return Ended(inspect_worker(job.request_folder), code < 0)
@@ -111,22 +115,29 @@ def make_ray(address: str) -> RayEngine:
     return RayEngine(address)
 
 
-def _task(python_variable: str) -> Callable[[list[str], str, str], tuple[int, str]]:
+def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
     """The function that Ray carries out. It is sent to the machine as it is, which need not have this package in the
     Python that Ray runs in: it uses nothing from outside itself."""
 
-    def run_command(command: list[str], packages: str, log: str) -> tuple[int, str]:
-        """Run a command with its output in a log; returns its exit code and the machine's name."""
+    def run_command(command: list[str], packages: str, log: str) -> int:
+        """Run a command with its output in a log; returns its exit code. On Linux it ends with Ray's worker, so that
+        a node that Ray has given up does not go on beside the one that takes over."""
+        import ctypes
         import os
-        import platform
+        import signal
         import subprocess
+        import sys
+
+        prctl = ctypes.CDLL(None).prctl if sys.platform.startswith("linux") else None
 
         variables = {**os.environ, "PYTHONPATH": packages}
         command = [variables.get(python_variable) or command[0], *command[1:]]
         for name in ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES"):  # Ray's own settings; the command has its --threads
             variables.pop(name, None)
+        end_with_this = None if prctl is None else lambda: prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
         with open(log, "ab") as out:
-            code = subprocess.call(command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out)
-        return code, platform.node()
+            return subprocess.call(
+                command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out, preexec_fn=end_with_this
+            )
 
     return run_command

@@ -1,21 +1,21 @@
-"""Benchmark of variants trained for the same wall time, and its report, table and chart."""
+"""Benchmark of variants trained for the same wall time, as a plan of a batch, and its report, table and chart."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ...batch.plan import MAX_JOBS, Plan
+from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
-from ...perform.training import prepare
-from ...progress import ignore
 from ...report.run_summary import evaluation_share
-from ...requests.values import Train
+from ...requests.values import Benchmark
+from ...schema import to_json
 from .chart import benchmark_chart
-from .scheduler import BenchmarkRun, PrintProgress, train_in_turns
 from .statistics import (
     MeanCurve,
     Outcome,
@@ -27,8 +27,10 @@ from .statistics import (
     summarize,
     within_spread,
 )
-from .variants import STANDARD, Changes, settings_of, without_choices
+from .variants import STANDARD, variants_of
 
+MEMORY_GB = 1.0
+"""Of a variant's process; all variants of a slice have one at the same time."""
 COLUMNS = {
     "iterations": ("iterations", 0),
     "ms_per_iteration": ("ms/it", 1),
@@ -49,77 +51,49 @@ COLUMNS = {
 Unfitted: without fitted exposure."""
 
 
-def run_benchmark(
-    request: Train,
-    variants: Mapping[str, Changes],
-    seconds: float,
-    seeds: int,
-    print_progress: PrintProgress = print,
-) -> str:
-    """Train every variant for `seconds` with each seed; returns the report, which is also written.
+def benchmark_table(request: Benchmark, seeds: int) -> dict[str, Any]:
+    """The table of a plan that carries out a benchmark: a slice for each seed.
 
-    request: the capture to train, and as `run` the folder of the runs; its settings are ignored. Writes report.txt,
-    benchmark.json, benchmark.csv and benchmark.png beside the runs, also when interrupted; the same call then
-    continues. Raises StgaError where the folder holds a benchmark of other settings.
+    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants, and more seeds than
+    a plan can have jobs.
     """
-    print_progress("Deciding effects")
-    out, requests = request.run, _requests(request, variants, seconds)
-    fits = any(each.settings.exposure for each in requests.values())  # for all variants or none, so that they compare
-    by_seed = {
-        seed: {name: BenchmarkRun(_seeded(each, seed), fits) for name, each in requests.items()}
-        for seed in range(seeds)
+    if seeds > MAX_JOBS:
+        raise StgaError(f"--seeds {seeds}: expected up to {MAX_JOBS}")
+    count = len(variants_of(request))
+    given = {name: value for name, value in to_json(request).items() if name not in ("out", "seed", "flame")}
+    if request.flame is not None:
+        given["flame"] = str(request.flame)
+    return {
+        "request": "benchmark",
+        **given,
+        "sweep": {"seed": list(range(seeds))},
+        "minutes": count * request.seconds / 60,
+        "resources": {"memory_gb": MEMORY_GB * count},
     }
-    for of_seed in by_seed.values():
-        for one in of_seed.values():
-            one.check()
-    left = sum(not one.finished for of_seed in by_seed.values() for one in of_seed.values())
-    if left:
-        each, total = format_duration(seconds), format_duration(left * seconds)
-        print_progress(f"{left} runs of {each}: {total} of training, plus the time to start and to evaluate")
-    try:
-        for seed, of_seed in by_seed.items():
-            if not all(one.finished for one in of_seed.values()):
-                train_in_turns(list(of_seed.values()), lambda text, seed=seed: print_progress(f"seed {seed}: {text}"))  # type: ignore[misc]
-    except KeyboardInterrupt:
-        print_progress(f"Finished runs are reported in {out / 'report.txt'}; run the same command to continue")
-        raise
-    finally:
-        report = _write_report(request.capture, by_seed, seconds, out)
-    return report
 
 
-def _requests(request: Train, variants: Mapping[str, Changes], seconds: float) -> dict[str, Train]:
-    """variant -> its training, with the effects that are decided for all seeds; a variant with the settings of an
-    earlier one is left out."""
-    requests: dict[str, Train] = {}
-    for name, changes in variants.items():
-        undecided = replace(request, run=request.run / name, settings=settings_of(changes, seconds))
-        settings = without_choices(prepare(undecided, ignore, lambda line: None).run.settings)
-        if not any(replace(settings, preset=other.settings.preset) == other.settings for other in requests.values()):
-            requests[name] = replace(undecided, settings=settings)
-    return requests
+def slices_of(plan: Plan, table: str) -> list[Benchmark]:
+    """The slices of a table of the plan, by seed."""
+    found = [job.request for job in plan.jobs if job.table == table and isinstance(job.request, Benchmark)]
+    return sorted(found, key=lambda request: request.seed)
 
 
-def _seeded(request: Train, seed: int) -> Train:
-    run = request.run.with_name(f"{request.run.name}-{seed}")
-    return replace(request, run=run, settings=replace(request.settings, seed=seed))
-
-
-def _write_report(capture: Path, by_seed: Mapping[int, Mapping[str, BenchmarkRun]], seconds: float, out: Path) -> str:
-    """Write what is finished so far; returns the report."""
-    names = list(by_seed[0])
-    found = [outcome_of(name, of_seed[name]) for name in names for of_seed in by_seed.values()]
+def write_report(slices: Sequence[Benchmark], out: Path) -> str:
+    """Write report.txt, benchmark.json, benchmark.csv and benchmark.png of what is finished so far into a folder;
+    returns the report."""
+    first, names = slices[0], list(variants_of(slices[0]))
+    found = [outcome_of(name, one.seed, one.out / name) for name in names for one in slices]
     outcomes = [outcome for outcome in found if outcome is not None]
     curves = mean_curves(outcomes)
-    report = report_text(outcomes, curves, seconds, capture)
+    report = report_text(outcomes, curves, first.seconds, first.capture)
     with replacing(out / "report.txt") as partial:
         partial.write_text(report + "\n", encoding="utf-8")
-    write_json(out / "benchmark.json", _as_json(outcomes, seconds))
+    write_json(out / "benchmark.json", _as_json(outcomes, first.seconds))
     _write_csv(out / "benchmark.csv", outcomes)
     if curves:
-        fitted = any(one.fits_exposure for of_seed in by_seed.values() for one in of_seed.values())
+        fitted = any("psnr_unmatched" in figures for one in outcomes for figures in one.quality.values())
         views = "held-out views, exposure not fitted" if fitted else "held-out views"
-        title = f"{capture.name}: PSNR on {views}, {len(by_seed)} seeds; bold: Pareto front"
+        title = f"{first.capture.name}: PSNR on {views}, {len(slices)} seeds; bold: Pareto front"
         with replacing(out / "benchmark.png") as partial:
             benchmark_chart(curves, title).savefig(partial, format="png")
     return report

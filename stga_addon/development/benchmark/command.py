@@ -1,18 +1,23 @@
-"""Train variants for the same time in turns, and print how they compare."""
+"""Train variants for the same time in turns, and print how they compare.
 
-import sys
+Each seed is a job of a batch (docs/batch.md): one after another on this machine, at once on several.
+"""
+
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from ...batch.engines.local import processors
+from ...batch.plan import make_plan
 from ...cli.arguments import add_capture, duration, usable_path, whole_number
+from ...cli.batch import add_engine, carry_out_plan, print_plan, with_threads
 from ...cli.inputs import open_named_capture, principal_point_of
 from ...errors import StgaError
 from ...requests.open_head import OpenHead
-from ...requests.values import Train
-from ...training.settings import make_settings
-from .variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
+from ...requests.values import Benchmark
 
 NAME, HELP = "benchmark", "compare accuracy and training time of strategies and presets on the CPU"
+SLICES = "benchmark"
+"""Table of the plan, and start of the folders of the slices."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -24,22 +29,26 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--out", type=usable_path, default=Path("out/benchmark"), metavar="DIR", help="keeps the runs, to be continued"
     )
+    add_engine(parser)
 
 
 def run(options: Namespace) -> None:
-    from .benchmark import run_benchmark
+    from .benchmark import benchmark_table, slices_of, write_report
 
-    variants = select_variants(SETTING_VARIANTS if options.knobs else MAIN_VARIANTS, options.only)
-    settings = make_settings(seconds=options.budget)
     capture = open_named_capture(options)
     for split, purpose in (("train", "train on"), ("val", "measure with")):
         if not capture.views.get(split):
             raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
     flame = None if options.flame is None else options.flame.resolve()
-    out, root, point = options.out.resolve(), options.capture.resolve(), principal_point_of(options)
-    request = Train(out, root, settings, flame, point, device="cpu")
-    print(run_benchmark(request, variants, options.budget, options.seeds, _print_progress))
-
-
-def _print_progress(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    out, root, only = options.out.resolve(), options.capture.resolve(), tuple(options.only or ())
+    request = Benchmark(out, root, options.budget, flame, principal_point_of(options), knobs=options.knobs, only=only)
+    values = {"out": str(out), "job": {SLICES: benchmark_table(request, options.seeds)}}
+    plan = with_threads(make_plan(values, out, "stga benchmark"), options.threads or processors())
+    if options.dry_run:
+        print_plan(plan)
+        return
+    try:
+        carry_out_plan(plan, options.engine, options.address)
+    finally:
+        report = write_report(slices_of(plan, SLICES), out)
+    print(report)

@@ -6,25 +6,25 @@ import os
 import random
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import StgaError
+from ...progress import Cancelled, Progress, Report, Say, ignore
+from ...raster.cpu.threads import threads
 from ...requests.folder import request_folder, write_request
 from ...requests.values import Train
 from ...training.run.folder import has_run, read_run
 from ...worker.launch import same_interpreter_environment
 from .variants import without_choices
-from .worker import FIT_EXPOSURE, QUALITY
+from .worker import FIT_EXPOSURE, QUALITY, THREADS
 
 TURN_S = 2.0
 """Seconds of training in one turn."""
 SAVE_TIMEOUT_S = 60.0
 """Longest wait for an interrupted worker to save its run."""
-
-PrintProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -55,32 +55,34 @@ class BenchmarkRun:
             raise StgaError(f"{self.out}: holds a run with other settings; choose another --out, or delete it")
 
 
-def train_in_turns(runs: Sequence[BenchmarkRun], print_progress: PrintProgress) -> None:
+def train_in_turns(runs: Sequence[BenchmarkRun], say: Say, report: Report = ignore) -> dict[str, str]:
     """Train all runs, `TURN_S` at a time, in a random order that changes with every round.
 
     Each run has a process, of which one trains at a time. Finished runs are skipped and interrupted ones resumed, so
-    the same call continues where the last one ended. On KeyboardInterrupt every run is saved. A run that fails is
-    reported at the end and does not stop the others.
+    the same call continues where the last one ended. Returns name -> error of the runs that failed, which does not
+    stop the others. Raises Cancelled where the report stops it; then, and on KeyboardInterrupt, every run is saved.
     """
     workers = [_Worker(run) for run in runs if not run.finished]
     try:
         for worker in workers:  # one at a time, because starting loads the processor too
-            print_progress(f"Starting {worker.name}")
+            say(f"Starting {worker.name}")
+            report(Progress(stage="Starting", detail=worker.name))
             worker.start()
         rounds = max((math.ceil((run.request.settings.seconds or 0) / TURN_S) for run in runs), default=1)
         rng = random.Random(0)
         for turn in range(1, rounds + 1):
-            print_progress(f"Training, turn {turn} of {rounds}")
-            for worker in rng.sample(workers, len(workers)):
+            say(f"Training, turn {turn} of {rounds}")
+            for number, worker in enumerate(rng.sample(workers, len(workers))):
+                share = (turn - 1 + number / len(workers)) / rounds
+                if report(Progress(share, "Training", f"Turn {turn} of {rounds}")):
+                    raise Cancelled
                 worker.train_until(turn / rounds)
     finally:
         for worker in workers:
             worker.stop()
         for worker in workers:
             worker.wait()
-    for worker in workers:
-        if worker.error:
-            print_progress(f"{worker.name} failed: {worker.error}")
+    return {worker.name: worker.error for worker in workers if worker.error}
 
 
 class _Worker:
@@ -97,7 +99,7 @@ class _Worker:
         if not has_run(self._run.out):
             write_request(request_folder(self._run.out), self._run.request)
         # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
-        options = [FIT_EXPOSURE] if self._run.fits_exposure else []
+        options = [f"{THREADS}={threads()}", *([FIT_EXPOSURE] if self._run.fits_exposure else [])]
         with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", f"{__package__}.worker", str(self._run.out), *options],

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,6 @@ import numpy as np
 from ...files import read_json
 from ...training.evaluate.forecast import UNMATCHED, checked_forecasts, curve_of
 from ...training.run.metrics_log import read_metrics
-from .scheduler import BenchmarkRun
 from .worker import QUALITY
 
 CURVE_POINTS = 200
@@ -65,11 +65,11 @@ class MeanCurve:
     high: np.ndarray
 
 
-def outcome_of(variant: str, run: BenchmarkRun) -> Outcome | None:
-    """The run's outcome so far; None before its first evaluation."""
-    lines = read_metrics(run.out)
-    quality = read_json(run.out / QUALITY) if run.finished else {}
-    return Outcome(variant, run.request.settings.seed, lines, quality) if lines else None
+def outcome_of(variant: str, seed: int, run: Path) -> Outcome | None:
+    """The outcome so far of the run in a folder; None before its first evaluation."""
+    lines = read_metrics(run)
+    quality = read_json(run / QUALITY) if (run / QUALITY).exists() else {}
+    return Outcome(variant, seed, lines, quality) if lines else None
 
 
 def summarize(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Spread]]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from ...errors import StgaError
+from ...requests.values import Benchmark
 from ...selection import SelectionOptions
 from ...training.settings import PRESETS, STRATEGIES, TrainingSettings, make_settings
 
@@ -54,6 +55,11 @@ def settings_of(changes: Changes, seconds: float) -> TrainingSettings:
 def without_choices(settings: TrainingSettings) -> TrainingSettings:
     """Settings whose effects are decided: what was asked for no longer counts."""
     return replace(settings, effects=None)
+
+
+def variants_of(request: Benchmark) -> dict[str, Changes]:
+    """The variants that are compared. Raises StgaError for unknown names."""
+    return select_variants(SETTING_VARIANTS if request.knobs else MAIN_VARIANTS, list(request.only) or None)
 
 
 def select_variants(variants: dict[str, Changes], only: list[str] | None) -> dict[str, Changes]:

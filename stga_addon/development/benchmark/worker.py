@@ -1,6 +1,6 @@
 """Benchmark worker: a process that trains one run in turns.
 
-    python -m stga_addon.development.benchmark.worker FOLDER [--fit-exposure]
+    python -m stga_addon.development.benchmark.worker FOLDER --threads=N [--fit-exposure]
 
 Trains as the request in FOLDER asks (`requests.folder`), or resumes the run in FOLDER. Each line on stdin is a share
 of the budget to train up to; the end of stdin means save and end. Each line, and the start, is answered by a line of
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
-FIT_EXPOSURE = "--fit-exposure"
+FIT_EXPOSURE, THREADS = "--fit-exposure", "--threads"
 QUALITY = "quality.json"
 """Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the file exists."""
 
@@ -86,4 +86,7 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
 
 
 if __name__ == "__main__":
+    from ...raster.cpu.threads import set_threads
+
+    set_threads(next(int(text.partition("=")[2]) for text in sys.argv if text.startswith(THREADS)))
     work(Path(sys.argv[1]), sys.stdin, TextIOWrapper(claim_stdout(), encoding="utf-8"), FIT_EXPOSURE in sys.argv)

@@ -1,6 +1,8 @@
 """Training loop of a run: steps, evaluations and checkpoints in turn."""
 
 import logging
+import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -8,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from ...capture.model import Capture
-from ...errors import DeviceError, StgaError
+from ...errors import DeviceError, StgaError, shorten
 from ..evaluate import lpips
 from ..evaluate.evaluator import Evaluator
 from ..evaluate.metrics import peak_memory_mb
@@ -24,6 +26,8 @@ from .session import Session, begin_session, resume_session
 _log = logging.getLogger(__name__)
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
+CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
+"""Environment variable that replaces it, for machines that are taken away often."""
 
 
 def train(
@@ -86,6 +90,20 @@ def _train(
     return out / AVATAR
 
 
+def _asked_interval_s() -> float | None:
+    """Seconds between checkpoints by the environment variable; None without it. Raises StgaError for no such number."""
+    text = os.environ.get(CHECKPOINT_VARIABLE, "")
+    if not text:
+        return None
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds < math.inf:
+        raise StgaError(f"{CHECKPOINT_VARIABLE}: expected seconds between checkpoints, got {shorten(text)}")
+    return seconds
+
+
 @dataclass
 class _Loop:
     """Steps, evaluations and checkpoints of a session in turn.
@@ -131,6 +149,7 @@ class _Loop:
     def _train(self, interrupts: list[int]) -> None:
         session = self.session
         saved, started, first = session.elapsed_s, session.elapsed_s, session.trainer.iteration
+        asked_s = _asked_interval_s()
         with session.loader() as loader:
             while not session.spent().share >= 1:
                 session.step(loader, perf_counter)
@@ -138,7 +157,7 @@ class _Loop:
                     self._evaluate()
                     if self._is_finished():
                         break
-                if session.elapsed_s - saved > CHECKPOINT_S:
+                if session.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
                     session.write_checkpoint(self.evaluator)
                     saved = session.elapsed_s
                 self.speed = (session.trainer.iteration - first) / max(session.elapsed_s - started, 1e-9)

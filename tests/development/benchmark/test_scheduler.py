@@ -4,7 +4,6 @@ import io
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,15 +11,20 @@ from typing import Any
 import pytest
 
 from stga_addon.capture.model import Capture
-from stga_addon.development.benchmark import benchmark, scheduler
-from stga_addon.development.benchmark.benchmark import run_benchmark
+from stga_addon.development.benchmark import scheduler, variants
+from stga_addon.development.benchmark.benchmark import write_report
 from stga_addon.development.benchmark.scheduler import BenchmarkRun, train_in_turns
+from stga_addon.development.benchmark.slice import runs_of
 from stga_addon.development.benchmark.variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
+from stga_addon.perform.perform import perform
+from stga_addon.progress import Cancelled
+from stga_addon.progress import Progress as WorkProgress
 from stga_addon.requests.folder import request_folder, write_request
-from stga_addon.requests.values import Train
+from stga_addon.requests.values import Benchmark, Train
 from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
@@ -73,63 +77,60 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "nowhere" in json.loads(replies.getvalue())["error"]
 
 
-def interrupt_at(text: str, printed: list[str]) -> Callable[[str], None]:
-    def print_progress(line: str) -> None:
-        printed.append(line)
-        if text in line:
-            raise KeyboardInterrupt
-
-    return print_progress
+@pytest.fixture
+def two_variants(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variants, "MAIN_VARIANTS", VARIANTS)
+    monkeypatch.setattr(scheduler, "TURN_S", 0.5)
 
 
 @pytest.mark.slow
-def test_a_benchmark_is_interrupted_and_goes_on(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_variants: None) -> None:
     """Catches training lost to Ctrl-C, runs trained twice or not in turns, and files that are missing at the end."""
-    monkeypatch.setattr(scheduler, "TURN_S", 0.5)
-    request = Train(tmp_path, toy.root, make_settings(seconds=1.0), device="cpu")
-    printed: list[str] = []
-    with pytest.raises(KeyboardInterrupt):
-        run_benchmark(request, VARIANTS, 2.0, 1, interrupt_at("turn 2 of 4", printed))
-    assert printed[-1] == f"Finished runs are reported in {tmp_path / 'report.txt'}; run the same command to continue"
-    assert "no run is finished yet" in (tmp_path / "report.txt").read_text()
-    kept = {name: read_checkpoint(tmp_path / f"{name}-0").elapsed_s for name in VARIANTS}
+    request = Benchmark(tmp_path, toy.root, 2.0, seed=4)
+    said: list[str] = []
+
+    def stop(progress: WorkProgress) -> bool:
+        return progress.detail == "Turn 3 of 4"
+
+    with pytest.raises(Cancelled):
+        perform(request, stop, said.append)
+    assert write_report([request], tmp_path).endswith("no run is finished yet")
+    kept = {name: read_checkpoint(tmp_path / name).elapsed_s for name in VARIANTS}
     assert all(0.5 <= elapsed < 1.9 for elapsed in kept.values())
-    printed.clear()
-    report = run_benchmark(request, VARIANTS, 2.0, 1, printed.append)
-    assert (
-        printed[1]
-        == f"{len(VARIANTS)} runs of 2 s: {2 * len(VARIANTS)} s of training, plus the time to start and to evaluate"
-    )
-    assert [text for text in printed if ": Starting" in text] == [f"seed 0: Starting {name}-0" for name in VARIANTS]
+    said.clear()
+    shares: list[float] = []
+    perform(request, lambda progress: bool(shares.append(progress.share)), said.append)
+    assert [text for text in said if "Starting" in text] == [f"Starting {name}" for name in VARIANTS]
+    assert shares == sorted(shares)
+    report = write_report([request], tmp_path)
     for name in VARIANTS:
         assert f"| {name}" in report
-        checkpoint, lines = read_checkpoint(tmp_path / f"{name}-0"), read_metrics(tmp_path / f"{name}-0")
+        checkpoint, lines = read_checkpoint(tmp_path / name), read_metrics(tmp_path / name)
         assert checkpoint.elapsed_s >= 2 > kept[name]
         assert [line["iteration"] for line in lines] == sorted(line["iteration"] for line in lines)
+        assert read_run(tmp_path / name).settings.seed == 4
     assert (tmp_path / "report.txt").read_text() == report + "\n"
     assert {run["variant"] for run in json.loads((tmp_path / "benchmark.json").read_text())["runs"]} == set(VARIANTS)
     assert (tmp_path / "benchmark.csv").read_text().startswith("variant,seed,iteration,seconds,")
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
-    printed.clear()
-    assert run_benchmark(request, VARIANTS, 2.0, 1, printed.append) == report
-    assert printed == ["Deciding effects"]
+    said.clear()
+    perform(request, say=said.append)
+    assert [text for text in said if "Starting" in text] == []
     with pytest.raises(StgaError, match="holds a run with other settings"):
-        run_benchmark(request, VARIANTS, 3.0, 2, printed.append)
+        perform(replace(request, seconds=3.0))
 
 
 def test_exposure_is_fitted_for_all_or_none(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches variants with the effect that are measured with fitted exposure beside others without it."""
-    started: list[bool] = []
-    monkeypatch.setattr(
-        benchmark, "train_in_turns", lambda runs, print_progress: started.extend(run.fits_exposure for run in runs)
-    )
-    request = Train(tmp_path / "none", toy.root, make_settings(seconds=1.0), device="cpu")
+    request = Benchmark(tmp_path, toy.root, 2.0)
     rows = ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
     plain = {name: {**changes, "effects": {"exposure": "off"}} for name, changes in VARIANTS.items()}
-    run_benchmark(request, plain, 2.0, 1, lambda text: None)
     with_rows = {"paper": {**TINY, "schedule": "paper"}, "corrected": {**TINY, "exposure": rows, "effects": None}}
-    run_benchmark(replace(request, run=tmp_path / "all"), with_rows, 2.0, 1, lambda text: None)
-    assert started == [False, False, True, True]
+    fitted = []
+    for chosen in (plain, with_rows):
+        monkeypatch.setattr(variants, "MAIN_VARIANTS", chosen)
+        fitted += [run.fits_exposure for run in runs_of(request)]
+    assert fitted == [False, False, True, True]
 
 
 def test_ended_workers_are_reaped(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,22 +160,19 @@ def test_one_failure_does_not_end_the_others(toy: Capture, tmp_path: Path) -> No
     good = run_in(toy, tmp_path / "good", seconds=0.5)
     lost = run_in(toy, tmp_path / "lost", seconds=0.5)
     lost = replace(lost, request=replace(lost.request, capture=tmp_path / "nowhere"))
-    printed: list[str] = []
-    train_in_turns([lost, good], printed.append)
+    failures = train_in_turns([lost, good], lambda text: None)
     assert good.finished
     assert not lost.finished
-    assert [text for text in printed if "failed" in text] == [
-        text for text in printed if text.startswith("lost failed: ")
-    ]
-    assert "nowhere" in printed[-1]
+    assert list(failures) == ["lost"]
+    assert "nowhere" in failures["lost"]
 
 
 def test_variants() -> None:
     """Catches a variant whose settings cannot be made, or that the table cannot compare with the standard."""
-    for variants in (MAIN_VARIANTS, SETTING_VARIANTS):
-        made = [make_settings(**{"seconds": 1.0, **changes}) for changes in variants.values()]
-        assert len({json.dumps(str(replace(settings, preset=None))) for settings in made}) == len(variants)
-        assert "standard" in variants
+    for table in (MAIN_VARIANTS, SETTING_VARIANTS):
+        made = [make_settings(**{"seconds": 1.0, **changes}) for changes in table.values()]
+        assert len({json.dumps(str(replace(settings, preset=None))) for settings in made}) == len(table)
+        assert "standard" in table
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
     with pytest.raises(StgaError, match="--only: 'fast' is not one of draft, standard"):
         select_variants(MAIN_VARIANTS, ["fast"])

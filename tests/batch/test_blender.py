@@ -1,0 +1,129 @@
+"""Frames of an animation on workers, by a real Blender, which the command in STGA_BLENDER starts (docs/blender.md)."""
+
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba")
+
+from capture.factory import write_mesh_capture
+from PIL import Image
+
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.batch.engines.local import LocalEngine
+from stga_addon.batch.plan import read_plan
+from stga_addon.batch.run import JobState
+from stga_addon.capture.open import open_capture
+from stga_addon.development.package import build_zip
+
+from .simulated import carry_out
+
+ROOT = Path(__file__).resolve().parents[2]
+BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender"),
+]
+MAKE = """
+import bpy
+folder = {folder!r}
+bpy.ops.wm.read_homefile(use_empty=True)
+bpy.ops.stga.import_capture(directory=folder + "/capture", principal_point="opencv")
+bpy.ops.stga.show_avatar(filepath=folder + "/avatar.npz")
+render = bpy.context.scene.render
+render.resolution_x = render.resolution_y = 96
+render.resolution_percentage, render.engine = 100, "BLENDER_WORKBENCH"
+render.filepath = "//wrong/"
+bpy.ops.wm.save_as_mainfile(filepath=folder + "/head.blend")
+"""
+PLAN = """
+out = "{engine}"
+[resources]
+threads = 1
+memory_gb = 1
+[job.film]
+request = "render-blend"
+blend = "head.blend"
+sweep = {{ frames = {{ first = 0, last = 4, size = 2 }} }}
+"""
+COMMAND = """
+import sys
+from stga_addon.cli.main import main
+sys.exit(main(["batch", sys.argv[1], "--engine", "ray"]))
+"""
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with an animated head in a .blend file, and pictures of it by one Blender: frames 0 to 4 in `whole`."""
+    folder = tmp_path_factory.mktemp("shot")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BLENDER_USER_RESOURCES", str(folder / "profile"))
+        patch.setenv("STGA_PYTHON", sys.executable)
+        archive = build_zip(folder)
+        blender("--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
+        capture = open_capture(write_mesh_capture(folder / "capture", (0, 1, 3, 4), range(4)))
+        faces = capture.faces.astype(np.int32)
+        splats = lattice_splats(capture.neutral, faces, order=0)
+        write_avatar(folder / "avatar.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), faces))
+        (folder / "make.py").write_text(MAKE.format(folder=str(folder)))
+        blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
+        names = folder / "whole/######"
+        blender(
+            "--background", folder / "head.blend", "--engine", "STGA_SPLATS", "--render-output", names,
+            "--render-format", "PNG", "--frame-start", 0, "--frame-end", 4, "--render-anim",
+        )  # fmt: skip
+        yield folder
+
+
+def blender(*arguments: object) -> None:
+    done = subprocess.run([*BLENDER, *map(str, arguments)], capture_output=True, text=True, timeout=600, cwd=ROOT)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+
+
+def pictures(folder: Path) -> dict[str, np.ndarray]:
+    return {path.name: np.asarray(Image.open(path)) for path in sorted(folder.rglob("*.png"))}
+
+
+def check(shot: Path, engine: str) -> None:
+    whole, found = pictures(shot / "whole"), pictures(shot / engine)
+    assert list(found) == list(whole) == [f"{frame:06d}.png" for frame in range(5)]
+    for name, picture in whole.items():
+        np.testing.assert_array_equal(found[name], picture)
+    assert any((whole["000000.png"] != picture).any() for picture in whole.values())  # it moves
+    assert sorted(path.name for path in (shot / engine).glob("film-*")) == [
+        f"film-frames{span}" for span in ("0-1", "2-3", "4-4")
+    ]
+
+
+def plan_of(shot: Path, engine: str) -> Path:
+    path = shot / f"{engine}.toml"
+    path.write_text(PLAN.format(engine=engine))
+    return path
+
+
+def test_frames_through_the_local_engine(shot: Path) -> None:
+    """Catches frames that a worker's Blender renders with another engine, leaves out, or renders again."""
+    plan = read_plan(plan_of(shot, "local"))
+    batch, _ = carry_out(plan, LocalEngine(2, 8.0))
+    assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
+    check(shot, "local")
+    batch, _ = carry_out(plan, LocalEngine(2, 8.0))
+    assert {entry.state for entry in batch.entries.values()} == {JobState.KEPT}
+
+
+def test_frames_through_ray(shot: Path) -> None:
+    """Catches a Ray worker that finds neither Blender nor the training environment."""
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
+    command = [sys.executable, "-c", COMMAND, str(plan_of(shot, "ray"))]
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=500, cwd=ROOT)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    check(shot, "ray")
