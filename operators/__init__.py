@@ -11,6 +11,7 @@ from .arkit_controls import AddArkitControls, RemoveArkitControls
 from .common import register_classes, unregister_classes
 from .continue_run import Extend, Refine
 from .drive import CalibrateLive, DriveLive, FollowLive, MeasureRange, RecordLive, StopLive
+from .drive_video import DriveVideo
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PerformanceDrop, PlyDrop
 from .environment import MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
@@ -70,6 +71,7 @@ CLASSES = (
     CalibrateLive,
     RecordLive,
     FollowLive,
+    DriveVideo,
     ImportPly,
     ExportAvatar,
     ExportCameras,

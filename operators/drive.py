@@ -8,6 +8,7 @@ import bpy
 from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.driving.live.receiver import LOOPBACK, Receiver, leaves_this_machine
 from ..stga_addon.driving.live.sources import SOURCES
+from ..stga_addon.driving.live.take import Recording
 from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S
 from ..stga_addon.driving.transfer import trained_range
 from ..stga_addon.errors import StgaError
@@ -77,6 +78,12 @@ class DriveOptions:
     mirror: bpy.props.BoolProperty(name="Mirror", description="Exchange left and right, as a mirror does")
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
+    detector: bpy.props.StringProperty(
+        name="Detector",
+        description="Google's face_landmarker.task, which detects the shapes in a video",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS,
+    )
     takes: bpy.props.StringProperty(
         name="Takes",
         description="Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
@@ -221,16 +228,29 @@ class FollowLive(_NeedsSession, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _apply(operator: Any, context: Any, recording: Any) -> None:
-    """Write the take and apply it. Raises StgaError."""
-    settings = scene_settings(context).drive
-    folder = settings.takes
+def takes_folder(context: Any) -> tuple[Path, str]:
+    """The folder of takes, which is made, and a warning where it does not last, or "". Raises StgaError."""
+    folder = scene_settings(context).drive.takes
+    warning = ""
     if folder.startswith("//") and not bpy.data.filepath:
-        path = live_session.write_take(recording, Path(bpy.app.tempdir))
-        operator.report({"WARNING"}, f"{path}: is lost when Blender ends; save the .blend file to keep takes beside it")
+        path = Path(bpy.app.tempdir)
+        warning = f"{path}: is emptied when Blender ends; save the .blend file to keep takes beside it"
     else:
-        path = live_session.write_take(recording, file_path(folder, "takes"))
-    options = live_options(settings)
+        path = file_path(folder, "takes")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be made ({error.strerror or error})") from error
+    return path, warning
+
+
+def _apply(operator: Any, context: Any, recording: Recording) -> None:
+    """Write the take and apply it. Raises StgaError."""
+    folder, warning = takes_folder(context)
+    if warning:
+        operator.report({"WARNING"}, warning)
+    path = live_session.write_take(recording, folder)
+    options = live_options(scene_settings(context).drive)
     try:
         bpy.ops.stga.apply_motion(
             filepath=str(path),

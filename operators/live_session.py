@@ -181,10 +181,6 @@ def write_take(recording: Recording, folder: Path) -> Path:
     performance = recording.performance()
     if performance is None:
         raise StgaError("Record: fewer than two faces were received; nothing was recorded")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StgaError(f"{folder}: cannot be made ({error.strerror or error})") from error
     number = 1
     while (path := folder / f"take_{number:03d}.csv").exists():
         number += 1

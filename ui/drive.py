@@ -9,7 +9,9 @@ from ..operators import ids, live_session
 from ..operators.common import scene_settings
 from ..stga_addon.driving.live.receiver import LOOPBACK
 from ..stga_addon.driving.live.sources import SOURCES
+from ..stga_addon.requests.monitor_state import Kind
 from .motion import MotionPanel
+from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
 
@@ -44,6 +46,9 @@ class DrivePanel(SidebarPanel, bpy.types.Panel):
         row.prop(settings, "exchange_jaw", text="Swap Jaw", toggle=True)
         row.prop(settings, "exchange_mouth", text="Swap Mouth", toggle=True)
         layout.prop(settings, "takes")
+        if not draw_running(layout, context, Kind.PERFORMANCE):
+            layout.operator(ids.DRIVE_VIDEO, text="From a Video of a Face", icon="FILE_MOVIE")
+            layout.prop(settings, "detector")
 
 
 def _draw_source(layout: Any, context: Any, settings: Any) -> None:

@@ -26,8 +26,8 @@ def shown(stream: Stream) -> float:
 
 
 def test_late_doubled_and_lost_packets():
-    """Catches a head that jumps back in time, packets that count twice, and losses that are not counted: rows of half the
-    rate of the clock are no losses."""
+    """Catches a head that jumps back in time, packets that count twice, and losses that are not counted: rows of half
+    the rate of the clock are no losses."""
     stream = Stream(LINK)
     order = [0, 2, 4, 8, 6, 8, 10, 16]
     for number, frame in enumerate(order):

@@ -6,7 +6,7 @@ import numpy as np
 
 from stga_addon.driving.names import ARKIT_SHAPES
 
-UDP_ORDER = [name for name in ARKIT_SHAPES]
+UDP_ORDER = list(ARKIT_SHAPES)
 for pair in ("jaw", "mouth"):
     left, right = UDP_ORDER.index(f"{pair}Left"), UDP_ORDER.index(f"{pair}Right")
     UDP_ORDER[left], UDP_ORDER[right] = UDP_ORDER[right], UDP_ORDER[left]
@@ -29,9 +29,7 @@ def live_link_face(
     return b"\x06" + names + time + body
 
 
-def facial_mocap(
-    weights: dict[str, float], head: tuple[float, float, float] = (0, 0, 0), separator: str = "-"
-) -> bytes:
+def facial_mocap(weights: dict[str, float], head: tuple[float, ...] = (0, 0, 0), separator: str = "-") -> bytes:
     """Percent; pitch, yaw and roll in degrees, and a position."""
     fields = []
     for name in ARKIT_SHAPES:
