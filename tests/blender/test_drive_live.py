@@ -155,6 +155,7 @@ def test_stopped_in_the_middle_of_a_recording(live):
 
 def test_the_trained_range(live):
     """Catches a meter that says inside where nobody trained, and a live pose that is not led back."""
+    bpy.context.scene.frame_set(2)
     bpy.ops.stga.measure_range()
     from stga_addon.scene.rig.trained import outside_now, stored_range
 

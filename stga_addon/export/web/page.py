@@ -10,7 +10,9 @@ PLAYER = Path(__file__).parent / "player"
 MODULES = (
     "data.js",
     "vector.js",
+    "performance.js",
     "rotation.js",
+    "shapes.js",
     "motion.js",
     "rig.js",
     "strain.js",
