@@ -1,5 +1,6 @@
 """The live session: what a phone or program sends, on the scene's head, at most one in this Blender."""
 
+import gc
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,6 +109,7 @@ class LiveSession:
         monitor.unwatch(self)
         if _session is self:
             _session = None
+            gc.unfreeze()
         if _show_again in bpy.app.handlers.frame_change_post:
             bpy.app.handlers.frame_change_post.remove(_show_again)
 
@@ -171,6 +173,7 @@ def start(target: Target, receiver: Receiver) -> LiveSession:
         _session.stop()
     _session = LiveSession(target, receiver)
     bpy.app.handlers.frame_change_post.append(_show_again)
+    gc.freeze()  # a collection of all that Blender and its add-ons hold takes longer than a frame
     monitor.watch(_session)
     return _session
 
