@@ -4,12 +4,14 @@ from typing import Any
 
 import bpy
 
-from . import ids, monitor
+from . import drive, ids, monitor
 from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
 from .arkit_controls import AddArkitControls, RemoveArkitControls
 from .common import register_classes, unregister_classes
 from .continue_run import Extend, Refine
+from .drive import CalibrateLive, DriveLive, FollowLive, MeasureRange, RecordLive, StopLive
+from .drive_video import DriveVideo
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PerformanceDrop, PlyDrop
 from .environment import MakeEnvironment, TestEnvironment
 from .export import ExportAvatar
@@ -63,6 +65,13 @@ CLASSES = (
     ApplyMotion,
     AddArkitControls,
     RemoveArkitControls,
+    MeasureRange,
+    DriveLive,
+    StopLive,
+    CalibrateLive,
+    RecordLive,
+    FollowLive,
+    DriveVideo,
     ImportPly,
     ExportAvatar,
     ExportCameras,
@@ -92,9 +101,11 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
     monitor.register()
+    drive.register()
 
 
 def unregister() -> None:
+    drive.unregister()
     monitor.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)

@@ -8,8 +8,14 @@ import bpy
 import numpy as np
 
 from ..stga_addon.capture.open import open_capture
-from ..stga_addon.driving.open_motion import MotionOptions, adapted, performed, prepared_performance
-from ..stga_addon.driving.performance import parts_kept
+from ..stga_addon.driving.open_motion import (
+    MotionOptions,
+    adapted,
+    parsed_gain,
+    performed,
+    prepared_performance,
+)
+from ..stga_addon.driving.performance import EXCHANGEABLE, parts_kept
 from ..stga_addon.driving.read_performance import is_performance, read_performance
 from ..stga_addon.driving.transfer import TrainedRange, trained_range
 from ..stga_addon.errors import StgaError
@@ -19,6 +25,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
 from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
+from ..stga_addon.scene.rig.trained import store_range
 from . import ids
 from .common import (
     FileImport,
@@ -50,6 +57,14 @@ def _gain_property(name: str, what: str) -> Any:
         soft_max=2.0,
         max=10.0,
         options={"SKIP_SAVE"},
+    )
+
+
+def exchange_property(pair: str) -> Any:
+    """Whether left and right of a pair of shapes (`EXCHANGEABLE`) are exchanged."""
+    return bpy.props.BoolProperty(
+        name=f"Exchange {pair.capitalize()} Sides",
+        description=f"Of a face performance: exchange {pair}Left and {pair}Right, which some senders exchange",
     )
 
 
@@ -126,6 +141,14 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     jaw_gain: _gain_property("Jaw Gain", "the jaw's shapes")
     eyes_gain: _gain_property("Eyes Gain", "the gaze")
     head_gain: _gain_property("Head Gain", "the head's rotation, which turns the neck")
+    shape_gains: bpy.props.StringProperty(
+        name="Shape Gains",
+        description="Of a face performance: factors of single shapes, which take the place of their part's, such as "
+        "jawOpen=0.8 cheekPuff=0",
+        options={"SKIP_SAVE"},
+    )
+    exchange_jaw: exchange_property("jaw")
+    exchange_mouth: exchange_property("mouth")
     fps: bpy.props.FloatProperty(
         name="Recorded At",
         description="Frames per second of the recording; 0: one timestep for each frame of the scene. A face "
@@ -231,14 +254,20 @@ class ApplyMotion(bpy.types.Operator, FileImport):
 
     def _options(self) -> MotionOptions:
         gains = {"face": self.face_gain, "jaw": self.jaw_gain, "eyes": self.eyes_gain, "head": self.head_gain}
-        return MotionOptions(self.strength, self.neutral, self.smoothing, self.mirror, gains, self.stay_trained)
+        gains |= dict(parsed_gain(text) for text in self.shape_gains.replace(",", " ").split())
+        exchange = tuple(pair for pair in EXCHANGEABLE if getattr(self, f"exchange_{pair}"))
+        return MotionOptions(
+            self.strength, self.neutral, self.smoothing, self.mirror, gains, self.stay_trained, exchange
+        )
 
     def _trained(self, head: Any) -> TrainedRange | None:
         """The range of the head's own recording, where it is asked for."""
         if not self.stay_trained:
             return None
         own = flame_of(capture_of(head), head.name)
-        return trained_range([own.frame(timestep) for timestep in own.timesteps])
+        trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
+        store_range(head, trained)
+        return trained
 
     def _check_end(self, count: int) -> None:
         end = self.start + count - 1

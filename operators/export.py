@@ -1,6 +1,7 @@
 """Exports an avatar to the files of other viewers and tools."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,6 +10,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.driving.page_controls import page_controls
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
 from ..stga_addon.format import format_bytes
@@ -134,6 +136,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         if self.format == "web":
             playback = scene_playback(context, head, frames, self.motion_only)
             motion = None if self.motion_only else exact_motion(head, frames, self._warn)
+            playback = replace(playback, controls=page_controls(motion))
         if format.source == "range":
             check_free_space(path, range_bytes(avatar, self.format, len(frames)))
         elif format.source == "motion":

@@ -1,4 +1,4 @@
-"""Request monitor: one timer that reads the status of workers and brings their results into their scenes.
+"""Request monitor: the one timer, which reads the status of workers and brings their results into their scenes.
 
 What is to be done is decided by `requests.monitor_state`; this module reads files, owns the timer and carries out
 effects, those that depend on the kind of request by the table in `results`.
@@ -10,7 +10,8 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
-from typing import Any
+from time import monotonic
+from typing import Any, Protocol
 
 import bpy
 import numpy as np
@@ -52,6 +53,33 @@ _curves: dict[Path, Curve | None] = {}
 """Run folder -> its curve as last read."""
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
+
+
+class Watched(Protocol):
+    """What the timer calls beside its checks of requests, at a rate of its own."""
+
+    def tick(self) -> float | None:
+        """Seconds until the next call; None where there is none."""
+
+    def close(self) -> None:
+        """The file, or the extension, is gone."""
+
+
+_watched: list[Watched] = []
+_requests_due = 0.0
+"""Monotonic time of the next check of requests, while something is called more often."""
+
+
+def watch(thing: Watched) -> None:
+    """Call `thing` from the timer until it returns None, the file is closed, or the extension ends."""
+    _watched.append(thing)
+    _restart_timer()
+
+
+def unwatch(thing: Watched) -> None:
+    """Call it no more; without an effect where it is not called."""
+    with suppress(ValueError):
+        _watched.remove(thing)
 
 
 def state_of(scene: Any, kind: Kind) -> RequestState:
@@ -117,13 +145,40 @@ def has_timer() -> bool:
 
 
 def tick() -> float | None:
-    """Check every request; seconds until the next call, None to stop the timer, as bpy.app.timers expects."""
+    """Check every request, and call what is watched; seconds until the next call, None to stop the timer, as
+    bpy.app.timers expects."""
+    intervals = [_check_requests(), *(_call_safely(thing) for thing in list(_watched))]
+    return min((interval for interval in intervals if interval is not None), default=None)
+
+
+def _check_requests() -> float | None:
+    """Check every request, unless the timer runs faster for something else and it is too early; seconds until the next
+    check, None where nothing is expected."""
+    global _requests_due
+    now = monotonic()
+    if _watched and now < _requests_due:
+        return _requests_due - now
     scenes = [scene for scene in bpy.data.scenes if scene.library is None]
     intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind if kind != Kind.ENVIRONMENT]
     environment = _states.get((NO_SCENE, Kind.ENVIRONMENT))
     if environment is None or environment.is_running:
         intervals.append(_check_safely(None, Kind.ENVIRONMENT))
-    return min((interval for interval in intervals if interval is not None), default=None)
+    interval = min((interval for interval in intervals if interval is not None), default=None)
+    _requests_due = now + (CHECK_INTERVAL_S if interval is None else interval)
+    return interval
+
+
+def _call_safely(thing: Watched) -> float | None:
+    """Call what is watched; after an unexpected error, which is reported, it is closed and called no more."""
+    try:
+        interval = thing.tick()
+    except Exception as error:
+        print(_describe(error))
+        thing.close()
+        interval = None
+    if interval is None:
+        unwatch(thing)
+    return interval
 
 
 def _check_safely(scene: Any, kind: Kind) -> float | None:
@@ -298,6 +353,15 @@ def _push_undo() -> None:
         bpy.ops.ed.undo_push(message="Show Result")
 
 
+def _restart_timer() -> None:
+    """Let the timer run at once, however long it would have waited."""
+    global _requests_due
+    _requests_due = 0.0
+    if bpy.app.timers.is_registered(tick):
+        bpy.app.timers.unregister(tick)
+    _start_timer()
+
+
 def _start_timer() -> None:
     if has_timer() and not bpy.app.timers.is_registered(tick):
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
@@ -312,6 +376,12 @@ def redraw() -> None:
                         region.tag_redraw()
 
 
+def _close_watched() -> None:
+    for thing in list(_watched):
+        thing.close()
+    _watched.clear()
+
+
 def _end_unawaited() -> None:
     """End the workers whose result only a scene that is gone was to have."""
     for (_, kind), state in list(_states.items()):
@@ -323,6 +393,7 @@ def _end_unawaited() -> None:
 @persistent
 def _after_load(_: Any) -> None:
     loader.close()
+    _close_watched()
     _end_unawaited()
     for key in [key for key in _states if key[1] not in (Kind.VIDEO, Kind.ENVIRONMENT)]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
@@ -369,6 +440,7 @@ def unregister() -> None:
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     loader.close()
+    _close_watched()
     _end_unawaited()
     for (_, kind), state in _states.items():
         if kind == Kind.VIDEO and state.folder is not None:

@@ -165,6 +165,21 @@ def _select_for_take(scene: Any, state: RequestState) -> Answer:
     return Shown(undoable=True)
 
 
+# Performances of videos
+
+
+def _apply_performance(scene: Any, state: RequestState) -> Answer:
+    """Apply the performance that was written to the scene's head, with the operator, which reports in the window."""
+    head = _head(scene, state)
+    if not is_head(head):
+        raise StgaError(f"{state.subject}: was written, but the scene has no head to apply it to")
+    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
+    with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
+        undoable = window is not None
+        bpy.ops.stga.apply_motion("EXEC_DEFAULT", undoable, filepath=str(state.subject), start=scene.frame_start)
+    return Shown()
+
+
 KINDS = {
     Kind.TRAINING: RequestKind(
         "Training",
@@ -183,6 +198,12 @@ KINDS = {
     Kind.ANALYSIS: RequestKind("The analysis", "Stop the analysis; earlier results stay", show=_fill_effects),
     Kind.SELECTION: RequestKind(
         "The selection", "Stop selecting; the groups stay as they are", show=_select_for_take, changed=_head
+    ),
+    Kind.PERFORMANCE: RequestKind(
+        "The performance of the video",
+        "Stop watching the video; nothing is written",
+        show=_apply_performance,
+        changed=_head,
     ),
     Kind.VIDEO: RequestKind(
         "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay"

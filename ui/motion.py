@@ -9,6 +9,7 @@ from ..operators.common import is_head, rig_or_none, scene_settings
 from ..stga_addon.driving.names import ARKIT_SHAPES
 from ..stga_addon.scene.rig.arkit import has_controls
 from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY, property_path
+from ..stga_addon.scene.rig.trained import outside_now, stored_range
 from .sidebar import SidebarPanel
 
 MAX_SLIDERS = 10  # the first components vary most
@@ -43,6 +44,28 @@ class ArkitPanel(SidebarPanel, bpy.types.Panel):
         for name in ARKIT_SHAPES:
             column.prop(rig, property_path(name), text=name, slider=True)
         self.layout.operator(ids.REMOVE_ARKIT_CONTROLS, icon="X")
+
+
+class TrainedPanel(SidebarPanel, bpy.types.Panel):
+    """Meters of how far outside the trained range the head is posed in this frame."""
+
+    bl_idname = "STGA_PT_trained"
+    bl_label = "Trained Range"
+    bl_parent_id = MotionPanel.bl_idname
+    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Any) -> None:
+        head = scene_settings(context).head
+        rig = rig_or_none(head) if is_head(head) else None
+        trained = stored_range(head) if rig is not None else None
+        if trained is None:
+            self.layout.operator(ids.MEASURE_RANGE, icon="DRIVER_DISTANCE")
+            return
+        for part, beyond in outside_now(head, rig, trained).items():
+            text = (
+                f"{part.capitalize()}: {beyond:.1f} half widths outside" if beyond else f"{part.capitalize()}: inside"
+            )
+            self.layout.progress(factor=min(beyond, 1.0), text=text)
 
 
 class _Sliders(SidebarPanel):

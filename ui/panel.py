@@ -16,8 +16,9 @@ from ..stga_addon.scene.display.splat_object import display_mode, input_identifi
 from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
 from .continue_panel import ContinuePanel
+from .drive import DrivePanel
 from .effects import EffectsPanel
-from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel
+from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel, TrainedPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
@@ -124,6 +125,8 @@ CLASSES = (
     EffectsPanel,
     ShowPanel,
     MotionPanel,
+    DrivePanel,
+    TrainedPanel,
     ArkitPanel,
     ExpressionPanel,
     IdentityPanel,

@@ -8,6 +8,7 @@ import bpy
 from ..operators import ids
 from ..operators.common import register_classes, unregister_classes
 from ..operators.continue_run import ExtendOptions, RefineOptions
+from ..operators.drive import DriveOptions
 from ..operators.track import TrackOptions, path_property
 from ..operators.train import TrainOptions, preset_property
 from ..stga_addon.scene.compat import PATH_OPTIONS
@@ -75,6 +76,10 @@ class ExtendSettings(ExtendOptions, bpy.types.PropertyGroup):
     """The panel's options of Extend with Take."""
 
 
+class DriveSettings(DriveOptions, bpy.types.PropertyGroup):
+    """The panel's options of driving live."""
+
+
 class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     """Settings of the panel, one group for each scene; passed to operators as arguments, but for head and splats."""
 
@@ -94,6 +99,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     motion_source: bpy.props.PointerProperty(
         name="From", description="Another imported head, whose motion is applied to this one", type=bpy.types.Object
     )
+    drive: bpy.props.PointerProperty(type=DriveSettings)
     splats: bpy.props.PointerProperty(
         name="Splats", description="Splats whose display is set here", type=bpy.types.Object
     )
@@ -122,7 +128,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, SceneSettings)
+CLASSES = (SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, DriveSettings, SceneSettings)
 
 
 def register() -> None:

@@ -6,6 +6,7 @@ from ..requests.open_head import OpenHead
 from ..requests.values import ConvertMotion
 from .arguments import frame_rate, usable_path
 from .carry_out import carry_out
+from .inputs import add_detector, provide_detector
 from .motion import add_motion_options, motion_options
 
 NAME, HELP = "drive", "convert a face performance (ARKit's 52 shapes) to a FLAME motion, or a motion to a CSV of shapes"
@@ -16,7 +17,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "source",
         type=usable_path,
         metavar="MOTION",
-        help="a performance (CSV, JSON, text, take folder), FLAME parameters (.npz), or a capture tracked with FLAME",
+        help="a performance (CSV, JSON, text, take folder), a video of a face, FLAME parameters (.npz), or a capture "
+        "tracked with FLAME",
     )
     parser.add_argument(
         "--out",
@@ -30,9 +32,13 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--head", type=usable_path, metavar="CAPTURE", dest="of", help="whose identity (default: average)"
     )
     parser.add_argument("--fps", type=frame_rate, help="frames per second of the result (default: as recorded)")
+    add_detector(parser)
     add_motion_options(parser)
 
 
 def run(options: Namespace) -> None:
+    provide_detector(options)
     chosen = motion_options(options)
-    carry_out(ConvertMotion(options.source, options.out, options.flame, options.of, options.fps, chosen))
+    carry_out(
+        ConvertMotion(options.source, options.out, options.flame, options.of, options.fps, chosen, options.detector)
+    )

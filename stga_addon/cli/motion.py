@@ -3,13 +3,13 @@
 import argparse
 from argparse import ArgumentParser, Namespace
 
-from ..driving.names import ARKIT_SHAPES, PARTS
-from ..driving.open_motion import MAX_FACTOR, MAX_SMOOTHING_S, MotionOptions
+from ..driving.open_motion import MAX_FACTOR, MAX_SMOOTHING_S, MotionOptions, parsed_gain
+from ..driving.performance import EXCHANGEABLE
 from ..driving.transfer import NEUTRALS
 from ..errors import StgaError
 from .arguments import real_number
 
-OPTIONS = ("strength", "neutral", "smooth", "mirror", "gain", "stay_trained")
+OPTIONS = ("strength", "neutral", "smooth", "mirror", "exchange", "gain", "stay_trained")
 MOTION_HELP = (
     "another person's motion: FLAME parameters (.npz, or a capture), or a performance in ARKit's shapes (CSV of Live "
     "Link Face or Audio2Face, its take folder, JSON, iFacialMocap's text)"
@@ -25,6 +25,13 @@ def add_motion_options(parser: ArgumentParser) -> None:
     )
     group.add_argument("--smooth", type=smoothing, metavar="SECONDS", help="smooth a performance in time")
     group.add_argument("--mirror", action="store_true", help="exchange left and right of a performance")
+    group.add_argument(
+        "--exchange",
+        choices=EXCHANGEABLE,
+        action="append",
+        default=[],
+        help="exchange left and right of one pair alone, which some senders exchange; may be repeated",
+    )
     group.add_argument(
         "--gain",
         type=gain,
@@ -46,10 +53,10 @@ def add_motion_options(parser: ArgumentParser) -> None:
 
 def gain(text: str) -> tuple[str, float]:
     """Raises argparse.ArgumentTypeError for what is no NAME=FACTOR."""
-    name, _, value = text.partition("=")
-    if name not in (*PARTS, "head", *ARKIT_SHAPES):
-        raise argparse.ArgumentTypeError(f"'{text}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
-    return name, factor(value)
+    try:
+        return parsed_gain(text)
+    except StgaError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def factor(text: str) -> float:
@@ -81,6 +88,7 @@ def motion_options(options: Namespace) -> MotionOptions:
         neutral=options.neutral or "none",
         smoothing=options.smooth or 0.0,
         mirror=options.mirror,
+        exchange=tuple(options.exchange),
         gains=dict(options.gain),
         stay_trained=options.stay_trained,
     )

@@ -5,11 +5,11 @@ import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 
-from ..errors import StgaError
 from ..requests.open_head import OpenHead
 from ..requests.values import MATTES, SYNC, WORLDS, Track
 from .arguments import real_number, usable_path, whole_number
 from .carry_out import carry_out
+from .inputs import add_detector, provide_detector
 
 NAME, HELP = "track", "track a head through footage, and write a capture"
 
@@ -32,12 +32,7 @@ def add_footage(parser: ArgumentParser) -> None:
     parser.add_argument("--cameras", type=usable_path, metavar="FILE", help="calibration that is not in FOOTAGE")
     points = parser.add_mutually_exclusive_group()
     points.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")
-    points.add_argument("--detector", type=usable_path, metavar="TASK", help="MediaPipe's face_landmarker.task")
-    parser.add_argument(
-        "--download-detector",
-        action="store_true",
-        help="download Google's face_landmarker.task (4 MB) to the file of --detector, where there is none",
-    )
+    add_detector(parser, points)
     parser.add_argument("--focal", type=real_number, metavar="PIXELS", help="focal length of a single camera")
     parser.add_argument("--start", type=whole_number(0), default=0, help="first timestep")
     parser.add_argument("--stop", type=whole_number(1), help="timestep to stop before")
@@ -80,12 +75,7 @@ def run(options: Namespace) -> None:
 def tracking_request(options: Namespace, out: Path) -> Track:
     """What `add_footage`'s options ask for, into the folder `out`. Raises StgaError where the detector that is to be
     downloaded has no file."""
-    if options.download_detector:
-        from ..tracking.detector_file import download_task
-
-        if options.detector is None:
-            raise StgaError("--download-detector: give the file to write with --detector")
-        download_task(options.detector)
+    provide_detector(options)
     return Track(
         options.footage, options.model, out, options.cameras, options.landmarks, options.detector, options.focal,
         options.start, options.stop, options.step, dict(options.offset), options.meshes,

@@ -15,8 +15,18 @@ from ..flame.model import FlameModel
 from ..flame.motion import strengthened, transferred_motion
 from ..flame.sequence import FlameSequence
 from ..schema import setting
-from .head_map import head_map, person_of
-from .performance import Performance, amplified, mirrored, relative_to, resampled, smoothed
+from .head_map import HeadMap, head_map, person_of
+from .names import ARKIT_SHAPES, PARTS
+from .performance import (
+    EXCHANGEABLE,
+    Performance,
+    amplified,
+    exchanged_sides,
+    mirrored,
+    relative_to,
+    resampled,
+    smoothed,
+)
 from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_performance
 from .transfer import (
     NEUTRALS,
@@ -42,6 +52,7 @@ class MotionOptions:
     smoothing  seconds, standard deviation; of performances alone, like the next two
     mirror     exchange left and right
     gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
+    exchange   pairs of shapes of a performance whose left and right were exchanged by the sender (`EXCHANGEABLE`)
     stay_trained  0 to 1: how far parameters are led back to the range that the avatar was trained on; None: that range
                   is not asked for
     """
@@ -52,6 +63,21 @@ class MotionOptions:
     mirror: bool = False
     gains: Mapping[str, float] = field(default_factory=dict)
     stay_trained: float | None = setting(None, 0, 1)
+    exchange: tuple[str, ...] = setting((), choices=EXCHANGEABLE)
+
+
+def parsed_gain(text: str) -> tuple[str, float]:
+    """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError for other text."""
+    name, _, number = text.partition("=")
+    if name not in (*PARTS, "head", *ARKIT_SHAPES):
+        raise StgaError(f"'{text}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= MAX_FACTOR:
+        raise StgaError(f"'{number}' is not a number from 0 to {MAX_FACTOR:g}")
+    return name, value
 
 
 @dataclass(frozen=True)
@@ -112,7 +138,7 @@ def performed(
 ) -> Motion:
     """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what errors call it."""
     prepared = prepared_performance(performance, options, fps)
-    frames, beyond = _finished(head_map(person, name).frames(prepared), options, trained)
+    frames, beyond = frames_of(head_map(person, name), prepared, options, trained)
     timesteps = tuple(range(len(frames)))
     return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
 
@@ -137,12 +163,29 @@ def prepared_performance(performance: Performance, options: MotionOptions, fps: 
     rate = fps or performance.fps
     if performance.times[-1] * rate > MAX_ROWS:
         raise StgaError(f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long")
-    changed = resampled(performance, fps)
+    rest = None
     if options.neutral != "none":
-        first = performance.weights[0]
-        changed = relative_to(changed, quiet_weights(performance) if options.neutral == "quiet" else first)
-    changed = amplified(smoothed(changed, options.smoothing), options.gains)
+        weights = quiet_weights(performance) if options.neutral == "quiet" else performance.weights[0]
+        rest = replace(performance, weights=weights[None], head=None)
+    return smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing)
+
+
+def corrected(performance: Performance, options: MotionOptions, rest: Performance | None = None) -> Performance:
+    """The performance row by row: with the sender's exchanged pairs put right, relative to the face of `rest` (None: as
+    it is), amplified and mirrored."""
+    changed = exchanged_sides(performance, options.exchange)
+    if rest is not None:
+        changed = relative_to(changed, exchanged_sides(rest, options.exchange))
+    changed = amplified(changed, options.gains)
     return mirrored(changed) if options.mirror else changed
+
+
+def frames_of(
+    found: HeadMap, performance: Performance, options: MotionOptions, trained: TrainedRange | None = None
+) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
+    """Frames of a performance, as `corrected`, on the head of a map; and part -> (T,) how far they were outside the
+    trained range before they were led back (`transfer.outside`)."""
+    return _finished(found.frames(performance), options, trained)
 
 
 def _finished(

@@ -8,6 +8,8 @@ import numpy as np
 from .names import ARKIT_SHAPES, COLUMN, PARTS, mirrored_name, part_of
 
 MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])
+EXCHANGEABLE = ("jaw", "mouth")
+"""Pairs of shapes, such as mouthLeft and mouthRight, which receivers report as exchanged by some senders."""
 GAP = 1.5
 """Rows farther apart than this many frames have lost some between them."""
 SMOOTHING_REACH = 3.0
@@ -56,6 +58,15 @@ def mirrored(performance: Performance) -> Performance:
     return replace(performance, weights=performance.weights[:, MIRROR], head=head)
 
 
+def exchanged_sides(performance: Performance, pairs: tuple[str, ...]) -> Performance:
+    """jawLeft and jawRight exchanged, mouthLeft and mouthRight, or both (`EXCHANGEABLE`)."""
+    weights = performance.weights.copy()
+    for pair in pairs:
+        left, right = COLUMN[f"{pair}Left"], COLUMN[f"{pair}Right"]
+        weights[:, [left, right]] = weights[:, [right, left]]
+    return replace(performance, weights=weights)
+
+
 def smoothed(performance: Performance, seconds: float) -> Performance:
     """Convolved in time by a Gaussian of standard deviation `seconds`; rows must be evenly spaced (`resampled`)."""
     deviation = seconds * performance.fps
@@ -80,10 +91,15 @@ def amplified(performance: Performance, gains: Mapping[str, float]) -> Performan
     return replace(performance, weights=performance.weights * factors, head=head)
 
 
-def relative_to(performance: Performance, neutral: np.ndarray) -> Performance:
-    """Weights without those of the performer's neutral face (52,), so that this face is 0 and 1 stays 1."""
+def relative_to(performance: Performance, rest: Performance) -> Performance:
+    """The performance without the face and head rotation of `rest` (its first row), so that these are 0 and a weight of
+    1 stays 1."""
+    neutral = rest.weights[0]
+    head = performance.head
+    if head is not None and rest.head is not None:
+        head = head - rest.head[0]
     room = np.maximum(1.0 - neutral, 0.1)
-    return replace(performance, weights=(performance.weights - neutral) / room)
+    return replace(performance, weights=(performance.weights - neutral) / room, head=head)
 
 
 def parts_kept(performance: Performance, parts: tuple[str, ...]) -> Performance:

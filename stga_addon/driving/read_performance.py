@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import file_size, read_json
-from .facial_mocap import parse_packet
+from .live.facial_mocap import parse_packet
 from .names import COUNT, arkit_name, columns_of
 from .performance import Performance
 from .timecode import seconds_of
@@ -138,7 +138,7 @@ def _read_packets(path: Path) -> Performance:
     if not known:
         raise StgaError(f"{path}: has no line of iFacialMocap, such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|")
     columns_of(str(path), known[0].names)
-    weights = np.stack([packet.weights for packet in known])
+    weights = np.stack([packet.weights for packet in known if packet.weights is not None])
     heads = [packet.head for packet in known]
     head = None if any(turn is None for turn in heads) else np.array(heads)
     return _performance(path, None, weights, head)

@@ -19,6 +19,22 @@ MAX_VIEWS = 32
 
 
 @dataclass(frozen=True)
+class ShapeControls:
+    """Sliders of a page that move expressions, jaw and eyes of its FLAME rig together, such as ARKit's shapes.
+
+    linear    (C, E + 9): expression coefficients, then axis-angles of jaw, left and right eye, per weight of control
+    products  (C, E): expression coefficients per product of a weight and that of the control `opens`
+    limited   the control whose weight counts up to that of `opens` only
+    """
+
+    names: tuple[str, ...]
+    linear: np.ndarray
+    products: np.ndarray
+    opens: str
+    limited: str
+
+
+@dataclass(frozen=True)
 class Playback:
     """What plays besides the poses.
 
@@ -28,6 +44,7 @@ class Playback:
     up         (3,) direction that points up in the avatar's space
     selection  (F,) bool per pose: the triangles that it trained; None where that is not known
     motion_only  leave out blend shapes, skeleton and sliders of the FLAME file; the posed meshes stay
+    controls   sliders beside those of the rig; only of FLAME heads, and not with `motion_only`
     """
 
     title: str = "Avatar"
@@ -36,6 +53,7 @@ class Playback:
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     selection: Sequence[np.ndarray] | None = None
     motion_only: bool = False
+    controls: ShapeControls | None = None
 
 
 def playback_fps(capture: Capture | None, given: float | None = None, numbered: bool = False) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from ..avatar.file import Avatar
 from ..capture.camera import Camera
 from ..capture.model import Capture
+from ..driving.page_controls import page_controls
 from ..export.playback import MAX_VIEWS, Playback
 from ..export.web.write import flame_notice
 from ..flame.sequence import FlameSequence
@@ -36,6 +37,7 @@ def capture_playback(
         up=_up(capture),
         selection=_selection(request, capture, timesteps),
         motion_only=request.motion_only,
+        controls=None if request.motion_only else page_controls(capture.flame),
     )
     sequence = None if capture.flame is None else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
     notice = flame_notice(avatar, sequence, request.motion_only)

@@ -341,11 +341,12 @@ class Export:
 class ConvertMotion:
     """Convert a performance in ARKit's shapes to a FLAME motion, or a motion to a performance.
 
-    source   a performance, FLAME parameters (.npz), or the folder of a capture tracked with FLAME
+    source   a performance, a video of a face, FLAME parameters (.npz), or the folder of a capture tracked with FLAME
     output   ARKit's shapes (.csv) or FLAME parameters (.npz)
     flame    FLAME model file of the head
     head     folder of the capture whose identity a performance moves; None: the model's average head
     fps      frames per second of the result; None: as recorded
+    detector MediaPipe's face_landmarker.task, for videos
     """
 
     source: Path
@@ -354,6 +355,7 @@ class ConvertMotion:
     head: Path | None = None
     fps: float | None = setting(None, above=0)
     options: MotionOptions = field(default_factory=MotionOptions)
+    detector: Path | None = None
 
     @property
     def writes_shapes(self) -> bool:

@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -41,26 +43,77 @@ class FaceMesh:
         return [_pixels(face.landmark, image) for face in found]
 
 
-class FaceLandmarker:
-    """MediaPipe's Tasks API with the user's `face_landmarker.task`: the same 478 landmarks."""
+@dataclass(frozen=True)
+class FaceScores:
+    """What the network says of a face: its blend shapes by name, 0 to 1, and its rotation (3, 3).
 
-    def __init__(self, mediapipe: Any, task: Path) -> None:
+    The rotation takes a face that looks along +z, with y up and its own left at +x, to the camera's x right, y up and z
+    towards the face.
+    """
+
+    weights: Mapping[str, float]
+    rotation: np.ndarray
+
+
+class FaceLandmarker:
+    """MediaPipe's Tasks API with the user's `face_landmarker.task`: the same 478 landmarks, and with `scores` the 52
+    blend shapes."""
+
+    def __init__(self, mediapipe: Any, task: Path, scores: bool = False) -> None:
         vision = mediapipe.tasks.vision
         options = vision.FaceLandmarkerOptions(
             base_options=mediapipe.tasks.BaseOptions(model_asset_buffer=task.read_bytes()),
-            num_faces=MAX_FACES,
+            num_faces=1 if scores else MAX_FACES,
             min_face_detection_confidence=MIN_DETECTION_CONFIDENCE,
+            output_face_blendshapes=scores,
+            output_facial_transformation_matrixes=scores,
         )
         self._image, self._format = mediapipe.Image, mediapipe.ImageFormat.SRGB
         self._landmarker = vision.FaceLandmarker.create_from_options(options)
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
-        found = self._landmarker.detect(self._image(image_format=self._format, data=np.ascontiguousarray(image)))
-        return [_pixels(face, image) for face in found.face_landmarks]
+        return [_pixels(face, image) for face in self._found(image).face_landmarks]
+
+    def score(self, image: np.ndarray) -> FaceScores | None:
+        """The scores of the face in an image (H, W, 3) uint8; None where none is found. Only with `scores`."""
+        found = self._found(image)
+        if not found.face_blendshapes or not found.facial_transformation_matrixes:
+            return None
+        weights = {category.category_name: float(category.score) for category in found.face_blendshapes[0]}
+        left, _, right = np.linalg.svd(np.asarray(found.facial_transformation_matrixes[0], np.float64)[:3, :3])
+        return FaceScores(weights, left @ right)
+
+    def _found(self, image: np.ndarray) -> Any:
+        return self._landmarker.detect(self._image(image_format=self._format, data=np.ascontiguousarray(image)))
 
 
 def make_detector(task: Path | None = None) -> Detector:
     """MediaPipe's detector; with `task`, the Tasks API with that file. Raises StgaError where it is not available."""
+    mediapipe = _mediapipe()
+    if task is not None:
+        return _landmarker(mediapipe, task)
+    if not hasattr(mediapipe, "solutions"):
+        raise StgaError(
+            f"mediapipe {mediapipe.__version__} has no network in its wheel; "
+            "give Google's face_landmarker.task with --detector, which --download-detector downloads, or install "
+            "mediapipe==0.10.21 (Python 3.11 or 3.12)"
+        )
+    return FaceMesh(mediapipe.solutions)
+
+
+def make_face_scorer(task: Path) -> FaceLandmarker:
+    """The detector with blend shapes. Raises StgaError where it is not available."""
+    return _landmarker(_mediapipe(), task, scores=True)
+
+
+def _landmarker(mediapipe: Any, task: Path, scores: bool = False) -> FaceLandmarker:
+    try:
+        return FaceLandmarker(mediapipe, task, scores)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise StgaError(f"{task}: is not a face landmarker of MediaPipe ({error})") from error
+
+
+def _mediapipe() -> Any:
     os.environ.setdefault("GLOG_minloglevel", "2")  # its C++ part reports its own progress on stderr
     try:
         import mediapipe
@@ -70,18 +123,7 @@ def make_detector(task: Path | None = None) -> Detector:
             f"{sys.version_info[0]}.{sys.version_info[1]}) lacks: make an environment with `stga environment make "
             "--tracking`, run `pip install mediapipe==0.10.21` (Python 3.11 or 3.12), or give files with --landmarks"
         ) from error
-    if task is not None:
-        try:
-            return FaceLandmarker(mediapipe, task)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise StgaError(f"{task}: is not a face landmarker of MediaPipe ({error})") from error
-    if not hasattr(mediapipe, "solutions"):
-        raise StgaError(
-            f"mediapipe {mediapipe.__version__} has no network in its wheel; "
-            "give Google's face_landmarker.task with --detector, which --download-detector downloads, or install "
-            "mediapipe==0.10.21 (Python 3.11 or 3.12)"
-        )
-    return FaceMesh(mediapipe.solutions)
+    return mediapipe
 
 
 def _pixels(landmarks: Any, image: np.ndarray) -> np.ndarray:

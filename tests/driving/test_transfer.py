@@ -47,7 +47,7 @@ def test_a_resting_face_that_is_not_zero():
     take = Performance(np.arange(50) / 30, weights, None, 30.0)
     rest = quiet_weights(take)
     assert rest[3] == 0.2
-    changed = relative_to(take, rest).weights[:, 3]
+    changed = relative_to(take, Performance(np.zeros(1), rest[None], None, 30.0)).weights[:, 3]
     np.testing.assert_allclose(changed[:10], 0)
     np.testing.assert_allclose(changed[10:15], 1)
 

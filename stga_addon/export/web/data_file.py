@@ -10,7 +10,7 @@ from ...avatar.file import Avatar
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...flame.quaternions import normalized
-from ..playback import Playback
+from ..playback import Playback, ShapeControls
 from .container import FixedPoint, pack
 from .rig import WebRig
 
@@ -53,6 +53,10 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     unit = _local_unit(avatar)
     arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
     arrays |= _rig_arrays(rig)
+    controls = playback.controls if rig.expressions else None
+    if controls is not None:
+        arrays["shape_linear"] = controls.linear.astype(np.float32)
+        arrays["shape_products"] = controls.products.astype(np.float32)
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     if exact:
@@ -71,6 +75,7 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
         "joints": list(rig.joint_names),
         "parents": list(rig.parents),
         "sliders": _sliders(rig),
+        **_shapes(playback.controls if rig.expressions else None),
         "views": [_view(name, camera) for name, camera in playback.views.items()],
     }
 
@@ -81,6 +86,12 @@ def _sliders(rig: WebRig) -> list[dict[str, Any]]:
     reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
     order = np.argsort(-used.std(0), kind="stable") if len(used) else np.arange(rig.expressions)
     return [{"name": f"expr_{k:03d}", "component": k, "reach": round(float(reach[k]), 2)} for k in order.tolist()]
+
+
+def _shapes(controls: ShapeControls | None) -> dict[str, Any]:
+    if controls is None:
+        return {}
+    return {"shapes": {"names": list(controls.names), "opens": controls.opens, "limited": controls.limited}}
 
 
 def _view(name: str, camera: Camera) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.development.browser import Browser, find_browser
 from stga_addon.development.demo.head import synthetic_flame
-from stga_addon.export.playback import Playback
+from stga_addon.export.playback import Playback, ShapeControls
 from stga_addon.export.web.data_file import data_file
 from stga_addon.export.web.page import page
 from stga_addon.export.web.rig import WebRig, flame_rig
@@ -59,8 +59,9 @@ class Head:
     def rig(self) -> WebRig:
         return flame_rig(self.sequence)
 
-    def data(self, rig: WebRig | None = None, exact: bool = False) -> bytes:
-        playback = Playback(title="Zoë", fps=2.0, views={"front": self.camera}, selection=self.selection)
+    def data(self, rig: WebRig | None = None, exact: bool = False, controls: ShapeControls | None = None) -> bytes:
+        views = {"front": self.camera}
+        playback = Playback(title="Zoë", fps=2.0, views=views, selection=self.selection, controls=controls)
         return data_file(self.avatar, rig or self.rig, playback, exact)
 
     @property

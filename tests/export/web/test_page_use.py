@@ -1,9 +1,11 @@
 """The page in use in a real browser: touch, keys, sliders, a lost graphics context, long play, embedding."""
 
 import functools
+import json
 import re
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,11 @@ import numpy as np
 import pytest
 
 from stga_addon.development.browser import Browser
+from stga_addon.driving.head_map import head_map
+from stga_addon.driving.inverse import write_performance
+from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
+from stga_addon.driving.page_controls import page_controls
+from stga_addon.driving.performance import Performance
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.write import SCRIPT_NAME, write_web
 from stga_addon.flame.forward import FlameFrame, flame_forward
@@ -268,3 +275,67 @@ def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
     assert found["jaw"] == pytest.approx(0.2)
     assert browser.requests == [f"{server}/{name}" for name in ("index.html", SCRIPT_NAME, "anna.stga")]
     assert browser.errors == []
+
+
+def driven_mesh(head: Head, weights: np.ndarray, angles: np.ndarray | None = None) -> np.ndarray:
+    """Where ARKit weights (52,) put the head in its first recorded place; angles: yaw, pitch, roll of the neck."""
+    turned = None if angles is None else angles[None]
+    (found,) = head_map(head.sequence, "head").frames(Performance(np.zeros(1), weights[None], turned, 60.0))
+    first = head.sequence.frame(0)
+    neck = first.neck_pose if angles is None else found.neck_pose
+    frame = replace(first, expr=found.expr, jaw_pose=found.jaw_pose, eyes_pose=found.eyes_pose, neck_pose=neck)
+    return flame_forward(head.sequence.model, head.sequence.shape, frame, head.sequence.static_offset)
+
+
+def vertices(browser: Browser, script: str) -> np.ndarray:
+    """The mesh after a script about `avatar`."""
+    found = browser.evaluate(f"""(() => {{
+      const avatar = document.querySelector('stga-avatar');
+      avatar.pause();
+      {script}
+      avatar.player.frame = avatar.frame;
+      avatar.player.draw();
+      return Array.from(avatar.player.rig.vertices);
+    }})()""")
+    return np.reshape(found, (-1, 3))
+
+
+def test_face_shapes_and_a_performance(browser, head, tmp_path):
+    """Catches ARKit's sliders that move a head otherwise than Blender does, closed lips without an open jaw, rows of a
+    CSV that come at the wrong time, and a recording that does not come back."""
+    show(browser, tmp_path, head.data(exact=True, controls=page_controls(head.sequence)))
+    before = vertices(browser, "avatar.frame = 0;")
+    weights = np.random.default_rng(2).random(COUNT) * (np.random.default_rng(3).random(COUNT) < 0.5)
+    weights[[COLUMN["jawOpen"], COLUMN["mouthClose"]]] = 0.4, 0.9
+    chosen = dict(zip(ARKIT_SHAPES, weights.tolist(), strict=True))
+    found = vertices(
+        browser,
+        f"""for (const [name, value] of Object.entries({chosen})) {{
+          const input = document.querySelector(`.slider[data-name="${{name}}"] input`);
+          input.value = value;
+          input.dispatchEvent(new Event('input'));
+        }}""",
+    )
+    np.testing.assert_allclose(found, driven_mesh(head, weights), atol=1e-5)
+    np.testing.assert_allclose(vertices(browser, "avatar.release();"), before, atol=1e-12)
+
+    rows = np.random.default_rng(4).random((4, COUNT)) * 0.5
+    turns = np.random.default_rng(5).normal(0, 0.2, (4, 3))
+    write_performance(tmp_path / "take.csv", Performance(np.array([0, 1, 2, 4]) / 30, rows, turns, 30.0))
+    text = json.dumps((tmp_path / "take.csv").read_text())
+    for frame, row, turn in (
+        (0, rows[0], turns[0]),
+        (1.5, (rows[1] + rows[2]) / 2, (turns[1] + turns[2]) / 2),
+        (3, (rows[2] + rows[3]) / 2, (turns[2] + turns[3]) / 2),  # was lost
+        (4, rows[3], turns[3]),
+    ):
+        found = vertices(browser, f"avatar.setPerformance({text}); avatar.frame = {frame};")
+        np.testing.assert_allclose(found, driven_mesh(head, row, turn), atol=1e-5)
+    assert browser.evaluate("document.querySelector('stga-avatar').fps") == pytest.approx(30, rel=1e-3)
+    assert browser.evaluate("document.querySelector('#scrub').max") == "4"
+    refused = browser.evaluate(
+        "(() => { try { document.querySelector('stga-avatar').setPerformance('a,b'); }"
+        " catch (error) { return error.message; } })()"
+    )
+    assert refused.startswith("This file is no table of face shapes")
+    np.testing.assert_allclose(vertices(browser, "avatar.setPerformance(null);"), before, atol=1e-12)

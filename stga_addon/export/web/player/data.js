@@ -162,6 +162,12 @@ function checkData(header, arrays) {
     if (arrays[name]) shapesOf[name] = [faces, 3 * components];
   }
   if (arrays.strain_range) shapesOf.strain_range = [faces, 6];
+  if (header.shapes) {
+    const controls = list(header.shapes.names, 'shapes').length;
+    const moved = size(arrays, 'shape_products', 1);
+    require(moved <= shapes, 'shape_products');
+    Object.assign(shapesOf, { shape_linear: [controls, moved + 9], shape_products: [controls, moved] });
+  }
   if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
   for (const [name, shape] of Object.entries(shapesOf)) checkArray(arrays, name, shape);
   require(!arrays.sh || [9, 24, 45].includes(arrays.sh.shape[1]), 'sh');
@@ -193,6 +199,11 @@ function checkHeader(header, joints, shapes) {
       Number.isFinite(slider.reach) &&
       slider.reach > 0 &&
       isIndex(slider.component, shapes), 'sliders');
+  }
+  if (header.shapes) {
+    const { names: controls, opens, limited } = header.shapes;
+    require(controls.every((/** @type {unknown} */ name) => typeof name === 'string'), 'shapes');
+    require(controls.includes(opens) && controls.includes(limited), 'shapes');
   }
   for (const view of list(header.views, 'views')) {
     require(typeof view?.name === 'string' && list(view.size, 'views').length === 2, 'views');

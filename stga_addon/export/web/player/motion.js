@@ -4,12 +4,16 @@
 /** @import { Data } from './types.js' */
 
 import { slerpAxisAngle } from './rotation.js';
+import { Shapes } from './shapes.js';
 
 /** Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded one. */
 export class Motion {
   /** @param {Data} data */
-  constructor({ arrays }) {
-    this.frames = arrays.coefficients.shape[0];
+  constructor(data) {
+    const { arrays } = data;
+    this.recordedFrames = arrays.coefficients.shape[0];
+    this.recordedFps = data.header.fps;
+    this.shapes = new Shapes(data);
     this.recorded = arrays;
     const [shapes, joints] = [arrays.coefficients.shape[1], arrays.pose.shape[1]];
     this.coefficients = new Float64Array(shapes);
@@ -19,17 +23,29 @@ export class Motion {
     this.pinnedPose = new Float64Array(3 * joints).fill(NaN);
   }
 
+  /** Of the performance, where one plays instead of the recording. */
+  get frames() {
+    return this.shapes.performance?.rows.length ?? this.recordedFrames;
+  }
+
+  get fps() {
+    return this.shapes.performance?.fps ?? this.recordedFps;
+  }
+
   /**
-   * Fill coefficients, pose and translation with those of `frame`, between frames on the shortest way.
+   * Fill coefficients, pose and translation with those of `frame`, between frames on the shortest way. Of a performance,
+   * the head as a whole stays where it is in the first recorded frame.
    * @param {number} frame
    */
   sample(frame) {
-    const first = Math.min(Math.max(Math.floor(frame), 0), this.frames - 1);
-    const second = Math.min(first + 1, this.frames - 1);
-    const share = Math.min(Math.max(frame - first, 0), 1);
+    const recorded = this.shapes.performance ? 0 : frame;
+    const first = Math.min(Math.max(Math.floor(recorded), 0), this.recordedFrames - 1);
+    const second = Math.min(first + 1, this.recordedFrames - 1);
+    const share = Math.min(Math.max(recorded - first, 0), 1);
     blend(this.recorded.coefficients.values, first, second, share, this.coefficients);
     blend(this.recorded.translation.values, first, second, share, this.translation);
     this.turn(first, second, share);
+    if (this.shapes.active) this.shapes.apply(frame, this.coefficients, this.pose);
     replacePinned(this.coefficients, this.pinnedCoefficients);
     replacePinned(this.pose, this.pinnedPose);
   }
@@ -51,6 +67,7 @@ export class Motion {
   release() {
     this.pinnedCoefficients.fill(NaN);
     this.pinnedPose.fill(NaN);
+    this.shapes.release();
   }
 }
 

@@ -16,6 +16,16 @@ import { DataError } from './data.js';
 import { StgaAvatar } from './stga-avatar.js';
 
 const SLIDERS_SHOWN = 8;
+const SHAPES_FIRST = [
+  'browInnerUp',
+  'mouthPucker',
+  'mouthSmileRight',
+  'mouthSmileLeft',
+  'eyeBlinkRight',
+  'eyeBlinkLeft',
+  'mouthClose',
+  'jawOpen',
+]; // the last comes first
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
@@ -107,9 +117,13 @@ function step(by) {
   avatar.frame = Math.round(avatar.frame) + by;
 }
 
-function addTransport() {
+function showLength() {
   byId('transport').hidden = avatar.frameCount < 2;
   inputOf('scrub').max = String(avatar.frameCount - 1);
+}
+
+function addTransport() {
+  showLength();
   byId('play').addEventListener('click', toggle);
   byId('loop').addEventListener('click', toggleLoop);
   const speed = element('#speed', HTMLSelectElement);
@@ -270,7 +284,15 @@ function addExpressions() {
     }),
   );
   section.hidden = !rows.length;
-  const more = byId('more');
+  showFirst(rows, byId('more'));
+}
+
+/**
+ * Hide all but the first rows until the button is clicked.
+ * @param {HTMLElement[]} rows
+ * @param {HTMLElement} more
+ */
+function showFirst(rows, more) {
   more.hidden = rows.length <= SLIDERS_SHOWN;
   more.textContent = `Show all ${rows.length}`;
   for (const row of rows.slice(SLIDERS_SHOWN)) row.hidden = true;
@@ -278,6 +300,54 @@ function addExpressions() {
     for (const row of rows) row.hidden = false;
     more.hidden = true;
   });
+}
+
+// Face shapes (ARKit's), and a performance of them from a file
+
+function addFaceShapes() {
+  const names = [...(info().shapes?.names ?? [])];
+  byId('shapes').hidden = !names.length;
+  names.sort((one, other) => SHAPES_FIRST.indexOf(other) - SHAPES_FIRST.indexOf(one));
+  const list = element('.sliders', HTMLElement, byId('shapes'));
+  const rows = names.map((name) =>
+    addSlider(list, {
+      id: name,
+      label: name,
+      low: 0,
+      high: 1,
+      read: () => avatar.getShape(name),
+      write: (value) => avatar.setShape(name, value),
+      format: (value) => value.toFixed(2),
+    }),
+  );
+  showFirst(rows, byId('more-shapes'));
+  const file = inputOf('performance');
+  byId('open-performance').addEventListener('click', () => file.click());
+  file.addEventListener('change', () => playFile(file.files?.[0]).then(() => (file.value = '')));
+  byId('close-performance').addEventListener('click', () => avatar.setPerformance(null));
+  avatar.addEventListener('motionchange', () => {
+    byId('close-performance').hidden = !avatar.player?.motion.shapes.performance;
+    showLength();
+  });
+  document.addEventListener('dragover', (event) => event.preventDefault());
+  document.addEventListener('drop', (event) => {
+    event.preventDefault();
+    playFile(event.dataTransfer?.files[0]);
+  });
+}
+
+/** @param {File | undefined} file */
+async function playFile(file) {
+  if (!file || !avatar.info) return;
+  const problem = byId('performance-problem');
+  problem.hidden = true;
+  try {
+    avatar.setPerformance(await file.text());
+    avatar.play();
+  } catch (error) {
+    problem.textContent = error instanceof DataError ? error.message : `The file cannot be read: ${error}`;
+    problem.hidden = false;
+  }
 }
 
 function addPose() {
@@ -362,7 +432,7 @@ function toggleFullscreen() {
 
 function showFacts() {
   const splats = avatar.splatCount.toLocaleString('en');
-  const rate = avatar.frameCount > 1 ? ` · ${Number(info().fps.toFixed(2))} fps` : '';
+  const rate = avatar.frameCount > 1 ? ` · ${Number(avatar.fps.toFixed(2))} fps` : '';
   byId('facts').innerHTML =
     `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms of JavaScript a frame</span>`;
 }
@@ -371,6 +441,7 @@ function start() {
   addTransport();
   addViews();
   addBackgrounds();
+  addFaceShapes();
   addExpressions();
   addPose();
   avatar.addEventListener('frame', () => {

@@ -98,7 +98,7 @@ export class Player {
 
   selectionBits() {
     const { selection } = this.data.arrays;
-    if (!selection) return null;
+    if (!selection || this.motion.shapes.performance) return null;
     const [, bytes] = selection.shape;
     const first = bytes * Math.min(Math.round(this.frame), this.frameCount - 1);
     return selection.values.subarray(first, first + bytes);

@@ -37,8 +37,8 @@ export function matrixFromAxisAngle(vectors, from, out, to) {
  * @returns {Vector}
  */
 export function slerpAxisAngle(a, b, share) {
-  const p = quaternionFromAxisAngle(a);
-  let q = quaternionFromAxisAngle(b);
+  const p = quaternionOf(a);
+  let q = quaternionOf(b);
   let cosine = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
   if (cosine < 0) {
     q = q.map((part) => -part);
@@ -48,14 +48,14 @@ export function slerpAxisAngle(a, b, share) {
   const sine = Math.sin(angle);
   const before = sine < SMALL_ANGLE ? 1 - share : Math.sin((1 - share) * angle) / sine;
   const after = sine < SMALL_ANGLE ? share : Math.sin(share * angle) / sine;
-  return axisAngleFromQuaternion(p.map((part, k) => before * part + after * q[k]));
+  return axisAngleOf(p.map((part, k) => before * part + after * q[k]));
 }
 
 /**
  * @param {ArrayLike<number>} vector
  * @returns {number[]}
  */
-function quaternionFromAxisAngle(vector) {
+export function quaternionOf(vector) {
   const [x, y, z] = [vector[0], vector[1], vector[2]];
   const angle = Math.hypot(x, y, z);
   const factor = angle < SMALL_ANGLE ? 0.5 : Math.sin(angle / 2) / angle;
@@ -66,9 +66,24 @@ function quaternionFromAxisAngle(vector) {
  * @param {number[]} quaternion
  * @returns {Vector}
  */
-function axisAngleFromQuaternion([w, x, y, z]) {
+export function axisAngleOf([w, x, y, z]) {
   const length = Math.hypot(x, y, z);
   const angle = 2 * Math.atan2(length, w);
   const factor = length < SMALL_ANGLE ? 2 : angle / length;
   return [factor * x, factor * y, factor * z];
+}
+
+/**
+ * The quaternion that turns by `b`, then by `a`.
+ * @param {number[]} a
+ * @param {number[]} b
+ * @returns {number[]}
+ */
+export function multiplied([aw, ax, ay, az], [bw, bx, by, bz]) {
+  return [
+    aw * bw - ax * bx - ay * by - az * bz,
+    aw * bx + ax * bw + ay * bz - az * by,
+    aw * by - ax * bz + ay * bw + az * bx,
+    aw * bz + ax * by - ay * bx + az * bw,
+  ];
 }

@@ -6,6 +6,7 @@
 import { cameraOfView } from './camera.js';
 import { addControls } from './controls.js';
 import { DataError, readData } from './data.js';
+import { readPerformance } from './performance.js';
 import { Player } from './player.js';
 import { RendererError } from './renderer.js';
 
@@ -156,7 +157,45 @@ export class StgaAvatar extends HTMLElement {
     return Array.from(this.#loaded.motion.pose.subarray(at, at + 3));
   }
 
-  /** Give expressions and joints back to the recorded motion. */
+  /**
+   * Replace a shape (one of `info.shapes.names`) by a weight; null: as the performance has it, or 0. While one is
+   * replaced, the shapes move expressions, jaw and eyes instead of the recording.
+   * @param {string} name
+   * @param {number | null} weight
+   */
+  setShape(name, weight) {
+    const { shapes } = this.#loaded.motion;
+    shapes.pinned[this.#shape(name)] = weight ?? NaN;
+    this.#posed();
+  }
+
+  /** @param {string} name */
+  getShape(name) {
+    return this.#loaded.motion.shapes.weights[this.#shape(name)];
+  }
+
+  /**
+   * Play a performance (the text of a CSV file with a column per shape) instead of the recording; null: the recording.
+   * Throws DataError where it is none.
+   * @param {string | null} text
+   */
+  setPerformance(text) {
+    const { shapes } = this.#loaded.motion;
+    if (text !== null && !shapes.names.length) throw new DataError('This avatar has no shapes for a performance.');
+    shapes.performance = text === null ? null : readPerformance(text, shapes.names);
+    if (text === null) shapes.weights.fill(0);
+    this.#time = 0;
+    this.#last = 0;
+    this.dispatchEvent(new CustomEvent('motionchange'));
+    this.#posed();
+  }
+
+  /** Frames per second of what plays. */
+  get fps() {
+    return this.#player?.motion.fps ?? 0;
+  }
+
+  /** Give expressions, shapes and joints back to the recorded motion. */
   release() {
     this.#player?.motion.release();
     this.#posed();
@@ -266,6 +305,13 @@ export class StgaAvatar extends HTMLElement {
   }
 
   /** @param {string} name */
+  #shape(name) {
+    const index = this.#loaded.motion.shapes.names.indexOf(name);
+    if (index < 0) throw new RangeError(`There is no shape "${name}".`);
+    return index;
+  }
+
+  /** @param {string} name */
   #joint(name) {
     const index = this.#loaded.data.header.joints.indexOf(name);
     if (index < 0) throw new RangeError(`There is no joint "${name}".`);
@@ -347,7 +393,7 @@ export class StgaAvatar extends HTMLElement {
     this.#request = 0;
     const player = this.#player;
     if (!player || player.gl.isContextLost()) return;
-    if (this.#playing) this.#advance(now, player.data.header.fps);
+    if (this.#playing) this.#advance(now, player.motion.fps);
     player.frame = this.#time;
     player.draw();
     if (this.#playing) this.#changed('frame');

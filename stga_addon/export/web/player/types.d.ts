@@ -48,6 +48,8 @@ export interface Header {
   joints: string[];
   parents: number[];
   sliders: Slider[];
+  /** Controls that move expressions, jaw and eyes together: one counts up to the weight of another only. */
+  shapes?: { names: string[]; opens: string; limited: string };
   views: View[];
 }
 
@@ -75,6 +77,8 @@ export interface Arrays {
   sh?: DataArray;
   strain_color?: DataArray;
   strain_range?: DataArray;
+  shape_linear?: DataArray;
+  shape_products?: DataArray;
   /** Coefficients of signals (signals.js). */
   [offset: string]: DataArray | undefined;
 }
@@ -107,4 +111,12 @@ export interface Target {
   format: number;
   width: number;
   height: number;
+}
+
+/** Rows at even times; the column of each shape, and of yaw, pitch and roll of the head (radians); -1: none. */
+export interface Performance {
+  columns: number[];
+  head: number[];
+  rows: Float64Array[];
+  fps: number;
 }

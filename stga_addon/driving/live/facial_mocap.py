@@ -2,23 +2,17 @@
 
 import math
 import re
-from dataclasses import dataclass
 
 import numpy as np
 
-from .names import COLUMN, COUNT, arkit_name
+from ..names import COLUMN, COUNT, arkit_name
+from .packet import FacePacket
 
+REQUEST = b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"
+"""Makes the app send to the address that this comes from."""
 MAX_PACKET_BYTES = 1 << 16
+MAX_WEIGHT = 10.0
 _VALUE = re.compile(r"([A-Za-z_]+)[-&](-?\d+(?:\.\d+)?)", re.ASCII)
-
-
-@dataclass(frozen=True)
-class FacePacket:
-    """One frame of a live source: names it has, weights (52,), and head rotation (yaw, pitch, roll) in radians."""
-
-    names: tuple[str, ...]
-    weights: np.ndarray
-    head: tuple[float, float, float] | None
 
 
 def parse_packet(data: bytes) -> FacePacket | None:
@@ -42,7 +36,7 @@ def parse_packet(data: bytes) -> FacePacket | None:
                 names.append(name)
         elif field.lstrip("=").startswith("head#"):
             head = _head(field.partition("#")[2])
-    if not names or not np.isfinite(weights).all():
+    if not names or not (np.abs(weights) <= MAX_WEIGHT).all():
         return None
     return FacePacket(tuple(names), weights, head)
 

@@ -1,0 +1,285 @@
+"""Driving the head live: starting and stopping to listen, calibrating, recording, choosing among senders."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.driving.head_map import head_map
+from ..stga_addon.driving.live.receiver import LOOPBACK, Receiver, leaves_this_machine
+from ..stga_addon.driving.live.sources import SOURCES
+from ..stga_addon.driving.live.take import Recording
+from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S
+from ..stga_addon.driving.transfer import trained_range
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.rig.live_pose import LivePose
+from ..stga_addon.scene.rig.trained import store_range, stored_range
+from . import ids, live_session
+from .apply_motion import exchange_property
+from .common import (
+    capture_of,
+    file_path,
+    flame_of,
+    head_of,
+    needs_rig,
+    needs_rig_or_shapes,
+    reporting,
+    rig_or_none,
+    scene_settings,
+)
+from .live_session import Target, live_options
+
+MAX_PORT = 65535
+
+
+class DriveOptions:
+    """What the panel stores about driving live; annotations of `ui.properties.DriveSettings`."""
+
+    source: bpy.props.EnumProperty(
+        name="Source",
+        description="What sends the face",
+        items=[(name, source.label, source.hint) for name, source in SOURCES.items()],
+    )
+    address: bpy.props.StringProperty(
+        name="Listen On",
+        description="Address of this computer on which packets are received. "
+        f"{LOOPBACK}: from this computer alone; 0.0.0.0: from every computer and phone of the network",
+        default=LOOPBACK,
+    )
+    port: bpy.props.IntProperty(
+        name="Port", description="UDP port; 0: the source's usual one", min=0, max=MAX_PORT, default=0
+    )
+    phone: bpy.props.StringProperty(
+        name="Phone", description="IP address that the app on the phone shows", default=LOOPBACK
+    )
+    strength: bpy.props.FloatProperty(
+        name="Strength",
+        description="1: as received; above 1: exaggerated",
+        default=1.0,
+        min=0.0,
+        soft_max=2.0,
+        max=10.0,
+    )
+    smoothing: bpy.props.FloatProperty(
+        name="Smoothing",
+        description="Time constant in seconds; the head follows later by as much",
+        min=0.0,
+        soft_max=0.2,
+        max=MAX_SMOOTHING_S,
+    )
+    stay_trained: bpy.props.FloatProperty(
+        name="Stay Trained",
+        description="Lead expression, jaw and eyes softly back to the range of the head's own recording; 1: fully. On "
+        "heads without ARKit controls",
+        min=0.0,
+        max=1.0,
+    )
+    mirror: bpy.props.BoolProperty(name="Mirror", description="Exchange left and right, as a mirror does")
+    exchange_jaw: exchange_property("jaw")
+    exchange_mouth: exchange_property("mouth")
+    detector: bpy.props.StringProperty(
+        name="Detector",
+        description="Google's face_landmarker.task, which detects the shapes in a video",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS,
+    )
+    takes: bpy.props.StringProperty(
+        name="Takes",
+        description="Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
+        subtype="DIR_PATH",
+        options=PATH_OPTIONS,
+        default="//stga_takes",
+    )
+
+
+class MeasureRange(bpy.types.Operator):
+    """Measure the range of expression, jaw and eyes in the recording that the head was trained on"""
+
+    bl_idname = ids.MEASURE_RANGE
+    bl_label = "Measure Trained Range"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_rig(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head = head_of(context)
+        own = flame_of(capture_of(head), head.name)
+        store_range(head, trained_range([own.frame(timestep) for timestep in own.timesteps]))
+        return {"FINISHED"}
+
+
+class DriveLive(bpy.types.Operator):
+    """Let a phone or program move the head; Esc over the viewport stops it. Keyframes are only made by Record"""
+
+    bl_idname = ids.DRIVE_LIVE
+    bl_label = "Drive Live"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_rig_or_shapes(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head, settings = head_of(context), scene_settings(context).drive
+        source = SOURCES[settings.source]
+        if leaves_this_machine(source, settings.address, settings.phone) and not bpy.app.online_access:
+            raise StgaError(
+                f"{source.label}: receives from other devices, but online access is off in Blender's preferences "
+                f"(System > Network); allow it, or listen on {LOOPBACK}"
+            )
+        rig = rig_or_none(head)
+        pose = LivePose(head, rig)
+        found = trained = None
+        if pose.takes_frames:
+            own = flame_of(capture_of(head), head.name)
+            found = head_map(own, head.name)
+            trained = stored_range(head)
+            if trained is None and own.timesteps:
+                trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
+                store_range(head, trained)
+        receiver = Receiver(source, settings.address, settings.port, settings.phone)
+        live_session.start(Target(context.scene.name, pose, found, trained), receiver)
+        return {"FINISHED"}
+
+
+class _NeedsSession:
+    """Mixin: an operator on the session that is running."""
+
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        if live_session.session() is not None:
+            return True
+        cls.poll_message_set("No source is listened to; choose Drive Live first")  # type: ignore[attr-defined]
+        return False
+
+
+class StopLive(_NeedsSession, bpy.types.Operator):
+    """Stop listening; the head goes back to its own animation, and a recording is kept"""
+
+    bl_idname = ids.STOP_LIVE
+    bl_label = "Stop"
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        running = live_session.session()
+        assert running is not None
+        recording, running.recording = running.recording, None
+        running.stop()
+        if recording is not None and len(recording) > 1:
+            _apply(self, context, recording)
+        return {"FINISHED"}
+
+
+class CalibrateLive(_NeedsSession, bpy.types.Operator):
+    """Take the performer's face and head of this moment as the resting ones, which do not move the head"""
+
+    bl_idname = ids.CALIBRATE_LIVE
+    bl_label = "Set Neutral"
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        running = live_session.session()
+        assert running is not None
+        running.calibrate()
+        return {"FINISHED"}
+
+
+class RecordLive(_NeedsSession, bpy.types.Operator):
+    """Record what is received; again: write the take as CSV and apply it to the head as a new action"""
+
+    bl_idname = ids.RECORD_LIVE
+    bl_label = "Record"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        running = live_session.session()
+        assert running is not None
+        if running.recording is None:
+            running.start_recording(context.scene.frame_current)
+            return {"FINISHED"}
+        recording, running.recording = running.recording, None
+        _apply(self, context, recording)
+        running.show_again()
+        return {"FINISHED"}
+
+
+class FollowLive(_NeedsSession, bpy.types.Operator):
+    """Follow this sender instead of the other"""
+
+    bl_idname = ids.FOLLOW_LIVE
+    bl_label = "Follow"
+
+    address: bpy.props.StringProperty(name="Address", description="IP address of the sender")
+    subject: bpy.props.StringProperty(name="Subject", description="Its name for itself")
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        running = live_session.session()
+        assert running is not None
+        running.stream.follow((self.address, self.subject))
+        return {"FINISHED"}
+
+
+def takes_folder(context: Any) -> tuple[Path, str]:
+    """The folder of takes, which is made, and a warning where it does not last, or "". Raises StgaError."""
+    folder = scene_settings(context).drive.takes
+    warning = ""
+    if folder.startswith("//") and not bpy.data.filepath:
+        path = Path(bpy.app.tempdir)
+        warning = f"{path}: is emptied when Blender ends; save the .blend file to keep takes beside it"
+    else:
+        path = file_path(folder, "takes")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be made ({error.strerror or error})") from error
+    return path, warning
+
+
+def _apply(operator: Any, context: Any, recording: Recording) -> None:
+    """Write the take and apply it. Raises StgaError."""
+    folder, warning = takes_folder(context)
+    if warning:
+        operator.report({"WARNING"}, warning)
+    path = live_session.write_take(recording, folder)
+    options = live_options(scene_settings(context).drive)
+    try:
+        bpy.ops.stga.apply_motion(
+            filepath=str(path),
+            start=recording.start,
+            strength=options.strength,
+            smoothing=options.smoothing,
+            mirror=options.mirror,
+            stay_trained=options.stay_trained or 0.0,
+        )
+    except RuntimeError as error:
+        raise StgaError(str(error).strip().removeprefix("Error: ")) from error
+    operator.report({"INFO"}, f"Recorded {len(recording)} faces: {path}")
+
+
+_keymap_items: list[tuple[Any, Any]] = []
+
+
+def register() -> None:
+    """Let Esc over a 3D viewport stop the session; without a window, Blender has no keys."""
+    keys = bpy.context.window_manager.keyconfigs.addon
+    if keys is not None:
+        keymap = keys.keymaps.new(name="3D View", space_type="VIEW_3D")
+        _keymap_items.append((keymap, keymap.keymap_items.new(ids.STOP_LIVE, "ESC", "PRESS")))
+
+
+def unregister() -> None:
+    running = live_session.session()
+    if running is not None:
+        running.stop()
+    for keymap, item in _keymap_items:
+        keymap.keymap_items.remove(item)
+    _keymap_items.clear()

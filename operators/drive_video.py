@@ -1,0 +1,58 @@
+"""Drives the head by a video of a face: a worker detects the performance, which is then applied."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.driving.face_video import is_video
+from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.requests.values import ConvertMotion
+from ..stga_addon.tracking.footage.video import SUFFIXES
+from . import ids
+from .common import FileImport, file_path, needs_rig_or_shapes, reporting, scene_settings
+from .drive import takes_folder
+from .request import needs_idle, start
+from .training_python import training_python
+
+
+class DriveVideo(bpy.types.Operator, FileImport):
+    """Detect the 52 shapes in a video of a face, write them as a CSV file into the takes, and apply them to the head"""
+
+    bl_idname = ids.DRIVE_VIDEO
+    bl_label = "Drive from Video"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    filename_ext = ".mp4"
+    filter_glob: bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_idle(cls, context, Kind.PERFORMANCE) and needs_rig_or_shapes(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        video = file_path(self.filepath, "video")
+        if not is_video(video):
+            raise StgaError(f"{video}: is no video; expected {', '.join(SUFFIXES)}")
+        task = scene_settings(context).drive.detector
+        if not task:
+            raise StgaError(
+                "Drive from Video: needs Google's face_landmarker.task, which `stga drive --download-detector` "
+                "downloads; give the file in the Drive panel"
+            )
+        folder, _ = takes_folder(context)
+        output = _free_path(folder, video.stem)
+        start(
+            context.scene, ConvertMotion(video, output, detector=file_path(task, "detector")), training_python(context)
+        )
+        return {"FINISHED"}
+
+
+def _free_path(folder: Path, stem: str) -> Path:
+    path, number = folder / f"{stem}.csv", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}_{number}.csv"
+    return path

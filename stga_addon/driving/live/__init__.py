@@ -1,0 +1,1 @@
+"""Live face capture: datagrams of phones and programs as ARKit weights."""

@@ -1,0 +1,84 @@
+"""The Virtual Motion Capture protocol: blend shapes and bones as OSC messages."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..names import COLUMN, COUNT, arkit_name
+from .osc import Message, Value, messages
+from .packet import FacePacket
+
+VALUE, APPLY = "/VMC/Ext/Blend/Val", "/VMC/Ext/Blend/Apply"
+TIME, BONE = "/VMC/Ext/T", "/VMC/Ext/Bone/Pos"
+HEAD_BONE = "head"
+MAX_WEIGHT = 10.0
+
+
+@dataclass(frozen=True)
+class Received:
+    """What a sender said so far: values come one by one, and count when they are applied."""
+
+    weights: np.ndarray = field(default_factory=lambda: np.zeros(COUNT))
+    names: frozenset[str] = frozenset()
+    head: tuple[float, float, float] | None = None
+    time: float | None = None
+
+
+def decode(data: bytes, before: Received) -> tuple[FacePacket | None, Received] | None:
+    """The frame that a datagram applies, if any, and what is known after it; None for bytes that are no VMC.
+
+    before: what was known from this sender's earlier datagrams. Shapes have ARKit's names in any spelling; VRM's own
+    expressions (A, Joy, …) are left out. Source: the protocol's specification (protocol.vmc.info).
+    """
+    found = messages(data)
+    if found is None or not any(address.startswith("/VMC/") for address, _ in found):
+        return None
+    known, packet = before, None
+    for message in found:
+        known = _with(known, message)
+        if message[0] == APPLY and known.names:
+            packet = FacePacket(tuple(sorted(known.names)), known.weights, known.head, "", known.time)
+    return packet, known
+
+
+def _with(known: Received, message: Message) -> Received:
+    """What is known after a message; of malformed ones nothing is taken."""
+    address, values = message
+    if address == VALUE and len(values) == 2 and isinstance(values[0], str):
+        name, value = arkit_name(values[0]), _number(values[1])
+        if name is None or value is None or not abs(value) <= MAX_WEIGHT:
+            return known
+        weights = known.weights.copy()
+        weights[COLUMN[name]] = value
+        return replace(known, weights=weights, names=known.names | {name})
+    if address == TIME and len(values) == 1 and _number(values[0]) is not None:
+        return replace(known, time=_number(values[0]))
+    if address == BONE and len(values) == 8 and isinstance(values[0], str) and values[0].lower() == HEAD_BONE:
+        head = _head(values[4:])
+        return known if head is None else replace(known, head=head)
+    return known
+
+
+def _head(values: Sequence[Value]) -> tuple[float, float, float] | None:
+    """Yaw, pitch and roll of Unity's quaternion (x, y, z, w).
+
+    Unity's axes are left-handed, with x to the face's right: mirrored in x, rotations about y and z change their sign.
+    """
+    numbers = [value for value in map(_number, values) if value is not None]
+    length = math.sqrt(sum(value * value for value in numbers))
+    if len(numbers) != 4 or not 0.5 < length < 2:
+        return None
+    x, y, z, w = numbers
+    x, y, z, w = x / length, -y / length, -z / length, w / length
+    yaw = math.atan2(2 * (x * z + w * y), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * x - y * z))))
+    return yaw, pitch, math.atan2(2 * (x * y + w * z), 1 - 2 * (x * x + z * z))
+
+
+def _number(value: Value) -> float | None:
+    """A finite number as float; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e30:
+        return None
+    return float(value)

@@ -1,0 +1,231 @@
+"""Driving a head live in Blender: what a source sends on the head, and what stays when it is stopped."""
+
+import gc
+import socket
+import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from driving.live import wire  # noqa: E402
+
+from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
+from stga_addon.driving.head_map import head_map  # noqa: E402
+from stga_addon.driving.names import ARKIT_SHAPES  # noqa: E402
+from stga_addon.driving.performance import Performance  # noqa: E402
+from stga_addon.driving.read_performance import read_performance  # noqa: E402
+from stga_addon.flame.forward import flame_forward  # noqa: E402
+from stga_addon.flame.sequence import FlameSequence  # noqa: E402
+from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
+from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+
+pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
+TOLERANCE_M = 2e-5
+
+
+@pytest.fixture
+def live(tmp_path: Path, extension) -> SimpleNamespace:
+    """The demo's head, driven by packets that the test sends."""
+    model = synthetic_flame(0)
+    write_flame(model, tmp_path / "flame.npz")
+    shape = np.linspace(-0.5, 0.5, model.n_identity)
+    rng = np.random.default_rng(4)
+    jaw = np.linspace([0, 0, 0], [0.2, 0, 0], 5)
+    np.savez(tmp_path / "own.npz", expr=rng.normal(0, 0.3, (5, 10)), jaw_pose=jaw, shape=shape)
+    bpy.ops.stga.import_motion(filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz"))
+    settings = bpy.context.scene.stga.drive
+    settings.port, settings.takes = free_port(), str(tmp_path / "takes")
+    own = FlameSequence(model, shape, None, (), {}.__getitem__)
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sessions = extension.operators.live_session
+
+    def send(weights, frame, **options):
+        sender.sendto(wire.live_link_face(weights, frame, **options), ("127.0.0.1", settings.port))
+        return sessions.session().tick()
+
+    yield SimpleNamespace(
+        send=send,
+        settings=settings,
+        sessions=sessions,
+        own=own,
+        map=head_map(own, "demo"),
+        takes=tmp_path / "takes",
+        monitor=extension.operators.monitor,
+    )
+    if sessions.session() is not None:
+        sessions.session().stop()
+    sender.close()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def the_head():
+    return bpy.context.scene.stga.head
+
+
+def mesh() -> np.ndarray:
+    bpy.context.view_layer.update()
+    return evaluated_vertices(the_head())
+
+
+def expected(live, weights: dict[str, float], head=(0.0, 0.0, 0.0)) -> np.ndarray:
+    row = np.array([[weights.get(name, 0.0) for name in ARKIT_SHAPES]])
+    take = Performance(np.zeros(1), row, np.array([head]), 60.0)
+    return flame_forward(live.own.model, live.own.shape, live.map.frames(take)[0])
+
+
+def half(seed: int) -> dict[str, float]:
+    return {name: 0.5 * value for name, value in wire.mixed(seed).items()}
+
+
+def test_the_head_follows_and_comes_back(live):
+    """Catches a pose that is another than a file's, keyframes that nobody asked for, and a head that stays posed."""
+    bpy.context.scene.frame_set(1)
+    before, actions = mesh(), sorted(bpy.data.actions.keys())
+    assert bpy.ops.stga.drive_live() == {"FINISHED"}
+    for number in range(3):
+        weights = half(number)
+        assert 0 < live.send(weights, number, head=(0.1, 0.2, -0.1)) <= 1 / 60
+        np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
+    bpy.context.scene.frame_set(2)  # its own animation does not come between two packets
+    np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
+    bpy.context.scene.frame_set(1)
+    assert bpy.ops.stga.stop_live() == {"FINISHED"}
+    np.testing.assert_allclose(mesh(), before, atol=1e-7)
+    assert sorted(bpy.data.actions.keys()) == actions
+    assert live.sessions.session() is None
+    assert not bpy.ops.stga.stop_live.poll()
+
+
+def test_controls_follow(live):
+    """Catches ARKit controls that are driven and posed at the same time, or are left moved."""
+    bpy.ops.stga.add_arkit_controls()
+    rig = rig_of(the_head())
+    rig["jawOpen"] = 0.25
+    bpy.ops.stga.drive_live()
+    weights = half(1)
+    live.send(weights, 1, head=(0.1, 0.2, -0.1))
+    np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
+    bpy.ops.stga.stop_live()
+    assert rig["jawOpen"] == 0.25
+
+
+def test_record_with_a_calibrated_face(live):
+    """Catches a take that is not what the head did, has the resting face in it, or is not kept as a file."""
+    bpy.ops.stga.drive_live()
+    live.send({"jawOpen": 0.2}, 0)
+    bpy.ops.stga.calibrate_live()
+    bpy.context.scene.frame_set(10)
+    bpy.context.scene.render.fps = 30
+    bpy.ops.stga.record_live()
+    rows = [{"jawOpen": 0.2 + 0.08 * number, "mouthPucker": 0.05 * number} for number in range(9)]
+    for number, row in enumerate(rows):
+        live.send(row, 100 + number)
+    shown = mesh()
+    assert bpy.ops.stga.record_live() == {"FINISHED"}
+    take = read_performance(live.takes / "take_001.csv")
+    assert len(take.times) == 9
+    np.testing.assert_allclose(take.times, np.arange(9) / 60, atol=1e-5)
+    assert take.weights[0].max() == pytest.approx(0, abs=1e-6)
+    np.testing.assert_allclose(mesh(), shown, atol=TOLERANCE_M)  # still live
+    bpy.ops.stga.stop_live()
+    bpy.context.scene.frame_set(14)  # 8/60 s after frame 10
+    np.testing.assert_allclose(mesh(), shown, atol=TOLERANCE_M)
+    bpy.context.scene.frame_set(10)
+    np.testing.assert_allclose(mesh(), expected(live, {}), atol=TOLERANCE_M)
+
+
+def test_stopped_in_the_middle_of_a_recording(live):
+    """Catches a take that is lost with Esc."""
+    bpy.ops.stga.drive_live()
+    bpy.ops.stga.record_live()
+    for number in range(3):
+        live.send({"jawOpen": 0.3 * number}, number)
+    bpy.ops.stga.stop_live()
+    assert (live.takes / "take_001.csv").is_file()
+
+
+def test_the_trained_range(live):
+    """Catches a meter that says inside where nobody trained, and a live pose that is not led back."""
+    bpy.context.scene.frame_set(2)
+    bpy.ops.stga.measure_range()
+    from stga_addon.scene.rig.trained import outside_now, stored_range
+
+    head, rig = the_head(), rig_of(the_head())
+    trained = stored_range(head)
+    np.testing.assert_allclose(trained.middle["jaw"][0], 0.1, atol=0.01)
+    assert outside_now(head, rig, trained)["jaw"] == 0
+    bpy.ops.stga.drive_live()
+    live.send({"jawOpen": 1.0}, 0)
+    bpy.context.view_layer.update()
+    open_jaw = float(live.map.jaw[ARKIT_SHAPES.index("jawOpen"), 0])
+    assert outside_now(head, rig, trained)["jaw"] == pytest.approx(
+        (open_jaw - 0.1) / trained.width["jaw"][0] - 1, rel=0.1
+    )
+    live.settings.stay_trained = 1.0
+    live.send({"jawOpen": 1.0}, 1)
+    assert outside_now(head, rig, trained)["jaw"] <= 0.25
+
+
+def test_another_address_needs_online_access(live):
+    """Catches packets from the network although Blender's preferences forbid it."""
+    if bpy.app.online_access:
+        pytest.skip("online access is allowed here")
+    live.settings.address = "0.0.0.0"
+    with pytest.raises(RuntimeError, match="online access is off"):
+        bpy.ops.stga.drive_live()
+    live.settings.address = "127.0.0.1"
+    live.settings.source, live.settings.phone = "facial_mocap", "192.168.0.7"
+    with pytest.raises(RuntimeError, match="online access is off"):
+        bpy.ops.stga.drive_live()
+
+
+def test_it_ends_with_file_head_and_extension(live, extension):
+    """Catches a socket that stays open, or a head of another file that is posed."""
+    for end in (
+        lambda: bpy.data.objects.remove(the_head()),
+        lambda: bpy.ops.wm.read_homefile(use_empty=True),
+    ):
+        if the_head() is None:
+            return
+        bpy.ops.stga.drive_live()
+        running = live.sessions.session()
+        live.send({}, 1)
+        end()
+        if live.sessions.session() is not None:
+            assert running.tick() is None
+        assert live.sessions.session() is None
+        assert running.receiver._socket.fileno() == -1
+
+
+def test_a_minute_without_growth(live):
+    """Catches memory that grows with packets, senders or noise, and ticks that grow slower."""
+    bpy.ops.stga.drive_live()
+    noise = np.random.default_rng(0)
+    rows = [half(number) for number in range(10)]
+
+    def minute(first: int) -> None:
+        for number in range(600):
+            live.send(rows[number % 10], first + number, subject="A" if number % 7 else "B")
+            if number % 3 == 0:
+                live.sessions.session().stream.receive("1.2.3.4", noise.bytes(40), number / 60)
+
+    minute(0)
+    gc.collect()
+    tracemalloc.start()
+    minute(1000)
+    gc.collect()
+    before = tracemalloc.get_traced_memory()[0]
+    minute(2000)
+    gc.collect()
+    after = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert after - before < 20_000

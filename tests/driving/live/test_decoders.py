@@ -1,0 +1,184 @@
+"""Decoders of live sources, against bytes written from the layouts and against independent encoders."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stga_addon.driving.head_map import head_turns
+from stga_addon.driving.live import facial_mocap as mocap
+from stga_addon.driving.live import live_link_face as link
+from stga_addon.driving.live import osc, vmc
+from stga_addon.driving.names import ARKIT_SHAPES, COLUMN
+
+from . import wire
+
+
+def as_dict(weights) -> dict[str, float]:
+    return dict(zip(ARKIT_SHAPES, weights.tolist(), strict=True))
+
+
+def test_live_link_face():
+    """Catches values at the place of the CSV's columns, where jaw and mouth have the right first, a time in frames, and
+    head angles taken from the eyes."""
+    weights = wire.mixed(0)
+    packet = link.decode(wire.live_link_face(weights, 120, (0.1, -0.2, 0.3), "Änne"))
+    assert packet is not None
+    assert as_dict(packet.weights) == pytest.approx(weights)
+    assert packet.head == pytest.approx((0.1, -0.2, 0.3))
+    assert packet.subject == "Änne"
+    assert packet.time == pytest.approx(120.25 / 60)
+
+
+def test_live_link_face_with_other_counts():
+    """Catches senders of 51 or 52 shapes that are refused, and a packet without a face that is taken as one at rest."""
+    weights = wire.mixed(1)
+    packet = link.decode(wire.live_link_face(weights, count=51))
+    assert as_dict(packet.weights) == pytest.approx({**weights, "tongueOut": 0.0})
+    assert packet.head is None
+    assert "tongueOut" not in packet.names
+    assert as_dict(link.decode(wire.live_link_face(weights, count=52)).weights) == pytest.approx(weights)
+    for absent in (wire.live_link_face({}, count=0), wire.live_link_face({}, count=0) + b"\0"):
+        packet = link.decode(absent)
+        assert packet is not None
+        assert packet.weights is None
+    assert link.decode(wire.live_link_face({}, count=30)) is None
+
+
+def test_packets_of_pylivelinkface():
+    """Catches a header that is read little-endian, as that library writes it: version as four bytes, then '$', which is
+    the first byte of a length of 36. Its layout, written here from its source of version 0.1."""
+    device = "$" + "12345678-1234-1234-1234-123456789abc"
+    name = b"Python_LiveLinkFace"
+    values = np.linspace(0, 1, 61)
+    data = struct.pack("<I", 6) + device.encode() + struct.pack("!i", len(name)) + name
+    data += struct.pack("!II", 600, 1056060032) + struct.pack("!II", 60, 1) + struct.pack("!B61f", 61, *values)
+    packet = link.decode(data)
+    assert packet.subject == name.decode()
+    assert packet.time == pytest.approx((600 + 0.47295) / 60, abs=1e-5)
+    assert as_dict(packet.weights)["jawLeft"] == pytest.approx(values[15])
+
+
+def test_facial_mocap():
+    """Catches percent taken as weights, degrees as radians, pitch as yaw, and the second version's separator."""
+    weights = {name: round(value, 2) for name, value in wire.mixed(2).items()}
+    for separator in "-&":
+        packet = mocap.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
+        assert as_dict(packet.weights) == pytest.approx(weights)
+        assert packet.head == pytest.approx(np.radians([20, 10, 30]))
+    assert mocap.parse_packet(b"mouthSmile_L&-5|jawOpen&12|").weights[COLUMN["mouthSmileLeft"]] == pytest.approx(-0.05)
+
+
+def osc_text(text: str) -> bytes:
+    return text.encode() + b"\0" * (4 - len(text.encode()) % 4)
+
+
+def blend(name: str, value: float) -> bytes:
+    return osc_text("/VMC/Ext/Blend/Val") + osc_text(",sf") + osc_text(name) + struct.pack(">f", value)
+
+
+APPLY = osc_text("/VMC/Ext/Blend/Apply") + osc_text(",")
+
+
+def bundle(*messages: bytes) -> bytes:
+    return osc_text("#bundle") + struct.pack(">Q", 1) + b"".join(struct.pack(">i", len(m)) + m for m in messages)
+
+
+def test_vmc_by_hand():
+    """Catches values that count before they are applied, are forgotten between two datagrams, or of VRM's own
+    expressions, whose A is no shape of ARKit."""
+    packet, known = vmc.decode(bundle(blend("JawOpen", 0.5), blend("A", 1.0)), vmc.Received())
+    assert packet is None
+    packet, known = vmc.decode(bundle(blend("MouthSmile_L", 0.25), bundle(blend("cheekPuff", 0.75), APPLY)), known)
+    expected = {"jawOpen": 0.5, "mouthSmileLeft": 0.25, "cheekPuff": 0.75}
+    assert {name: value for name, value in as_dict(packet.weights).items() if value} == expected
+    assert set(packet.names) == set(expected)
+    packet, _ = vmc.decode(bundle(blend("jawOpen", 0.0), APPLY), known)
+    assert as_dict(packet.weights)["cheekPuff"] == 0.75
+    assert vmc.decode(osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1), vmc.Received()) is None
+
+
+def test_vmc_with_python_osc():
+    """Catches what bytes by hand and decoder get wrong together: python-osc writes the datagrams."""
+    message = pytest.importorskip("pythonosc.osc_message_builder")
+    bundles = pytest.importorskip("pythonosc.osc_bundle_builder")
+    weights, known = wire.mixed(3), vmc.Received()
+
+    def written(address: str, *values: object) -> object:
+        builder = message.OscMessageBuilder(address)
+        for value in values:
+            builder.add_arg(value)
+        return builder.build()
+
+    builder = bundles.OscBundleBuilder(bundles.IMMEDIATELY)
+    builder.add_content(written("/VMC/Ext/T", 12.5))
+    for name, value in weights.items():
+        builder.add_content(written("/VMC/Ext/Blend/Val", name[0].upper() + name[1:], value))
+    builder.add_content(written("/VMC/Ext/Blend/Apply"))
+    packet, known = vmc.decode(builder.build().dgram, known)
+    assert as_dict(packet.weights) == pytest.approx(weights)
+    assert packet.time == 12.5
+    mixed = written("/x/y", 1, 2.5, "text", b"blob", True, False)
+    assert osc.messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_vmc_head(axis):
+    """Catches Unity's left-handed axes: a quaternion about x nods alike, about y and z turns the other way."""
+    angle = 0.3
+    quaternion = np.array([0.0, 0.0, 0.0, math.cos(angle / 2)])
+    quaternion[axis] = math.sin(angle / 2)
+    where = osc_text("/VMC/Ext/Bone/Pos") + osc_text(",sfffffff") + osc_text("Head") + struct.pack(
+        ">7f", 0, 1, 0, *quaternion
+    )  # fmt: skip
+    packet, _ = vmc.decode(bundle(where, blend("jawOpen", 0), APPLY), vmc.Received())
+    turn = head_turns(np.array([packet.head]))[0]
+    expected = np.zeros(3)
+    expected[axis] = angle if axis == 0 else -angle
+    np.testing.assert_allclose(turn, expected, atol=1e-6)
+
+
+def malformed(rng: np.random.Generator) -> bytes:
+    """A valid packet that is cut off, lengthened, or has bytes exchanged; or noise."""
+    valid = [
+        wire.live_link_face(wire.mixed(0)),
+        wire.facial_mocap(wire.mixed(0)),
+        bundle(blend("jawOpen", 0.5), bundle(blend("A", 1.0), APPLY)),
+    ]
+    data = bytearray(valid[rng.integers(3)])
+    for _ in range(rng.integers(4)):
+        data[rng.integers(len(data))] = rng.integers(256)
+    how = rng.integers(4)
+    if how == 0:
+        return bytes(data[: rng.integers(len(data))])
+    if how == 1:
+        return bytes(data) + rng.bytes(rng.integers(1, 50))
+    return bytes(data) if how == 2 else rng.bytes(rng.integers(400))
+
+
+def test_ten_thousand_malformed_packets():
+    """Catches an exception of any decoder, and weights or angles that are not finite."""
+    rng = np.random.default_rng(0)
+    known = vmc.Received()
+    for _ in range(10_000):
+        data = malformed(rng)
+        decoded = vmc.decode(data, known)
+        known = known if decoded is None else decoded[1]
+        for packet in (link.decode(data), mocap.parse_packet(data), decoded and decoded[0]):
+            if packet is not None and packet.weights is not None:
+                assert np.isfinite(packet.weights).all()
+                assert packet.time is None or math.isfinite(packet.time)
+                assert packet.head is None or np.isfinite(packet.head).all()
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes(data):
+    """Catches an exception that mutated packets do not reach."""
+    link.decode(data)
+    link.decode(b"\x06" + data)
+    mocap.parse_packet(data)
+    vmc.decode(data, vmc.Received())
+    osc.messages(b"#bundle\0" + data)

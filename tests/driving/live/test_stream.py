@@ -1,0 +1,194 @@
+"""Which packets of a source count, and what is said about them."""
+
+import socket
+
+import numpy as np
+import pytest
+
+from stga_addon.driving.live.receiver import MAX_DATAGRAMS, Receiver, leaves_this_machine
+from stga_addon.driving.live.sources import SOURCES
+from stga_addon.driving.live.stream import MAX_SENDERS, Stream
+from stga_addon.driving.live.take import Recording, eased, resting, row_of
+from stga_addon.driving.names import COLUMN
+from stga_addon.errors import StgaError
+
+from . import wire
+
+LINK = SOURCES["live_link_face"]
+
+
+def jaw(frame: int, value: float, **options) -> bytes:
+    return wire.live_link_face({"jawOpen": value}, frame, **options)
+
+
+def shown(stream: Stream) -> float:
+    return float(stream.latest.weights[COLUMN["jawOpen"]])
+
+
+def test_late_doubled_and_lost_packets():
+    """Catches a head that jumps back in time, packets that count twice, and losses that are not counted: rows of half
+    the rate of the clock are no losses."""
+    stream = Stream(LINK)
+    order = [0, 2, 4, 8, 6, 8, 10, 16]
+    for number, frame in enumerate(order):
+        stream.receive("10.0.0.5", jaw(frame, frame / 100), number / 30)
+        assert shown(stream) == pytest.approx(max(order[: number + 1]) / 100)
+    health = stream.health(8 / 30)
+    assert (health.lost, health.late, health.foreign) == (3, 2, 0)  # 6 came, but too late
+    stream.receive("10.0.0.5", b"hello", 1.0)
+    assert stream.health(1.0).foreign == 1
+    assert stream.receive("10.0.0.5", jaw(0, 0.9), 2.0) is None  # a third of a second back: late
+    assert Stream(LINK).health(0.0).rate == 0
+
+
+def test_a_clock_that_starts_anew():
+    """Catches a head that stands still after midnight, or after the app was started again."""
+    stream = Stream(LINK)
+    day = 24 * 3600 * 60
+    for number, frame in enumerate([day - 2, day - 1, 0, 1]):
+        stream.receive("a", jaw(frame, frame % 1000 / 1000), number / 60)
+    assert shown(stream) == pytest.approx(0.001)
+    assert stream.lost == 0
+
+
+def test_a_face_that_leaves_the_picture():
+    """Catches a face that falls to zero, or counts as silence, while it is out of the picture."""
+    stream = Stream(LINK)
+    stream.receive("a", jaw(0, 0.5), 0.0)
+    assert stream.has_face
+    assert stream.receive("a", jaw(1, 0.0, count=0), 1 / 60) is None
+    assert not stream.has_face
+    assert shown(stream) == 0.5
+    assert stream.silent_s(1 / 60) == 0
+    stream.receive("a", jaw(2, 0.7), 2 / 60)
+    assert stream.has_face
+
+
+def test_two_phones_on_one_port():
+    """Catches a head that trembles between two faces, one that cannot be handed over, and one that waits for a phone
+    that is gone."""
+    stream = Stream(LINK)
+    for frame in range(60):
+        stream.receive("10.0.0.5", jaw(frame, 0.1, subject="A"), frame / 60)
+        stream.receive("10.0.0.6", jaw(frame + 5000, 0.9, subject="B"), frame / 60)
+        assert shown(stream) == pytest.approx(0.1)
+    assert set(stream.senders) == {("10.0.0.5", "A"), ("10.0.0.6", "B")}
+    stream.receive("10.0.0.6", jaw(5100, 0.9, subject="B"), 10.0)  # A is silent
+    assert shown(stream) == pytest.approx(0.9)
+    stream.follow(("10.0.0.5", "A"))
+    stream.receive("10.0.0.6", jaw(5200, 0.8, subject="B"), 20.0)
+    assert shown(stream) == pytest.approx(0.9)
+    stream.receive("10.0.0.5", jaw(61, 0.2, subject="A"), 20.0)
+    assert shown(stream) == pytest.approx(0.2)
+
+
+def test_rate_and_delay():
+    """Catches a rate that is not that of the last seconds, and a delay that grows with the clocks' difference."""
+    stream = Stream(LINK)
+    for frame in range(300):
+        stream.receive("a", jaw(1_000_000 + frame, 0.5), frame / 60 + (0.05 if frame == 299 else 0.0))
+    health = stream.health(5.0)
+    assert health.rate == pytest.approx(60, rel=0.03)
+    assert health.delay_s == pytest.approx(0.05, abs=1e-3)
+
+
+def test_nothing_grows():
+    """Catches memory that grows with packets, senders or noise."""
+    stream, rng = Stream(LINK), np.random.default_rng(0)
+    for number in range(5000):
+        stream.receive(f"10.0.{number % 50}.1", jaw(number, 0.5, subject=str(number)), number / 60)
+        stream.receive(f"10.1.{number % 200}.1", rng.bytes(20), number / 60)
+    assert len(stream.senders) <= MAX_SENDERS
+    assert len(stream._known) <= MAX_SENDERS
+    assert len(stream._arrivals) <= 240
+
+
+def test_on_loopback():
+    """Catches a socket that waits, listens where it was not told to, or holds Blender up while it is flooded."""
+    receiver = Receiver(LINK, port=free_port())
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    assert receiver.read() == []
+    sent = jaw(1, 0.5)
+    for _ in range(MAX_DATAGRAMS + 10):
+        sender.sendto(sent, ("127.0.0.1", receiver.port))
+    assert receiver.read() == [("127.0.0.1", sent)] * MAX_DATAGRAMS
+    assert receiver._socket.getsockname()[0] == "127.0.0.1"
+    with pytest.raises(StgaError, match=f"port {receiver.port} of 127.0.0.1 cannot be opened"):
+        Receiver(LINK, port=receiver.port)
+    receiver.close()
+    sender.close()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_the_request_to_a_phone():
+    """Catches iFacialMocap that is never asked, or is asked for ever faster."""
+    phone = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    phone.bind(("127.0.0.2", SOURCES["facial_mocap"].port))
+    phone.settimeout(5)
+    receiver = Receiver(SOURCES["facial_mocap"], port=free_port(), phone="127.0.0.2")
+    for now in (0.0, 0.5, 1.1):
+        receiver.ask(now)
+    data, address = phone.recvfrom(100)
+    assert data == b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"
+    phone.recvfrom(100)
+    phone.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        phone.recvfrom(100)
+    phone.sendto(wire.facial_mocap({"jawOpen": 0.5}), address)
+    ((_, reply),) = receiver.read()
+    assert shown_by("facial_mocap", reply) == 0.5
+    receiver.close()
+    phone.close()
+
+
+def shown_by(source: str, data: bytes) -> float:
+    stream = Stream(SOURCES[source])
+    stream.receive("a", data, 0.0)
+    return shown(stream)
+
+
+def test_addresses():
+    """Catches packets that leave the computer without the user's word, and a mistyped address."""
+    assert not leaves_this_machine(LINK, "127.0.0.1", "no matter")
+    assert leaves_this_machine(LINK, "0.0.0.0", "")
+    assert leaves_this_machine(SOURCES["facial_mocap"], "127.0.0.1", "192.168.0.7")
+    with pytest.raises(StgaError, match="phone's address: '' is no IP address"):
+        leaves_this_machine(SOURCES["facial_mocap"], "127.0.0.1", "")
+    with pytest.raises(StgaError, match="address to listen on: 'localhost' is no IP address"):
+        Receiver(LINK, "localhost")
+    with pytest.raises(StgaError, match="cannot be opened"):
+        Receiver(LINK, "203.0.113.1")
+
+
+def test_recording():
+    """Catches a take that has arrival times, a resting face that is not taken off, and sides exchanged twice."""
+    stream = Stream(LINK)
+    first = stream.receive("a", wire.live_link_face({"jawOpen": 0.2, "mouthLeft": 0.3}, 0, (0.1, 0, 0)), 0.0)
+    recording = Recording(7, resting([first]), ("mouth",))
+    for frame in (0, 1, 2, 5):
+        data = wire.live_link_face({"jawOpen": 1.0, "mouthLeft": 0.5}, 100 + frame, (0.4, 0, 0))
+        recording.add(stream.receive("a", data, 3.0 * frame), 3.0 * frame)
+    take = recording.performance()
+    np.testing.assert_allclose(take.times, np.array([0, 1, 2, 5]) / 60, atol=1e-6)
+    assert take.lost == 2
+    np.testing.assert_allclose(take.weights[:, COLUMN["jawOpen"]], 1.0, atol=1e-6)
+    np.testing.assert_allclose(take.weights[:, COLUMN["mouthRight"]], (0.5 - 0.3) / 0.7, atol=1e-6)
+    np.testing.assert_allclose(take.weights[:, COLUMN["mouthLeft"]], 0)
+    np.testing.assert_allclose(take.head[:, 0], 0.3, atol=1e-6)
+    assert Recording(0, None).performance() is None
+
+
+def test_smoothing():
+    """Catches a filter that depends on the rate of the packets: a step is 63 % done after its time constant."""
+    stream = Stream(LINK)
+    low, high = (row_of(stream.receive("a", jaw(f, value), 0.0)) for f, value in ((0, 0.0), (1, 1.0)))
+    for rate in (30, 120):
+        row = low
+        for _ in range(rate // 10):
+            row = eased(row, high, 1 / rate, 0.1)
+        assert row.weights[0, COLUMN["jawOpen"]] == pytest.approx(1 - np.exp(-1), abs=1e-3)

@@ -1,0 +1,45 @@
+"""Packets written by hand from the layouts of the protocols."""
+
+import struct
+
+import numpy as np
+
+from stga_addon.driving.names import ARKIT_SHAPES
+
+UDP_ORDER = list(ARKIT_SHAPES)
+for pair in ("jaw", "mouth"):
+    left, right = UDP_ORDER.index(f"{pair}Left"), UDP_ORDER.index(f"{pair}Right")
+    UDP_ORDER[left], UDP_ORDER[right] = UDP_ORDER[right], UDP_ORDER[left]
+
+
+def live_link_face(
+    weights: dict[str, float],
+    frame: int = 0,
+    head: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    subject: str = "phone",
+    device: str = "DEVICE-1",
+    count: int = 61,
+    rate: int = 60,
+) -> bytes:
+    """Big-endian: version 6; device and subject with their lengths; frame, subframe, rate, denominator; the values."""
+    values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
+    names = b"".join(struct.pack(">i", len(text.encode())) + text.encode() for text in (device, subject))
+    time = struct.pack(">ifii", frame, 0.25, rate, 1)
+    body = struct.pack(f">B{count}f", count, *values[:count]) if count else b""
+    return b"\x06" + names + time + body
+
+
+def facial_mocap(weights: dict[str, float], head: tuple[float, ...] = (0, 0, 0), separator: str = "-") -> bytes:
+    """Percent; pitch, yaw and roll in degrees, and a position."""
+    fields = []
+    for name in ARKIT_SHAPES:
+        spelled = name.replace("Left", "_L").replace("Right", "_R") if name.endswith(("Left", "Right")) else name
+        fields.append(f"{spelled}{separator}{round(100 * weights.get(name, 0.0))}")
+    angles = ",".join(f"{value}" for value in head)
+    return ("|".join(fields) + f"|=head#{angles},0.1,0.2,-0.3|rightEye#1,2,0|leftEye#1,2,0|").encode()
+
+
+def mixed(seed: int) -> dict[str, float]:
+    """A weight per shape that tells the shapes apart."""
+    values = np.random.default_rng(seed).random(len(ARKIT_SHAPES)).astype(np.float32)
+    return dict(zip(ARKIT_SHAPES, values.tolist(), strict=True))
