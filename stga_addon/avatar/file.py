@@ -13,6 +13,7 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames, shifted_frames, strain_offset
+from .light import AvatarLight, light_arrays, light_from
 from .splats import MAX_SH_DEGREE, Splats
 from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain, strain_basis
 
@@ -38,6 +39,7 @@ class Avatar:
                 (`avatar.strain`); None: the same for all, ±MAX_STRAIN
     strain_position  (F, 3, 3) float32 how far a triangle's splats move with its `smoothed_strain`: for each component
                 a vector in the triangle's frame; None where positions follow the mesh alone
+    light       what relighting needs, None where it was not estimated
     """
 
     splats: Splats
@@ -51,6 +53,7 @@ class Avatar:
     principal_point: str = DEFAULT_PRINCIPAL_POINT
     strain_range: np.ndarray | None = None
     strain_position: np.ndarray | None = None
+    light: AvatarLight | None = None
 
     @property
     def follows_strain(self) -> bool:
@@ -96,6 +99,9 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     for name in _STRAIN_FIELDS:
         if getattr(avatar, name) is not None:
             arrays[name] = getattr(avatar, name)
+    if avatar.light is not None:
+        found, header["light"] = light_arrays(avatar.light)
+        arrays.update(found)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -122,6 +128,7 @@ def read_avatar(path: Path) -> Avatar:
         antialiased=header["antialiased"],
         principal_point=header["principal_point"],
         **{name: arrays.get(name) for name in _STRAIN_FIELDS},
+        light=light_from(path, arrays, header["light"], len(arrays["neutral"])) if "light" in header else None,
     )
     _check(path, avatar)
     return avatar
