@@ -6,15 +6,20 @@ import numpy as np
 
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
-from ..capture.mesh_raster import rasterize
 from ..capture.model import Capture, View, evenly_spread
 from ..capture.rigid import weighted_procrustes
 from ..progress import Progress, Report, ignore
+from .shadows import ShadowMap
+from .values import Light
 
-MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 400
+MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
 """Views that are looked at, evenly spread, and the size that larger images are reduced to."""
 MIN_FACING = 0.35
 """Cosine between a triangle's normal and the direction to the camera, below which its color is not used."""
+HIDDEN_M = 0.003
+"""A triangle is hidden by what is nearer to the camera by as much."""
+POINTS = (np.eye(3) + 1 / 3) / 2
+"""(3, 3) barycentric coordinates of the points of a triangle whose pixels are read."""
 SATURATED, DARK = 252, 4
 """Levels of 255 from which on, and up to which, a channel says nothing."""
 
@@ -51,11 +56,11 @@ def observe(capture: Capture, report: Report = ignore) -> Observed:
 
 
 def _view_colors(capture: Capture, mesh: np.ndarray, view: View) -> np.ndarray:
-    """(F, 3) linear mean color of the pixels of each triangle; NaN where there is none, or it is seen aslant."""
+    """(F, 3) linear mean color of each triangle at POINTS; NaN where it is hidden or seen aslant."""
     scale = min(1.0, MAX_SIDE_PX / max(view.camera.width, view.camera.height))
     view, image, mask = read_view(view, scale)
-    triangle, _ = rasterize(mesh, capture.faces, view.camera)
-    usable = (triangle >= 0) & (image.max(2) < SATURATED) & (image.max(2) > DARK)
+    level = image.max(2)
+    usable = (level < SATURATED) & (level > DARK)
     if mask is not None:
         usable &= _inner(mask > 127)
     corners = mesh[capture.faces]
@@ -63,10 +68,18 @@ def _view_colors(capture: Capture, mesh: np.ndarray, view: View) -> np.ndarray:
     to_camera = view.camera.position - corners.mean(1)
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
     facing = (normal * to_camera).sum(1) > MIN_FACING * lengths
-    where, linear = triangle[usable], srgb_to_linear(image[usable] / 255)
-    count = np.bincount(where, minlength=len(facing))
-    total = np.stack([np.bincount(where, channel, len(facing)) for channel in linear.T], axis=-1)
-    return np.where(((count > 0) & facing)[:, None], total / np.maximum(count, 1)[:, None], np.nan)
+    depths = ShadowMap(mesh, capture.faces, Light("point", np.ones(3), view.camera.position))
+    facing &= depths.lit(corners.mean(1), HIDDEN_M, step=0) > 0.5
+    total, count = np.zeros((len(facing), 3)), np.zeros((len(facing), 1))
+    for weights in POINTS:
+        pixels, _ = view.camera.project(np.einsum("k,fkc->fc", weights, corners))
+        column, row = np.floor(pixels).astype(np.int64).T
+        inside = facing & (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
+        column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+        inside &= usable[row, column]
+        total += np.where(inside[:, None], srgb_to_linear(image[row, column] / 255), 0)
+        count += inside[:, None]
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _inner(mask: np.ndarray) -> np.ndarray:
