@@ -19,7 +19,6 @@ import numpy as np
 from PIL import Image
 
 from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.avatar.splats import SH_C0, no_strain_color
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.model import Capture, View
@@ -29,7 +28,7 @@ from stga_addon.light.harmonics import even_directions, project, uniform
 from stga_addon.light.lamps import Lamps
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
-from stga_addon.render.render import render, render_avatar
+from stga_addon.render.render import render_avatar, render_colors
 from stga_addon.training.evaluate.lpips import load_network
 from stga_addon.training.evaluate.metrics import psnr
 
@@ -102,7 +101,7 @@ class Bench:
                 yield view, render_avatar(self.avatar, mesh, view.camera)
             else:
                 colors = relighter.colors(mesh, view.camera.position, values)
-                yield view, render_with_colors(self.avatar, mesh, view, colors)
+                yield view, render_colors(self.avatar, mesh, view.camera, colors)
 
     def score(self, name: str, relighter: Relighter | None, pictures: Path | None = None, **options: object):  # type: ignore[no-untyped-def]
         """Mean PSNR in the mask, LPIPS, PSNR of eyes and mouth."""
@@ -119,13 +118,6 @@ class Bench:
                 pictures.mkdir(parents=True, exist_ok=True)
                 Image.fromarray(pair).save(pictures / f"{name}_{view.timestep}_{view.camera_index}.png")
         return tuple(np.mean(found, axis=0))
-
-
-def render_with_colors(avatar: Avatar, mesh: np.ndarray, view: View, colors: np.ndarray) -> np.ndarray:
-    """(3, H, W) with colors (N, 3) of the splats instead of those that were trained."""
-    sh = ((colors - 0.5) / SH_C0).astype(np.float32)[:, None]
-    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(colors)))
-    return render(splats, view.camera, (1.0, 1.0, 1.0), avatar.frames(mesh), avatar.antialiased)
 
 
 def small_parts(capture: Capture, view: View) -> np.ndarray:
