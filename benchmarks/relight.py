@@ -4,7 +4,7 @@
 
 Each FOLDER holds `capture_A` (a capture under light A whose head never turns), `truth_A` … `truth_E` (captures of the
 same head and cameras with split "train": held-out views under each light) and `lights.json`, which says what the lights
-are (`lighting`). Light A is not given; its level is, as the color of a gray card. LPIPS needs STGA_LPIPS.
+are (`lighting`). Light A is not given; its level is, as the colors of a gray ball. LPIPS needs STGA_LPIPS.
 Prints PSNR inside the mask / LPIPS / PSNR of eyes and mouth, and writes pictures beside the run with --pictures.
 """
 
@@ -35,7 +35,6 @@ from stga_addon.training.evaluate.metrics import psnr
 LIGHTS = "ABCDE"
 BARS = {"B": (27.5, 0.036), "C": (29.0, 0.032), "D": (27.5, 0.052)}
 SMALL_PARTS = "left_eye", "right_eye", "mouth"
-FRONT = np.array([0.0, 0.0, 1.0])
 CARD_REFLECTANCE = 0.18
 
 
@@ -53,10 +52,15 @@ def lighting(spec: dict, **options: object) -> Lighting:
         lights.append(Light("area", power * np.array(color), 1.2 * toward, -toward, size=(side, side), tangent=tangent))
     for azimuth, elevation, strength, angle, color in spec["sun"]:
         lights.append(Light("sun", strength * np.array(color), direction=-direction(azimuth, elevation), angle=angle))
-    sky, (steps, colors) = even_directions(600), zip(*spec["world"], strict=True)
-    height = sky[:, 1] / 2 + 0.5
-    radiance = np.stack([np.interp(height, steps, [color[k] for color in colors]) for k in range(3)], axis=-1)
-    return Lighting(project(radiance, sky), tuple(lights), **options)  # type: ignore[arg-type]
+    sky = even_directions(600)
+    return Lighting(project(world_radiance(spec, sky), sky), tuple(lights), **options)  # type: ignore[arg-type]
+
+
+def world_radiance(spec: dict, directions: np.ndarray) -> np.ndarray:
+    """(N, 3) radiance of the world in directions (N, 3)."""
+    steps, colors = zip(*spec["world"], strict=True)
+    height = directions[:, 1] / 2 + 0.5
+    return np.stack([np.interp(height, steps, channel) for channel in zip(*colors, strict=True)], axis=-1)
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
@@ -65,18 +69,18 @@ def direction(azimuth: float, elevation: float) -> np.ndarray:
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-def gray_card(spec: dict) -> np.ndarray:
-    """(3,) linear color of a gray card at the origin that faces the front under a light."""
+BALL = np.array([direction(azimuth, elevation) for azimuth in (-50, 0, 50) for elevation in (-30, 0, 30)])
+"""(9, 3) normals of the gray ball that says how light the capture is."""
+
+
+def gray_ball(spec: dict) -> np.ndarray:
+    """(9, 3) linear colors of a gray ball at the origin under a light, where its normals are BALL."""
     values = lighting(spec, shadows=False)
     far = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])  # says only where the head is
     lamps = Lamps(values, far, np.zeros((0, 3), np.int32))
-    arriving = lamps.irradiance(np.zeros((1, 3)), FRONT[None])[0]
-    sky, (steps, colors) = even_directions(600), zip(*spec["world"], strict=True)
-    cosine = np.maximum(sky @ FRONT, 0) * 4 * np.pi / len(sky)
-    height = sky[:, 1] / 2 + 0.5
-    arriving = arriving + np.array(
-        [cosine @ np.interp(height, steps, [color[k] for color in colors]) for k in range(3)]
-    )
+    sky = even_directions(600)
+    cosine = np.maximum(BALL @ sky.T, 0) * 4 * np.pi / len(sky)
+    arriving = lamps.irradiance(np.zeros_like(BALL), BALL) + cosine @ world_radiance(spec, sky)
     return CARD_REFLECTANCE * arriving / np.pi
 
 
@@ -151,9 +155,9 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
     capture = open_capture(folder / "capture_A")
     avatar = trained(folder / "capture_A", run, seconds)
     bench = Bench(folder, avatar)
-    card = gray_card(bench.specs["A"])
-    light = estimate_light(capture, Known(card=card, toward=FRONT))
-    even = estimate_light(capture, Known(radiance=uniform(card / CARD_REFLECTANCE)))
+    ball = gray_ball(bench.specs["A"])
+    light = estimate_light(capture, Known(card=ball, toward=BALL))
+    even = estimate_light(capture, Known(radiance=uniform(ball.mean(0) / CARD_REFLECTANCE)))
     print(f"{folder.name}: {len(avatar.splats)} splats; residual {light.residual:.3f}, damping {light.damping:.2f}")
     relighter = Relighter(replace(avatar, light=light))
     rows = {

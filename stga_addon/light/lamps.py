@@ -41,7 +41,7 @@ class Lamps:
 
         lit = np.ones((max(1, len(self._maps)), len(points)), np.float32)
         for row, shadow in zip(lit, self._maps, strict=False):
-            row[:] = shadow.lit(points)
+            row[:] = shadow.lit(points, normals=normals)
         add_lights(
             np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32),
             np.asarray(eye, np.float32), np.asarray(roughness, np.float32),

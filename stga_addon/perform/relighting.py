@@ -34,7 +34,7 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
         card = srgb_to_linear(np.array(request.card))
         if not card.min() > 0:
             raise StgaError(f"--gray-card: expected three numbers above 0, got {request.card}")
-        known = Known(card=card, toward=_toward_central_camera(capture))
+        known = Known(card=card[None], toward=_toward_central_camera(capture)[None])
     return Written(folder / AVATAR, add_light(folder / AVATAR, capture, known, report))
 
 
