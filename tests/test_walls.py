@@ -28,6 +28,7 @@ LAYERS = (
     {"avatar", "selection"},
     {"export"},
     {"raster"},
+    {"light"},
     {"render"},
     {"tracking"},
     {"driving"},

@@ -13,6 +13,7 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
+from .light import AvatarLight, light_arrays, light_from
 from .offsets.offset import moved_frames
 from .offsets.table import OFFSETS
 from .splats import ADDED, ARRAYS, Splats
@@ -39,6 +40,7 @@ class Avatar:
                 (`avatar.strain`); None: the same for all, ±MAX_STRAIN
     driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of that name in
                 `offsets.table`, for each of its S components a vector in the triangle's frame
+    light       what relighting needs, None where it was not estimated
     """
 
     splats: Splats
@@ -52,6 +54,7 @@ class Avatar:
     principal_point: str = DEFAULT_PRINCIPAL_POINT
     strain_range: np.ndarray | None = None
     driven_offsets: Mapping[str, np.ndarray] = field(default_factory=dict)
+    light: AvatarLight | None = None
 
     @property
     def follows_strain(self) -> bool:
@@ -98,6 +101,9 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     if avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range
     arrays.update(avatar.driven_offsets)
+    if avatar.light is not None:
+        found, header["light"] = light_arrays(avatar.light)
+        arrays.update(found)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -125,6 +131,7 @@ def read_avatar(path: Path) -> Avatar:
         principal_point=header["principal_point"],
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
+        light=light_from(path, arrays, header["light"], len(arrays["neutral"])) if "light" in header else None,
     )
     _check(path, avatar)
     return avatar

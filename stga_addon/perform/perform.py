@@ -38,6 +38,7 @@ WORK: dict[type[Any], tuple[str, str]] = {
     values.TimePresets: (".analysis", "time_each_preset"),
     values.Evaluate: (".evaluation", "evaluate_run"),
     values.Benchmark: ("..development.benchmark.slice", "train_slice"),
+    values.Relight: (".relighting", "relight"),
 }
 """Request -> the module that carries it out, loaded when it is needed, and its function. The extension's zip leaves
 `development` out."""

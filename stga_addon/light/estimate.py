@@ -1,0 +1,139 @@
+"""The light of a capture, from its images and meshes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..avatar.light import AvatarLight
+from ..capture.model import Capture
+from ..errors import StgaError
+from ..progress import Report, ignore
+from .bounce import Bounce
+from .eyes import wet_roughness
+from .harmonics import COUNT, LAMBERT, basis, rotated, uniform
+from .observe import Observed, observe
+from .transfer import transfer_of
+
+ITERATIONS = 40
+PRIOR = 0.7
+"""Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every timestep."""
+MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
+"""Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides the light."""
+LOSS_SCALE = 3.0
+"""Residual at which an observation's weight has halved, in medians."""
+RIDGE = 1e-4
+TYPICAL_ALBEDO = 0.36
+"""Of skin (green), which sets the level of an estimated light; exposure and the eyedropper correct it."""
+HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
+"""Residuals from which on the light is too hard to be taken away, and at which albedo is damped most."""
+MAX_DAMPING = 0.6
+CARD_REFLECTANCE = 0.18
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a capture's light.
+
+    radiance   (9, 3) harmonics in the capture's axes; None: estimated
+    card       (K, 3) linear colors that a gray card of 18 % shows at the face, facing `toward`, or a gray ball where its
+               normal is that; None: the level is unknown
+    toward     (K, 3) unit vectors
+    """
+
+    radiance: np.ndarray | None = None
+    card: np.ndarray | None = None
+    toward: np.ndarray | None = None
+
+
+def estimate_light(capture: Capture, known: Known = Known(), report: Report = ignore) -> AvatarLight:
+    """The light of the capture and how its neutral mesh receives light. Raises StgaError without training views."""
+    if not capture.views.get("train"):
+        raise StgaError(f"{capture.root}: has no training views, from which its light could be estimated")
+    transfer, occlusion = transfer_of(capture.neutral, capture.faces)
+    observed = observe(capture, report)
+    by_face = transfer[capture.faces].mean(1)
+    radiance, residual = fit_light(observed, by_face, known.radiance)
+    source = "estimated"
+    if known.radiance is not None:
+        source = "file"
+    elif known.card is not None:
+        assert known.toward is not None
+        radiance, source = _level_with(radiance, known.card, known.toward), "gray_card"
+    mean = np.mean([transfer @ rotated(radiance, rotation) for rotation in observed.rotation], axis=0)
+    mean = np.maximum(mean, 0)
+    irradiance = mean + Bounce(capture.neutral, capture.faces, occlusion).light(mean)
+    damping = MAX_DAMPING * float(np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1))
+    return AvatarLight(
+        radiance=radiance.astype(np.float32),
+        transfer=transfer,
+        occlusion=occlusion,
+        irradiance=irradiance.astype(np.float32),
+        roughness=wet_roughness(capture.neutral, capture.faces),
+        residual=residual,
+        damping=round(damping, 3),
+        source=source,
+    )
+
+
+def fit_light(observed: Observed, transfer: np.ndarray, given: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Radiance (9, 3) in the world's axes and residual; transfer (F, 9) of triangles. given: only the residual is new.
+
+    Minimizes Σ w (color − albedo · transfer · radiance)² over triangles and timesteps, alternating between light and
+    albedo, which is drawn to the median; weights w are those of the Cauchy loss. The level is such that the median
+    albedo is TYPICAL_ALBEDO in an even, white light: mean irradiance is the same in all channels.
+    """
+    color = observed.color
+    # transfer · rotated(radiance) as a matrix of radiance in the world's axes
+    turns = np.stack([rotated(np.eye(COUNT), rotation) for rotation in observed.rotation])
+    received = np.einsum("fk,tkl->tfl", transfer, turns)
+    usable = np.isfinite(color[..., 0]) & (transfer[:, 0] > MIN_OPEN_TRANSFER)
+    if usable.sum() < 10 * COUNT:
+        raise StgaError("light: too few triangles are seen in the images to estimate it")
+    color, received = color[usable], received[usable]
+    face = np.broadcast_to(np.arange(len(transfer)), usable.shape)[usable]
+    radiance = uniform(np.ones(3) / np.pi) if given is None else given
+    weight = np.ones_like(color)
+    for _ in range(ITERATIONS):
+        arriving = np.maximum(received @ radiance, 0.02 * (received @ radiance).mean(0))
+        typical = np.median(color / arriving, axis=0)
+        albedo = _albedo(color, arriving, weight, face, typical, len(transfer), len(turns))
+        error = np.abs(color - albedo * arriving)
+        weight = 1 / (1 + (error / (LOSS_SCALE * np.median(error, axis=0) + 1e-9)) ** 2)
+        if given is None:
+            radiance = _solve(color, received, albedo, weight)
+    residual = float(1.4826 * np.median(error / np.maximum(color, 1e-3)))
+    if given is None:
+        mean = (received @ radiance).mean(0)
+        radiance = radiance / mean * (typical * mean)[1] * np.pi / TYPICAL_ALBEDO
+    return radiance, residual
+
+
+def _albedo(
+    color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray, typical: np.ndarray, faces: int,
+    times: int,
+) -> np.ndarray:  # fmt: skip
+    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical` by the prior."""
+    prior = PRIOR * times * (arriving**2).mean(0)
+    found = np.empty_like(color)
+    for k in range(3):
+        upper = np.bincount(face, weight[:, k] * color[:, k] * arriving[:, k], faces) + prior[k] * typical[k]
+        lower = np.bincount(face, weight[:, k] * arriving[:, k] ** 2, faces) + prior[k]
+        found[:, k] = (upper / lower)[face]
+    return found
+
+
+def _solve(color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(9, 3) radiance with the least weighted error, slightly drawn to 0."""
+    found = np.empty((COUNT, 3))
+    for k in range(3):
+        rows = received * (albedo[:, k] * np.sqrt(weight[:, k]))[:, None]
+        matrix = rows.T @ rows
+        ridge = RIDGE * np.trace(matrix) / COUNT * np.eye(COUNT)
+        found[:, k] = np.linalg.solve(matrix + ridge, rows.T @ (color[:, k] * np.sqrt(weight[:, k])))
+    return found
+
+
+def _level_with(radiance: np.ndarray, card: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """The light at the level and white balance at which gray that faces `toward` (K, 3) shows the colors (K, 3)."""
+    arriving = (basis(toward) * LAMBERT @ radiance).mean(0)
+    return np.asarray(radiance * (np.pi * card.mean(0) / CARD_REFLECTANCE / np.maximum(arriving, 1e-6)))

@@ -1,0 +1,193 @@
+"""Colors of an avatar's splats under the light of a scene."""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from ..avatar.embedding import face_frames
+from ..avatar.file import Avatar
+from ..avatar.splats import SH_C0
+from ..capture.color import linear_to_srgb, srgb_to_linear
+from ..capture.rigid import weighted_procrustes
+from ..errors import StgaError
+from .bounce import Bounce
+from .harmonics import GLOSSY, basis, even_directions, rotated, sh_color
+from .lamps import Lamps
+from .shadows import LIFT_M
+from .surface import at_splats, barycentric, vertex_normals
+from .values import Caster, Lighting
+
+REFLECTANCE = 0.04
+"""Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
+MIN_IRRADIANCE = 0.15
+"""Least irradiance of the capture that color is divided by, as a share of its mean: what was darker is noise."""
+HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.1
+"""Part of what arrived in the capture that came back as highlights, which is taken from the recorded colors; at least
+MIN_DIFFUSE_SHARE of them remains."""
+VIEW_DIRECTIONS, MIN_VIEW_COSINE = 96, 0.3
+"""Recorded colors are means over as many directions from which a splat's surface is seen."""
+
+
+class Relighter:
+    """An avatar whose file holds its light (`Avatar.light`), ready to be lit by a scene; made once, used every frame.
+
+    What a GPU needs to do the same, all float32 and by splat: `albedo`, `transfer`, `occlusion`, `roughness`, `normal`.
+    Raises StgaError where the avatar has no light.
+    """
+
+    def __init__(self, avatar: Avatar) -> None:
+        if avatar.light is None:
+            raise StgaError("the avatar does not know the light of its capture; `stga relight RUN` estimates it")
+        self.avatar, self.light = avatar, avatar.light
+        self.corners = np.ascontiguousarray(avatar.faces[avatar.splats.face])
+        self.weights = barycentric(avatar).astype(np.float32)
+
+    @cached_property
+    def transfer(self) -> np.ndarray:
+        """(N, 9) as `AvatarLight.transfer`."""
+        return self._at_splats(self.light.transfer)
+
+    @cached_property
+    def occlusion(self) -> np.ndarray:
+        """(N,) share of the sky that is open."""
+        return self._at_splats(self.light.occlusion[:, None])[:, 0]
+
+    @cached_property
+    def roughness(self) -> np.ndarray:
+        """(N,) of highlights; 0: that of the lighting."""
+        return self._at_splats(self.light.roughness[:, None])[:, 0]
+
+    @cached_property
+    def irradiance(self) -> np.ndarray:
+        """(N, 3) of the capture, which recorded colors are divided by."""
+        arriving = self._at_splats(self.light.irradiance)
+        return np.maximum(arriving, MIN_IRRADIANCE * self.light.irradiance.mean(0))
+
+    @cached_property
+    def albedo(self) -> np.ndarray:
+        """(N, 3) linear, of the neutral mesh (without color by strain)."""
+        return self._albedo(self.diffuse_color)
+
+    @cached_property
+    def diffuse_color(self) -> np.ndarray:
+        """(N, 3) recorded sRGB without what depends on the view: mean over directions from which a splat is seen."""
+        sh = self.avatar.splats.sh
+        constant = (0.5 + SH_C0 * sh[:, 0]).astype(np.float32)
+        if sh.shape[1] == 1:
+            return constant
+        normals = self._at_splats(vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces))
+        total, count = np.zeros_like(constant), np.full((len(constant), 1), 1e-6, np.float32)
+        for direction in even_directions(VIEW_DIRECTIONS):
+            seen = (normals @ direction > MIN_VIEW_COSINE)[:, None]
+            total += np.where(seen, sh_color(sh, np.broadcast_to(-direction, normals.shape)), 0)
+            count += seen
+        return np.where(count > 0.5, total / count, constant)
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """(N, 3) the mesh's smooth normal at the splat, in the axes of its triangle (`FaceFrames.rotation`)."""
+        mesh = self.avatar.neutral.astype(np.float64)
+        frames = face_frames(mesh, self.avatar.faces, mesh, self.avatar.convention)
+        normals = self._unit(self._at_splats(vertex_normals(mesh, self.avatar.faces)))
+        return np.einsum("nji,nj->ni", frames.rotation[self.avatar.splats.face], normals).astype(np.float32)
+
+    def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
+        """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh` (V, 3): what
+        `transfer` is multiplied with."""
+        rotation, _ = weighted_procrustes(np.asarray(mesh, np.float64), self.avatar.neutral, self._rigid)
+        return rotated(world, rotation)
+
+    def colors(
+        self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
+    ) -> np.ndarray:
+        """(N, 3) float32 sRGB of the splats, not clipped above 1: the `sh` of degree 0 is (color − 0.5) / SH_C0.
+
+        mesh: (V, 3) posed. eye: (3,) position of the camera. All in meters of the avatar's space.
+        """
+        return linear_to_srgb(self.radiance(mesh, eye, lighting, casters)).astype(np.float32)
+
+    def radiance(
+        self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
+    ) -> np.ndarray:
+        """(N, 3) float32: the same before sRGB's curve, for a scene's own color management."""
+        share = {"recorded": 0.0, "mix": lighting.mix, "scene": 1.0}[lighting.mode]
+        if not share:
+            return self._recorded(mesh, eye)
+        lit = self._lit(np.asarray(mesh, np.float64), np.asarray(eye, np.float64), lighting, casters)
+        lit *= np.float32(2**lighting.exposure) / np.asarray(lighting.white, np.float32)
+        return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
+
+    def _lit(self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]) -> np.ndarray:
+        vertex_normal = vertex_normals(mesh, self.avatar.faces)
+        points, normals = self._at_splats(mesh), self._unit(self._at_splats(vertex_normal))
+        world = self.world_in_head(mesh, lighting.world).astype(np.float32)
+        lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
+        at_vertices = np.maximum(self.light.transfer @ world, 0)
+        at_vertices += lamps.irradiance(mesh + LIFT_M * vertex_normal, vertex_normal)
+        roughness = np.where(self.roughness > 0, self.roughness, np.float32(max(lighting.roughness, 0.05)))
+        arriving, highlight = lamps.shade(points + LIFT_M * normals, normals, eye, roughness, REFLECTANCE)
+        arriving += np.maximum(self.transfer @ world, 0) + self._at_splats(self.bounce.light(at_vertices))
+        highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
+        albedo = self._albedo(self.diffuse_color + self._strain_color(mesh)) if self._strained else self.albedo
+        return albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight
+
+    def _sky_highlight(
+        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray, roughness: np.ndarray
+    ) -> np.ndarray:
+        """(N, 3) of the world: its mean radiance around the mirrored direction times the lobe's reflectance (Karis
+        2014)."""
+        if not np.any(world):
+            return np.zeros_like(points)
+        view = self._unit(eye.astype(np.float32) - points)
+        cosine = np.maximum((normals * view).sum(1), np.float32(0.02))
+        seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ (GLOSSY[:, None] * world), 0)
+        x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
+        z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
+        share = np.minimum(x * x, 2 ** (-9.28 * cosine)) * x + y
+        reflected = REFLECTANCE * (z - 1.04 * share) + 1.04 * share + w
+        return (seen * (reflected * self.occlusion)[:, None]).astype(np.float32)
+
+    def _albedo(self, color: np.ndarray) -> np.ndarray:
+        """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
+        linear = srgb_to_linear(np.maximum(color, 0))
+        highlight = HIGHLIGHT_SHARE * self.irradiance / np.pi
+        albedo = np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
+        damping = self.light.damping
+        if damping:
+            typical = np.exp(np.log(np.maximum(albedo, 1e-4)).mean(0))
+            albedo = np.maximum(albedo, 1e-4) ** (1 - damping) * typical**damping
+        return albedo.astype(np.float32)
+
+    @property
+    def _strained(self) -> bool:
+        return self.avatar.splats.strain_color.shape[1] > 0
+
+    def _strain_color(self, mesh: np.ndarray) -> np.ndarray:
+        splats = self.avatar.splats
+        return np.einsum("ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color)
+
+    def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
+        """(N, 3) linear colors as trained, seen from `eye`."""
+        splats, direction = self.avatar.splats, self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
+        color = sh_color(splats.sh, direction)
+        if self._strained:
+            color = color + self._strain_color(mesh)
+        return srgb_to_linear(np.maximum(color, 0)).astype(np.float32)
+
+    @cached_property
+    def bounce(self) -> Bounce:
+        """Light that the head reflects onto itself."""
+        return Bounce(self.avatar.neutral, self.avatar.faces, self.light.occlusion)
+
+    @cached_property
+    def _rigid(self) -> np.ndarray:
+        """(V,) weights of vertices that say how the head is turned: open ones, which the jaw moves least."""
+        return np.asarray(self.light.occlusion, np.float64) + 1e-3
+
+    def _at_splats(self, values: np.ndarray) -> np.ndarray:
+        return at_splats(values, self.corners, self.weights)
+
+    @staticmethod
+    def _unit(vectors: np.ndarray) -> np.ndarray:
+        return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)

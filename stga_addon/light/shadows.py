@@ -1,0 +1,98 @@
+"""Shadow maps: what a light sees of a head and of other objects."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .values import Caster, Light
+
+MAP_SIZE = 512
+"""Texels a side of a light's shadow map, which just holds the head."""
+LIFT_M = 0.002
+"""Points are lifted off the surface by as much along its normal, so that it does not shade itself."""
+BIAS_M, MAX_BIAS_M = 0.001, 0.006
+"""A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the taps, at most
+MAX_BIAS_M."""
+TAP_STEP = 2.0
+"""Texels between the 3 × 3 places that are looked up, for a soft edge about as wide as a splat."""
+Projection = Callable[[np.ndarray], np.ndarray]
+"""Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light cannot see them."""
+
+
+def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
+    """How a light sees space: parallel for a sun, else in perspective from its position, around the head.
+
+    A light inside the sphere around the head sees it under a wide angle, and loses what lies behind it.
+    """
+    center = (vertices.max(0) + vertices.min(0)) / 2
+    radius = float(np.linalg.norm(vertices - center, axis=1).max()) * 1.01 + 4 * LIFT_M
+    if light.kind == "sun":
+        forward, distance, scale = light.direction, np.inf, size / 2 / radius
+    else:
+        forward = center - light.position
+        distance = float(np.linalg.norm(forward))
+        forward = forward / max(distance, 1e-9)
+        slope = radius / np.sqrt(max(distance**2 - radius**2, (0.3 * radius) ** 2))
+        scale = size / 2 / slope
+    across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
+    origin = center if light.kind == "sun" else light.position
+
+    def project(points: np.ndarray) -> np.ndarray:
+        local = (points - origin) @ axes
+        if light.kind != "sun":
+            depth = local[:, 2:]
+            local[:, :2] /= np.where(depth > 1e-4, depth, np.nan)
+        local[:, :2] = local[:, :2] * scale + size / 2
+        return np.asarray(local, np.float32)
+
+    return project
+
+
+class ShadowMap:
+    """A light's depth map of a posed head (V, 3) meters and of other objects."""
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        light: Light,
+        casters: Sequence[Caster] = (),
+        size: int = MAP_SIZE,
+    ) -> None:
+        from ..raster.cpu.shadow import add_depths
+
+        self._project = light_projection(vertices, light, size)
+        self._light, self._texel_m = light, 2 * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2 / size
+        self.depth = np.full((size, size), np.inf, np.float32)
+        add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
+        for caster in casters:
+            add_depths(self._project(caster.vertices), np.ascontiguousarray(caster.faces, np.int32), self.depth)
+
+    def lit(
+        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP, normals: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the surface.
+
+        normals (N, 3): of the surface there, which make `bias` larger on slopes.
+        """
+        from ..raster.cpu.shadow import lit_shares
+
+        found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
+        if normals is not None:
+            biases = self._slope_bias(points, normals, bias, step)
+        places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
+        lit_shares(self.depth, places, biases, np.float32(step), found)
+        return found
+
+    def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:
+        """(N,) float32 meters."""
+        if self._light.kind == "sun":
+            cosine = -(normals @ self._light.direction)
+        else:
+            away = self._light.position - points
+            cosine = (normals * away).sum(1) / np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        cosine = np.clip(cosine, 0.05, 1)
+        slope = np.sqrt(1 - cosine**2) / cosine
+        return np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)).astype(np.float32)

@@ -1,0 +1,69 @@
+"""Depth maps of triangles as a light sees them, and which points they leave lit."""
+
+import math
+
+import numpy as np
+
+from . import jit
+from .threads import parallel
+
+ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+
+
+@jit
+def add_depths(points, faces, depth):
+    """Draw triangles into a depth map (S, S) float32, which keeps the least depth at each texel's center.
+
+    points (V, 3) float32: x and y in texels, depth; triangles with a point that is not finite are left out.
+    """
+    size = len(depth)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = points[a, 0], points[a, 1], points[a, 2]
+        bx, by, bz = points[b, 0] - ax, points[b, 1] - ay, points[b, 2] - az
+        cx, cy, cz = points[c, 0] - ax, points[c, 1] - ay, points[c, 2] - az
+        area = bx * cy - by * cx
+        if not (abs(area) > np.float32(1e-12)):
+            continue
+        low_x, high_x = ax + min(ZERO, bx, cx), ax + max(ZERO, bx, cx)
+        low_y, high_y = ay + min(ZERO, by, cy), ay + max(ZERO, by, cy)
+        if high_x < ZERO or high_y < ZERO or low_x > size or low_y > size:
+            continue
+        x0, x1 = max(0, math.ceil(low_x - HALF)), min(size - 1, math.floor(high_x - HALF))
+        y0, y1 = max(0, math.ceil(low_y - HALF)), min(size - 1, math.floor(high_y - HALF))
+        inverse = ONE / area
+        for y in range(y0, y1 + 1):
+            dy = np.float32(y) + HALF - ay
+            for x in range(x0, x1 + 1):
+                dx = np.float32(x) + HALF - ax
+                u, v = (dx * cy - dy * cx) * inverse, (bx * dy - by * dx) * inverse
+                if u >= ZERO and v >= ZERO and u + v <= ONE:
+                    z = az + u * bz + v * cz
+                    if z < depth[y, x]:
+                        depth[y, x] = z
+
+
+@parallel(lambda depth, points, *_: len(points))
+@jit
+def lit_shares(begin, end, depth, points, bias, step, lit):
+    """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not block it.
+
+    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block. step: texels between the
+    3 × 3 places that are looked up bilinearly around a point; 0: one place.
+    """
+    size, reach = len(depth), 1 if step > 0 else 0
+    for n in range(begin, end):
+        found, z = ZERO, points[n, 2] - bias[n]
+        for across in range(-reach, reach + 1):
+            for down in range(-reach, reach + 1):
+                x = points[n, 0] - HALF + np.float32(across) * step
+                y = points[n, 1] - HALF + np.float32(down) * step
+                left, top = math.floor(x), math.floor(y)
+                right_share, lower_share = x - np.float32(left), y - np.float32(top)
+                for k in range(4):
+                    column, row = int(left) + (k & 1), int(top) + (k >> 1)
+                    outside = column < 0 or row < 0 or column >= size or row >= size
+                    if outside or z <= depth[row, column]:
+                        weight = right_share if k & 1 else ONE - right_share
+                        found += weight * (lower_share if k >> 1 else ONE - lower_share)
+        lit[n] = found / np.float32((2 * reach + 1) ** 2)

@@ -1,0 +1,156 @@
+"""Irradiance of lights against closed forms and Blender's path tracer, shadows against cast rays."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from light.scenes import ball_and_plate, blocked
+from stga_addon.light.lamps import Lamps
+from stga_addon.light.shadows import LIFT_M
+from stga_addon.light.surface import vertex_normals
+from stga_addon.light.values import Caster, Light, Lighting
+
+NO_FACES = np.zeros((0, 3), np.int32)
+AROUND = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
+UP = np.array([[0.0, 0.0, 1.0]])
+TILTED = Light("area", np.ones(3) * 40, (0.3, 0.2, 0.6), direction=(-0.3, -0.2, -0.6), size=(0.4, 0.3))
+CASES = {
+    "sun": Light("sun", np.ones(3) * 3, direction=(-1, 0, -1)),
+    "point": Light("point", np.ones(3) * 100, (0.5, 0.5, 2)),
+    "spot": Light("spot", np.ones(3) * 100, (0, 0, 2), direction=(0.25, 0, -1), cone=1.0, blend=0.6),
+    "area": TILTED,
+    "disk": Light("area", np.ones(3) * 40, (0, 0.2, 0.8), direction=(0, 0, -1), size=(0.5, 0.5), shape="ellipse"),
+}
+
+
+def irradiance(light: Light) -> float:
+    lamps = Lamps(Lighting(lights=(light,)), AROUND, NO_FACES)
+    return float(lamps.irradiance(np.zeros((1, 3)), UP)[0, 1])
+
+
+def test_units_are_blenders():
+    """Catches a wrong factor of π, and a cosine or distance that is left out."""
+    assert irradiance(CASES["sun"]) == pytest.approx(3 * np.sqrt(0.5), rel=1e-5)
+    square = 0.25 + 0.25 + 4
+    assert irradiance(CASES["point"]) == pytest.approx(100 / (4 * np.pi) / square * 2 / np.sqrt(square), rel=1e-5)
+    small = Light("area", np.ones(3) * 100, (0, 0, 2), size=(0.01, 0.01))
+    assert irradiance(small) == pytest.approx(100 / np.pi / 4, rel=1e-4)
+
+
+PATH_TRACER = """
+import json, sys
+import bpy, mathutils, numpy as np
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 256, 0
+scene.cycles.use_denoising = False
+scene.render.resolution_x = scene.render.resolution_y = 8
+scene.view_settings.view_transform, scene.render.image_settings.file_format = "Raw", "OPEN_EXR"
+scene.world = bpy.data.worlds.new("w")
+scene.world.use_nodes = True
+scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0
+mesh = bpy.data.meshes.new("plane")
+mesh.from_pydata([(-.01, -.01, 0), (.01, -.01, 0), (.01, .01, 0), (-.01, .01, 0)], [], [(0, 1, 2, 3)])
+scene.collection.objects.link(bpy.data.objects.new("plane", mesh))
+material = bpy.data.materials.new("white")
+material.use_nodes = True
+nodes = material.node_tree.nodes
+nodes.clear()
+white, out = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
+white.inputs[0].default_value = (1, 1, 1, 1)
+material.node_tree.links.new(white.outputs[0], out.inputs[0])
+mesh.materials.append(material)
+camera = bpy.data.cameras.new("c")
+camera.type, camera.ortho_scale = "ORTHO", 0.004
+scene.camera = bpy.data.objects.new("c", camera)
+scene.camera.location = (0, 0, 0.5)
+scene.collection.objects.link(scene.camera)
+found = {}
+for name, values in json.loads(sys.argv[1]).items():
+    lamp = bpy.data.lights.new(name, values["kind"].upper())
+    for key, value in values["settings"].items():
+        setattr(lamp, key, value)
+    ob = bpy.data.objects.new(name, lamp)
+    scene.collection.objects.link(ob)
+    z = -mathutils.Vector(values["direction"]).normalized()
+    x = mathutils.Vector(values["tangent"]).normalized()
+    ob.matrix_world = mathutils.Matrix((x, z.cross(x), z)).transposed().to_4x4()
+    ob.matrix_world.translation = values["position"]
+    scene.render.filepath = sys.argv[2]
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(sys.argv[2])
+    found[name] = float(np.array(image.pixels[:]).reshape(8, 8, 4)[..., 1].mean() * np.pi)
+    bpy.data.images.remove(image)
+    bpy.data.objects.remove(ob)
+print("FOUND" + json.dumps(found))
+"""
+
+
+def blender_light(light: Light) -> dict:
+    across = np.cross(light.direction, (0.0, 1.0, 0.0))
+    settings = {"energy": float(light.color[1])}
+    if light.kind == "area":
+        shape = "ELLIPSE" if light.shape == "ellipse" else "RECTANGLE"
+        settings |= {"shape": shape, "size": light.size[0], "size_y": light.size[1]}
+    if light.kind == "spot":
+        settings |= {"spot_size": light.cone, "spot_blend": light.blend, "shadow_soft_size": 0.0}
+    if light.kind == "point":
+        settings |= {"shadow_soft_size": 0.0}
+    vectors = {"direction": light.direction.tolist(), "position": light.position.tolist(), "tangent": across.tolist()}
+    return {"kind": light.kind, "settings": settings, **vectors}
+
+
+@pytest.mark.slow
+def test_irradiance_is_the_path_tracers(tmp_path):
+    """Catches a light whose fall-off, cone or area differs from what Cycles shows, beyond 2 %."""
+    pytest.importorskip("bpy")
+    import json
+    from dataclasses import replace
+
+    cases = {n: replace(v, tangent=np.cross(v.direction, (0.0, 1.0, 0.0))) for n, v in CASES.items()}
+    wanted = json.dumps({name: blender_light(light) for name, light in cases.items()})
+    command = [sys.executable, "-c", PATH_TRACER, wanted, str(tmp_path / "x.exr")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.split("FOUND")[1].splitlines()[0])
+    for name, light in cases.items():
+        assert irradiance(light) == pytest.approx(found[name], rel=0.02), name
+
+
+@pytest.mark.parametrize(
+    "light",
+    [Light("sun", np.ones(3), direction=(-0.3, -1, 0.1)), Light("point", np.ones(3), (0.3, 0.8, 0.2))],
+    ids=["sun", "point"],
+)
+def test_shadows_are_those_of_cast_rays(light):
+    """Catches shadow maps in which the surface shades itself, that miss the plate, or put its shadow elsewhere."""
+    vertices, faces = ball_and_plate(3)
+    normals = vertex_normals(vertices, faces)
+    points = vertices + LIFT_M * normals
+    to_light = -np.broadcast_to(light.direction, points.shape)
+    if light.kind == "point":
+        to_light = light.position - points
+        to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True)
+    facing = (normals * to_light).sum(1) > 0.1
+    expected = np.array([not blocked(p[None], d, vertices, faces)[0] for p, d in zip(points, to_light, strict=True)])
+    assert 0.02 < (facing & ~expected).mean() < 0.5
+    with_shadow = Lamps(Lighting(lights=(light,)), vertices, faces).irradiance(points, normals)[:, 0]
+    without = Lamps(Lighting(lights=(light,), shadows=False), vertices, faces).irradiance(points, normals)[:, 0]
+    lit = with_shadow[facing] / without[facing]
+    assert (np.abs(lit - expected[facing]) > 0.5).mean() < 0.02
+    assert np.abs(lit - expected[facing]).mean() < 0.04
+
+
+def test_another_object_throws_its_shadow():
+    """Catches casters that are ignored, or drawn in another space than the head."""
+    vertices, faces = ball_and_plate(2)
+    ball = faces[(faces < 162).all(1)]
+    sun = Lighting(lights=(Light("sun", np.ones(3), direction=(0, -1, 0)),))
+    top = np.array([[0.0, 0.1 + LIFT_M, 0.0]])
+    up = np.array([[0.0, 1.0, 0.0]])
+    wall = Caster(np.array([[-1.0, 1, -1], [1, 1, -1], [0, 1, 1]]), np.array([[0, 1, 2]]))
+    assert Lamps(sun, vertices[:162], ball).irradiance(top, up)[0, 0] == pytest.approx(1, abs=1e-3)
+    assert Lamps(sun, vertices[:162], ball, [wall]).irradiance(top, up)[0, 0] == pytest.approx(0, abs=1e-3)
