@@ -17,22 +17,25 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[
     are those in the image, without perspective.
     """
     flat, depth = camera.project(vertices)
-    corners, inverse_depth = flat[faces], 1 / np.where(depth > 0, depth, np.nan)[faces]
-    low = np.floor(np.clip(corners.min(1) - 0.5, -1, [camera.width, camera.height]))
-    high = np.ceil(np.clip(corners.max(1) + 0.5, -1, [camera.width, camera.height]))
-    usable = np.isfinite(inverse_depth).all(1)
-    size = np.where(usable[:, None], np.maximum(high - np.maximum(low, 0), 0), 0).astype(np.int64)
-    low = np.maximum(np.nan_to_num(low), 0).astype(np.int64)
+    inverse_depth = 1 / np.where(depth > 0, depth, np.nan)[faces]
+    rows = np.flatnonzero(np.isfinite(inverse_depth).all(1) & np.isfinite(flat[faces]).all((1, 2)))
+    corners = flat[faces[rows]]
+    slopes = _barycentric_slopes(corners)
+    closeness_slopes = (slopes * inverse_depth[rows][:, :, None]).sum(1)
     nearest = np.zeros(camera.width * camera.height)
-    triangle = np.full(len(nearest), -1, np.int32)
-    weights = np.zeros((len(nearest), 3))
-    for rows in _chunks(size.prod(1)):
-        pixel, face, inside = _covered(rows, size[rows], low[rows], corners, camera)
-        closeness = (inside * inverse_depth[face]).sum(1)
-        order = np.argsort(closeness, kind="stable")  # of equal pixels, the last assignment counts: the nearest
-        order = order[closeness[order] > nearest[pixel[order]]]
-        nearest[pixel[order]], triangle[pixel[order]] = closeness[order], face[order]
-        weights[pixel[order]] = inside[order]
+    owner = np.full(len(nearest), -1)
+    for group in _chunks(corners, camera):
+        face, x, y = _covered(group, corners, camera)
+        closeness = _at(closeness_slopes[face], x, y)
+        pixel = y * camera.width + x
+        np.maximum.at(nearest, pixel, closeness)
+        wins = (closeness > 0) & (closeness == nearest[pixel])  # of several triangles at one depth, the last
+        owner[pixel[wins]] = face[wins]
+    shown = np.flatnonzero(owner >= 0)
+    triangle, weights = np.full(len(nearest), -1, np.int32), np.zeros((len(nearest), 3))
+    triangle[shown] = rows[owner[shown]]
+    y, x = np.divmod(shown, camera.width)
+    weights[shown] = np.maximum(_at(slopes[owner[shown]], x[:, None], y[:, None]), 0)
     shape = camera.height, camera.width
     return triangle.reshape(shape), weights.reshape(*shape, 3)
 
@@ -50,32 +53,73 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
     return np.asarray(picture)
 
 
-def _chunks(candidates: np.ndarray) -> list[np.ndarray]:
-    """Triangles with any candidate pixel, in groups of about CHUNK_PIXELS."""
-    rows = np.flatnonzero(candidates)
-    groups = np.cumsum(candidates[rows]) // CHUNK_PIXELS
-    return [rows[groups == group] for group in np.unique(groups)]
+def _chunks(corners: np.ndarray, camera: Camera) -> list[np.ndarray]:
+    """Triangles (T, 3, 2) that may show a pixel, in groups whose bounding boxes hold about CHUNK_PIXELS."""
+    low, high = corners.min(1), corners.max(1)
+    size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
+    drawn = np.flatnonzero((size >= 0).all(1))
+    groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
+    return np.split(drawn, np.flatnonzero(np.diff(groups)) + 1)
 
 
-def _covered(
-    rows: np.ndarray, size: np.ndarray, low: np.ndarray, corners: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel index, triangle and barycentric coordinates (M, 3) of each pixel center that lies in a triangle."""
-    count = size.prod(1)
-    face = np.repeat(rows, count)
-    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    width = np.repeat(size[:, 0], count)
-    start = np.repeat(low, count, axis=0)
-    x, y = start[:, 0] + place % width, start[:, 1] + place // width
-    a, b, c = (corners[face, k] for k in range(3))
-    center = np.stack([x, y], -1) + 0.5
-    area = _cross(b - a, c - a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        second, third = _cross(center - a, c - a) / area, _cross(b - a, center - a) / area
-    inside = np.stack([1 - second - third, second, third], -1)
-    keep = (inside >= 0).all(1) & (x < camera.width) & (y < camera.height)
-    return (y * camera.width + x)[keep], face[keep], inside[keep]
+def _covered(group: np.ndarray, corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangle, x and y of each pixel center that lies in a triangle of the group, or on its edge.
+
+    Pixel by pixel along the lines of the image that cross a triangle, between its edges.
+    """
+    face, y = _counted(group, *_whole(corners[group, :, 1].min(1), corners[group, :, 1].max(1), camera.height))
+    left, right = _crossings(corners, face, y + 0.5)
+    line, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
+    return face[line], x, y[line]
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+def _whole(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first pixel with its center from `low` to `high`, inside an image of this size, and how many there are."""
+    first = np.ceil(np.clip(low, 0, size + 1) - 0.5).astype(np.int64)
+    last = np.floor(np.clip(high, -1, size) - 0.5).astype(np.int64)
+    return first, np.maximum(np.minimum(last, size - 1) - first + 1, 0)
+
+
+def _counted(values: np.ndarray, first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each value `count` times, and numbers that count from its `first`."""
+    begin = np.cumsum(count) - count
+    return np.repeat(values, count), np.arange(count.sum()) + np.repeat(first - begin, count)
+
+
+def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y (R,).
+
+    An edge's ends are taken in the order of y, so that two triangles with a common edge agree where it lies to the
+    last bit and leave no pixel between them.
+    """
+    left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        first, second = corners[:, a], corners[:, b]
+        turned = second[:, 1] < first[:, 1]
+        x0, y0 = np.where(turned, second.T, first.T)
+        x1, y1 = np.where(turned, first.T, second.T)
+        slope = np.divide(x1 - x0, y1 - y0, out=np.zeros_like(x0), where=y1 > y0)
+        top = y0[face]
+        x = x0[face] + slope[face] * (y - top)
+        crosses = (top <= y) & (y <= y1[face])
+        np.minimum(left, x, out=left, where=crosses)
+        np.maximum(right, x, out=right, where=crosses)
+    return left, right
+
+
+def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
+    """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y + [k, 2].
+
+    Zero for triangles that are seen edge-on.
+    """
+    x, y = corners[..., 0] - 0.5, corners[..., 1] - 0.5
+    along_x, along_y = np.roll(y, -1, 1) - np.roll(y, 1, 1), np.roll(x, 1, 1) - np.roll(x, -1, 1)
+    constant = -(along_x * np.roll(x, -1, 1) + along_y * np.roll(y, -1, 1))
+    area = _at(np.stack([along_x[:, 0], along_y[:, 0], constant[:, 0]], -1), x[:, 0], y[:, 0])
+    with np.errstate(divide="ignore"):
+        inverse = np.where(area != 0, 1 / area, 0.0)
+    return np.stack([along_x, along_y, constant], -1) * inverse[:, None, None]
+
+
+def _at(slopes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.asarray(slopes[..., 0] * x + slopes[..., 1] * y + slopes[..., 2])

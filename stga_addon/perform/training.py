@@ -23,6 +23,7 @@ from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
 from ..training.effects.decisions import TRACKING
 from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from ..training.optimize.flame_refinement import with_refined_tracking
+from ..training.optimize.precompile import begin_compiling
 from ..training.run.continuation import continued_settings, select_for_takes
 from ..training.run.folder import AVATAR, Continuation, Run, Take, has_run, read_run
 from ..training.run.identity import file_digest, identity_of
@@ -140,6 +141,7 @@ def _as_progress(progress: TrainingProgress) -> Progress:
 def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     if not request.capture.is_dir():
         raise StgaError(f"{request.capture}: is not a folder; expected that of a capture")
+    begin_compiling()
     device, why = choose_device(request.device)
     capture = open_capture(request.capture, request.flame, request.principal_point)
     settings = request.settings

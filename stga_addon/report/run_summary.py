@@ -29,12 +29,16 @@ CURVE = "curve.png"
 MAX_DRAWING_SHARE = 0.01
 """Largest share of the time that drawing the curve may take while a run trains."""
 
+FIRST_DRAWING_S = 30.0
+"""Seconds until the first: loading the library takes a few, while the user waits for the first preview."""
+
 
 class CurveUpdater:
     """Keeps the curve in a run's folder up to date; call it as often as convenient."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._drawn_size, self._next_update = folder, -1, 0.0
+        self._folder, self._drawn_size = folder, -1
+        self._next_update = perf_counter() + FIRST_DRAWING_S
 
     def __call__(self) -> None:
         now = perf_counter()

@@ -108,11 +108,12 @@ def test_too_short_a_reach_would_be_noticed() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
-@pytest.mark.parametrize("bands", [1, 3, 4, 16])
-def test_bands_tile_the_image(height: int, width: int, bands: int) -> None:
-    """Catches a row that two bands or none covers, and an empty band where the image has fewer rows than bands."""
+@pytest.mark.parametrize("parts", [(1, 1), (2, 4), (3, 5), (1, 64)])
+def test_rectangles_tile_the_image(height: int, width: int, parts: tuple[int, int]) -> None:
+    """Catches a pixel that two rectangles or none covers, and an empty one where the image has fewer pixels than
+    parts."""
     covered = np.zeros((height, width), int)
-    for x0, y0, x1, y1 in whole_image(height, width, bands):
+    for x0, y0, x1, y1 in whole_image(height, width, parts):
         assert x0 < x1
         assert y0 < y1
         covered[y0:y1, x0:x1] += 1

@@ -10,6 +10,8 @@ from .threads import parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 ROWS_PER_BLOCK = 256
+ROWS_PER_SUM = 1024
+"""Rows that are summed by one thread, so that a sum does not depend on how many threads there are."""
 MAX_GRADIENT = np.float32(1e18)
 """A row with a larger gradient is skipped: its square would make the second moment infinite, and the row NaN."""
 
@@ -103,39 +105,55 @@ def sum_by_triangle(rows, face, gradient, total, trained):
             total[f, c] += gradient[i, c]
 
 
-@jit
 def scale_limit(rows, log_scale, face, unbound, limits, weight, gradient):
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
 
     limits (2, F) per triangle, of bound and of unbound splats, in the unit of the splats' local scale. Returns the
     norm.
     """
-    total = 0.0
-    for n in range(len(rows)):
-        i = rows[n]
-        limit = limits[1 if unbound[i] else 0, face[i]]
-        for c in range(3):
-            over = max(ZERO, math.exp(log_scale[i, c]) - limit)
-            total += over * over
-    norm = math.sqrt(total)
+    sums = np.empty(-(-len(rows) // ROWS_PER_SUM))
+    sum_excess_scale(sums, rows, log_scale, face, unbound, limits)
+    norm = math.sqrt(sums.sum())
     if norm > 0.0:
-        factor = np.float32(weight / norm)
-        for n in range(len(rows)):
-            i = rows[n]
-            limit = limits[1 if unbound[i] else 0, face[i]]
-            for c in range(3):
-                scale = math.exp(log_scale[i, c])
-                gradient[i, c] += factor * max(ZERO, scale - limit) * scale
+        add_excess_scale(rows, log_scale, face, unbound, limits, np.float32(weight / norm), gradient)
     return norm
 
 
+@parallel(lambda sums, *_: len(sums))
 @jit
-def opacity_weight(rows, opacity, share, weight, gradient):
+def sum_excess_scale(first_sum, past_sum, sums, rows, log_scale, face, unbound, limits):
+    """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
+    for k in range(first_sum, past_sum):
+        total = 0.0
+        for n in range(k * ROWS_PER_SUM, min(len(rows), (k + 1) * ROWS_PER_SUM)):
+            i = rows[n]
+            limit = limits[1 if unbound[i] else 0, face[i]]
+            for c in range(3):
+                over = max(ZERO, math.exp(log_scale[i, c]) - limit)
+                total += over * over
+        sums[k] = total
+
+
+@parallel(lambda rows, *_: len(rows))
+@jit
+def add_excess_scale(first_row, past_row, rows, log_scale, face, unbound, limits, factor, gradient):
+    """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
+    for n in range(first_row, past_row):
+        i = rows[n]
+        limit = limits[1 if unbound[i] else 0, face[i]]
+        for c in range(3):
+            scale = math.exp(log_scale[i, c])
+            gradient[i, c] += factor * max(ZERO, scale - limit) * scale
+
+
+@parallel(lambda rows, *_: len(rows))
+@jit
+def opacity_weight(first_row, past_row, rows, opacity, share, weight, gradient):
     """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).
 
     share (N,) float32.
     """
-    for n in range(len(rows)):
+    for n in range(first_row, past_row):
         i = rows[n]
         value = ONE / (ONE + math.exp(-opacity[i]))
         gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)

@@ -1,6 +1,7 @@
 """Rendering on the CPU: splats and a camera to an image, and the image's gradient back to the splats."""
 
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class BufferPool:
 
     def get(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
         """An uninitialized array; the same memory whenever the same name is asked for again."""
-        size = int(np.prod(shape))
+        size = prod(shape)
         buffer = self._buffers.get(name)
         if buffer is None or len(buffer) < size:
             # An eighth to spare, so that a slowly growing count does not allocate every time.

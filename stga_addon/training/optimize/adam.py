@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...capture.camera import Camera
-from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows
 from .state import TrainState
 
@@ -32,19 +31,11 @@ def step(
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    tables = zip(
-        *map(_tables, (state.parameters, state.gradients, state.first, state.second, state.average)), strict=True
-    )
     parameters = []
-    for name, arrays in zip(state.parameters._fields, tables, strict=True):
+    for name, arrays in state.tables.items():
         by_column = np.full(arrays[0].shape[1], rates[name], np.float32)
         if name == "sh":
             by_column[3:] = rates["sh_rest"]
         parameters.append(AdamTables._make((*arrays, by_column)))
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
     adam_rows(rows, state.steps.numpy(), tuple(parameters), options)
-
-
-def _tables(tensors: Parameters) -> tuple[np.ndarray, ...]:
-    """Each tensor as a numpy array (N, D) that shares its memory."""
-    return tuple(t.numpy().reshape(len(t), t[0].numel()) for t in tensors)

@@ -13,10 +13,19 @@ from ..settings import TrainingSettings
 from .hull_points import voxel_size
 
 
-def whole_image(height: int, width: int, bands: int = 4) -> np.ndarray:
-    """Rectangles (bands, 4) of pixels x0, y0, x1, y1 that tile an image; each is one thread's work."""
-    edges = np.linspace(0, height, min(bands, height) + 1).astype(np.int64)
-    return np.array([[0, top, width, bottom] for top, bottom in pairwise(edges)], np.int64)
+def whole_image(height: int, width: int, parts: tuple[int, int] = (2, 4)) -> np.ndarray:
+    """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one thread's work.
+
+    parts: of the image's shorter and of its longer side. Squares are cheapest, because the loss reads beyond their
+    edges.
+    """
+    rows, columns = parts if height <= width else parts[::-1]
+    tops, lefts = (_edges(side, count) for side, count in ((height, rows), (width, columns)))
+    return np.array([[x0, y0, x1, y1] for y0, y1 in pairwise(tops) for x0, x1 in pairwise(lefts)], np.int64)
+
+
+def _edges(side: int, count: int) -> list[int]:
+    return np.linspace(0, side, min(count, side) + 1).astype(int).tolist()
 
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +33,10 @@ def precompile_kernels(device: str = "cpu") -> None:
     """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
-    second process compiles half of them at the same time, because Numba compiles one function at a time per process.
+    second process compiles half of them at the same time (`begin_compiling`), because Numba compiles one function at a
+    time per process.
     """
-    helper = _second_process()
+    helper = begin_compiling()
     _render()
     _limit()
     if helper is not None:
@@ -50,8 +52,11 @@ def precompile_kernels(device: str = "cpu") -> None:
         compile_kernels(Device(adapter_name(device)))
 
 
-def _second_process() -> "subprocess.Popen[bytes] | None":
-    """A process that runs `_second_half`; None if it is cached already or a second process would not help."""
+@cache
+def begin_compiling() -> "subprocess.Popen[bytes] | None":
+    """The process that runs `_second_half`, started by the first call, while this one analyzes the capture; None if the
+    kernels are cached already or a second process would not help.
+    """
     cached = any(Path(KERNEL_CACHE_FOLDER).glob("*/image_loss.image_loss-*.nbi"))
     # As part of an extension, the package has another name and another cache.
     if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):

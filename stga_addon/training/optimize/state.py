@@ -2,6 +2,9 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import Field, dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -65,6 +68,18 @@ class TrainState:
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    @cached_property
+    def tables(self) -> dict[str, tuple[np.ndarray, ...]]:
+        """Parameter -> its values, gradient, moments and average as NumPy arrays (N, D) that share their memory.
+
+        Kept, because asking torch for the arrays in every iteration takes longer than Adam on a small selection.
+        """
+        kept = self.parameters, self.gradients, self.first, self.second, self.average
+        return {
+            name: tuple(t.numpy().reshape(len(t), t[0].numel()) for t in tensors)
+            for name, tensors in zip(self.parameters._fields, zip(*kept, strict=True), strict=True)
+        }
 
     def arrays(self) -> Parameters:
         """The parameters as NumPy arrays that share their memory."""
