@@ -12,6 +12,8 @@ from .arguments import real_number, usable_path, whole_number
 from .carry_out import carry_out
 
 NAME, HELP = "track", "track a head through footage, and write a capture"
+CAN_DOWNLOAD = Path(__file__).parents[1].joinpath("tracking/detector_file.py").exists()
+"""Whether this edition can download the detector: some are built without."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -33,11 +35,12 @@ def add_footage(parser: ArgumentParser) -> None:
     points = parser.add_mutually_exclusive_group()
     points.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")
     points.add_argument("--detector", type=usable_path, metavar="TASK", help="MediaPipe's face_landmarker.task")
-    parser.add_argument(
-        "--download-detector",
-        action="store_true",
-        help="download Google's face_landmarker.task (4 MB) to the file of --detector, where there is none",
-    )
+    if CAN_DOWNLOAD:
+        parser.add_argument(
+            "--download-detector",
+            action="store_true",
+            help="download Google's face_landmarker.task (4 MB) to the file of --detector, where there is none",
+        )
     parser.add_argument("--focal", type=real_number, metavar="PIXELS", help="focal length of a single camera")
     parser.add_argument("--start", type=whole_number(0), default=0, help="first timestep")
     parser.add_argument("--stop", type=whole_number(1), help="timestep to stop before")
@@ -80,7 +83,7 @@ def run(options: Namespace) -> None:
 def tracking_request(options: Namespace, out: Path) -> Track:
     """What `add_footage`'s options ask for, into the folder `out`. Raises StgaError where the detector that is to be
     downloaded has no file."""
-    if options.download_detector:
+    if CAN_DOWNLOAD and options.download_detector:
         from ..tracking.detector_file import download_task
 
         if options.detector is None:
