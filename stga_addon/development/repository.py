@@ -79,11 +79,17 @@ def _row(entry: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m stga_addon.development.repository", description=__doc__)
-    parser.add_argument("zips", type=Path, help="folder of the built zips; the platform edition is left out")
+    parser.add_argument(
+        "zips",
+        type=Path,
+        help="folder of the built zips: those of the complete edition where there are, else the small",
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder of the repository")
     parser.add_argument("--blender", default="blender", help="command that starts a Blender")
     options = parser.parse_args(arguments)
-    zips = sorted(path for path in options.zips.glob("*.zip") if not path.stem.endswith("-platform"))
+    built = sorted(path for path in options.zips.glob("*.zip") if not path.stem.endswith("-platform"))
+    # One edition: Blender takes two zips of one version, platform and range for a mistake.
+    zips = [path for path in built if "-py" in path.stem] or built
     try:
         print(write_repository(zips, options.out, shlex.split(options.blender)))
     except StgaError as error:

@@ -28,7 +28,10 @@ PLATFORM_TAGS = {
         *("manylinux2014_x86_64", "manylinux2010_x86_64", "manylinux1_x86_64"),
     ),
     "windows-x64": ("win_amd64",),
-    "macos-arm64": tuple(f"macosx_{major}_0_{kind}" for major in range(14, 10, -1) for kind in ("arm64", "universal2")),
+    "macos-arm64": (
+        *(f"macosx_{major}_0_{kind}" for major in range(14, 10, -1) for kind in ("arm64", "universal2")),
+        *(f"macosx_10_{minor}_universal2" for minor in range(15, 8, -1)),
+    ),
 }
 """Blender's name of a platform -> tags of wheels that run there: glibc 2.28 and macOS 14 or newer."""
 MARKERS = {
