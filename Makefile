@@ -5,7 +5,7 @@ BIN := .venv/bin
 # are made twice.
 PARALLEL := -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: demo demo-footage test test-fast test-gui lint lint-web fuzz extension clean
+.PHONY: demo demo-footage test test-fast test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -41,6 +41,18 @@ fuzz: .venv/ready
 
 extension: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --out dist
+
+extension-platform: .venv/ready
+	$(BIN)/python -m stga_addon.development.package --edition platform --out dist
+
+# BLENDER: the command that starts a Blender, for the Python of that Blender alone; ALL=1: for every platform
+extension-complete: .venv/ready
+	$(BIN)/python -m stga_addon.development.package --edition complete --out dist \
+		$(if $(BLENDER),--blender '$(BLENDER)') $(if $(ALL),--all)
+
+# The zips of dist as a repository for Blender, in dist/repository
+repository: .venv/ready
+	$(BIN)/python -m stga_addon.development.repository dist --out dist/repository --blender '$(or $(BLENDER),blender)'
 
 .venv/ready: pyproject.toml
 	$(PYTHON) -m venv .venv

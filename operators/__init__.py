@@ -4,6 +4,7 @@ from typing import Any
 
 import bpy
 
+from ..stga_addon.requests.environment_job import CAN_MAKE
 from . import drive, ids, monitor
 from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
@@ -13,7 +14,7 @@ from .continue_run import Extend, Refine
 from .drive import CalibrateLive, DriveLive, FollowLive, MeasureRange, RecordLive, StopLive
 from .drive_video import DriveVideo
 from .drop import AvatarDrop, CaptureDrop, OpenNpz, PerformanceDrop, PlyDrop
-from .environment import MakeEnvironment, TestEnvironment
+from .environment import TestEnvironment
 from .export import ExportAvatar
 from .export_cameras import ExportCameras
 from .export_head_model import ExportHeadModel
@@ -22,6 +23,7 @@ from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
+from .open_demo import OpenDemo
 from .pose import PoseHead
 from .preview_images import PreviewImages
 from .render_video import RenderVideo
@@ -33,12 +35,19 @@ from .track import TrackFootage
 from .track_correct import MarkKey, SolveAgain, ViewFootage
 from .train import Train
 
+MAKE_ENVIRONMENT: tuple[type, ...] = ()
+if CAN_MAKE:
+    from .make_environment import MakeEnvironment
+
+    MAKE_ENVIRONMENT = (MakeEnvironment,)
+
 CLASSES = (
     TrackFootage,
     ViewFootage,
     MarkKey,
     SolveAgain,
     ExportHeadModel,
+    OpenDemo,
     ImportCapture,
     ImportMotion,
     ImportMeshes,
@@ -54,7 +63,7 @@ CLASSES = (
     Cancel,
     Dismiss,
     CopyReport,
-    MakeEnvironment,
+    *MAKE_ENVIRONMENT,
     TestEnvironment,
     PoseHead,
     ShowAvatar,

@@ -1,3 +1,3 @@
 """STGA: selective-training Gaussian head avatars. Importing this package needs nothing but Python."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

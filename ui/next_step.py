@@ -6,6 +6,7 @@ import bpy
 
 from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
+from ..operators.open_demo import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
@@ -40,6 +41,8 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
                 "Import a capture: the tracked head, its cameras and their images. Or track your own footage below",
             )
             layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
+            if OpenDemo.poll(context):
+                layout.operator(ids.OPEN_DEMO, icon="USER")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)
         elif training.is_running:

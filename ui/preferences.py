@@ -7,6 +7,7 @@ import bpy
 from ..operators import ids, monitor
 from ..operators.common import register_classes, unregister_classes
 from ..operators.training_python import has_training_python
+from ..stga_addon.requests.environment_job import CAN_MAKE
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import PYTHON_VARIABLE
@@ -64,7 +65,8 @@ def _draw_environment(box: Any, context: Any, stored: Any) -> None:
         box.label(text=environment.snapshot.status.message, icon="CHECKMARK")
     elif not has_training_python(context):
         box.label(text="No training environment yet", icon="INFO")
-    box.operator(ids.MAKE_ENVIRONMENT, text="Make Training Environment…", icon="IMPORT")
+    if CAN_MAKE:
+        box.operator(ids.MAKE_ENVIRONMENT, text="Make Training Environment…", icon="IMPORT")
 
 
 def register() -> None:

@@ -133,7 +133,7 @@ def _inputs(options: Namespace) -> dict[str, Any]:
 
 def _write_blend(out: Path) -> Path | None:
     if find_spec("bpy") is None:
-        print("warning: no .blend file: this Python has no bpy (pip install bpy, or run the command in Blender)")
+        print("warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)")
         return None
     from ..training.optimize.flame_refinement import with_refined_tracking
 

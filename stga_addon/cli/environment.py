@@ -9,9 +9,10 @@ import sys
 import time
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import Any
 
 from ..errors import StgaError
-from ..requests.environment_job import check_python, make_arguments, remove_environment, store_choice
+from ..requests.environment_job import CAN_MAKE, check_python, remove_environment, store_choice
 from ..requests.open_head import OpenHead
 from ..worker.environment import PYTHON_VARIABLE, find_training_python, made_python, status_folder
 from ..worker.launch import prepare_status_folder, start_worker
@@ -29,14 +30,19 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--folder", type=usable_path, help="folder of the environment (default: in Blender's or your user data)"
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    make = actions.add_parser("make", help="make an environment with PyTorch, and use it")
-    make.add_argument("--wheels", type=usable_path, metavar="FOLDER", help="wheel files, to install without a network")
-    make.add_argument("--tracking", action="store_true", help="with the landmark detector that `stga track` needs")
-    make.add_argument("--python", default=sys.executable, metavar="PATH", help="Python 3.11 or newer to make it from")
+    if CAN_MAKE:
+        _add_make(actions)
     use = actions.add_parser("use", help="test a Python that has the packages, and use it")
     use.add_argument("python", metavar="PATH")
     actions.add_parser("test", help="show which Python trains, its versions of torch and numba and its device")
     actions.add_parser("remove", help="remove the environment, and forget the Python chosen with `use`")
+
+
+def _add_make(actions: Any) -> None:
+    make = actions.add_parser("make", help="make an environment with PyTorch, and use it")
+    make.add_argument("--wheels", type=usable_path, metavar="FOLDER", help="wheel files, to install without a network")
+    make.add_argument("--tracking", action="store_true", help="with the landmark detector that `stga track` needs")
+    make.add_argument("--python", default=sys.executable, metavar="PATH", help="Python 3.11 or newer to make it from")
 
 
 def run(options: Namespace) -> None:
@@ -73,6 +79,8 @@ def _make(folder: Path, options: Namespace) -> str:
     status, message = status_folder(folder), ""
     prepare_status_folder(status)
     wheels = options.wheels and options.wheels.absolute()
+    from ..requests.environment_make import make_arguments  # which not every edition has
+
     making = make_arguments(folder, options.python, wheels, options.tracking)
     worker = start_worker(status, sys.executable, making)
     try:

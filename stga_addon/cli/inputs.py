@@ -1,6 +1,7 @@
 """Inputs that several commands name: a capture, and the network of the face detector."""
 
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 from typing import Any
 
 from ..capture.model import Capture
@@ -8,6 +9,9 @@ from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..errors import StgaError
 from .arguments import usable_path
+
+CAN_DOWNLOAD = Path(__file__).parents[1].joinpath("tracking/detector_file.py").exists()
+"""Whether this edition can download the detector: some are built without."""
 
 
 def principal_point_of(options: Namespace) -> str:
@@ -25,16 +29,17 @@ def add_detector(parser: ArgumentParser, group: Any = None) -> None:
     (group or parser).add_argument(
         "--detector", type=usable_path, metavar="TASK", help="MediaPipe's face_landmarker.task"
     )
-    parser.add_argument(
-        "--download-detector",
-        action="store_true",
-        help="download Google's face_landmarker.task (4 MB) to the file of --detector, where there is none",
-    )
+    if CAN_DOWNLOAD:
+        parser.add_argument(
+            "--download-detector",
+            action="store_true",
+            help="download Google's face_landmarker.task (4 MB) to the file of --detector, where there is none",
+        )
 
 
 def provide_detector(options: Namespace) -> None:
     """Download the network where that is asked for. Raises StgaError where it has no file, or cannot be downloaded."""
-    if not options.download_detector:
+    if not CAN_DOWNLOAD or not options.download_detector:
         return
     from ..tracking.detector_file import download_task
 

@@ -2,6 +2,7 @@
 
 import argparse
 import hashlib
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,9 @@ from typing import Any
 
 from ..errors import StgaError
 from ..files import replacing
+from .demo.capture import CaptureOptions, make_capture
+from .editions import DEMO_FOLDER, PLATFORM, SMALL, Edition, complete, edition_manifest
+from .wheels import TARGETS, Target, collect_wheels, this_platform
 
 ROOT = Path(__file__).resolve().parents[2]
 MANIFEST = "blender_manifest.toml"
@@ -23,26 +27,46 @@ WHEELS = {
     "trimesh-5.2.0-py3-none-any.whl": "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29",
     "tqdm-4.70.1-py3-none-any.whl": "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73",
 }
+DEMO_SEED, DEMO_OPTIONS = 0, CaptureOptions(train=6, test=2, cameras=8)
+"""Of the capture in the complete edition: that of `make demo`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
 """Modification time of every entry, the earliest that a zip can hold: equal sources give an equal zip."""
 
 
-def build_zip(out: Path, root: Path = ROOT) -> Path:
-    """Write `<id>-<version>.zip` into the folder `out`, atomically; equal sources give equal bytes.
+def build_zip(out: Path, root: Path = ROOT, edition: Edition = SMALL, demo: Path | None = None) -> Path:
+    """Write `<id>-<version><suffix>.zip` into the folder `out`, atomically; equal sources give equal bytes.
 
+    demo: a capture to put into the zip.
     Downloads the wheels into `root/wheels` where they are missing. Raises StgaError where `root` is not a checkout or
     a wheel cannot be downloaded.
     """
     manifest = read_manifest(root)
-    fetch_wheels(root / "wheels")
-    path = out / f"{manifest['id']}-{manifest['version']}.zip"
+    wheels = edition_wheels(root / "wheels", edition)
+    files = {file.relative_to(root).as_posix(): file for file in extension_files(root, manifest, edition)}
+    files |= {f"wheels/{wheel.name}": wheel for wheel in wheels}
+    if demo is not None:
+        files |= {f"{DEMO_FOLDER}/{file.relative_to(demo).as_posix()}": file for file in _walk(demo, demo, [])}
+    path = out / f"{manifest['id']}-{manifest['version']}{edition.suffix}.zip"
     with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        for file in extension_files(root, manifest):
-            entry = zipfile.ZipInfo(file.relative_to(root).as_posix(), ENTRY_TIME)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, file.read_bytes())
+        _add(archive, MANIFEST, edition_manifest(manifest, edition, [wheel.name for wheel in wheels]).encode())
+        for name, file in sorted(files.items()):
+            _add(archive, name, file.read_bytes())
     return path
+
+
+def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    entry = zipfile.ZipInfo(name, ENTRY_TIME)
+    entry.compress_type = zipfile.ZIP_STORED if name.endswith((".whl", ".png")) else zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o644 << 16
+    archive.writestr(entry, data)
+
+
+def edition_wheels(folder: Path, edition: Edition) -> list[Path]:
+    """The wheels of an edition in `folder`, downloaded where they are missing. Raises StgaError where pip fails."""
+    if edition.target is not None:
+        return collect_wheels(folder / edition.target.name, edition.target)
+    fetch_wheels(folder)
+    return [folder / name for name in WHEELS]
 
 
 def read_manifest(root: Path) -> dict[str, Any]:
@@ -53,11 +77,10 @@ def read_manifest(root: Path) -> dict[str, Any]:
         raise StgaError(f"{root / MANIFEST}: cannot be read ({error.strerror}); expected a checkout") from error
 
 
-def extension_files(root: Path, manifest: dict[str, Any]) -> list[Path]:
-    """The files of the zip, sorted: what `paths_exclude_pattern` leaves, with the wheels that the manifest lists."""
+def extension_files(root: Path, manifest: dict[str, Any], edition: Edition = SMALL) -> list[Path]:
+    """The files of the zip from the checkout, sorted: what `paths_exclude_pattern` and the edition leave."""
     patterns = manifest["build"]["paths_exclude_pattern"]
-    wheels = [root / name for name in manifest["wheels"]]
-    return sorted([*_walk(root, root, [*patterns, "/wheels/"]), *wheels])
+    return sorted(_walk(root, root, [*patterns, *edition.left_out, f"/{MANIFEST}", "/wheels/"]))
 
 
 def fetch_wheels(folder: Path) -> None:
@@ -106,11 +129,47 @@ def _is_excluded(entry: Path, root: Path, patterns: Sequence[str]) -> bool:
     return False
 
 
+def target_of(blender: Sequence[str]) -> Target:
+    """The target that a Blender is: its Python on this platform, and its own version alone.
+
+    blender: the command that starts it. Raises StgaError where it does not answer.
+    """
+    asking = "import bpy, sys; print('PYTHON', *sys.version_info[:2], *bpy.app.version[:2], flush=True)"
+    command = [*blender, "--background", "--factory-startup", "--python-expr", asking]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise StgaError(f"{blender[0]}: cannot be started ({error.strerror})") from error
+    answer = next((line.split()[1:] for line in done.stdout.splitlines() if line.startswith("PYTHON ")), None)
+    if answer is None:
+        raise StgaError(f"{shlex.join(blender)}: did not say which Python it has (exit status {done.returncode})")
+    python, (major, minor) = ".".join(answer[:2]), map(int, answer[2:])
+    return Target(this_platform(), python, (f"{major}.{minor}.0", f"{major}.{minor + 1}.0"))
+
+
+def build_editions(options: argparse.Namespace) -> list[Path]:
+    """Build the edition that was asked for, the complete one for each of its targets. Raises StgaError."""
+    if options.edition != "complete":
+        return [build_zip(options.out, edition={"small": SMALL, "platform": PLATFORM}[options.edition])]
+    here = this_platform()
+    targets = [target_of(shlex.split(options.blender))] if options.blender else list(TARGETS)
+    if not (options.blender or options.all):
+        targets = [target for target in targets if target.platform == here]
+    demo = options.out / DEMO_FOLDER
+    if not (demo / "transforms.json").exists():
+        make_capture(demo, DEMO_SEED, DEMO_OPTIONS)
+    return [build_zip(options.out, edition=complete(target), demo=demo) for target in targets]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m stga_addon.development.package", description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder that receives the zip")
+    parser.add_argument("--edition", choices=("small", "platform", "complete"), default="small")
+    parser.add_argument("--blender", default="", help="complete: for the Python of this Blender, and no other")
+    parser.add_argument("--all", action="store_true", help="complete: for every platform, not only this one")
     try:
-        print(build_zip(parser.parse_args(arguments).out))
+        for path in build_editions(parser.parse_args(arguments)):
+            print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2

@@ -21,7 +21,7 @@ from .compose import Composer
 from .protocol import pack_layers, receive, send
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
-"""What the kernels need beside numpy, as pip names it."""
+"""What the kernels need beside numpy, by the names of the packages."""
 
 
 class RenderClient:

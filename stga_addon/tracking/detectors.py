@@ -120,8 +120,8 @@ def _mediapipe() -> Any:
     except ImportError as error:
         raise StgaError(
             f"landmarks need the Python package mediapipe, which {sys.executable} (Python "
-            f"{sys.version_info[0]}.{sys.version_info[1]}) lacks: make an environment with `stga environment make "
-            "--tracking`, run `pip install mediapipe==0.10.21` (Python 3.11 or 3.12), or give files with --landmarks"
+            f"{sys.version_info[0]}.{sys.version_info[1]}) lacks: install mediapipe 0.10.21 there (Python 3.11 or "
+            "3.12; newer ones need a newer mediapipe and Google's face_landmarker.task), or give files with --landmarks"
         ) from error
     return mediapipe
 

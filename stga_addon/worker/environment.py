@@ -1,6 +1,6 @@
 """Training environment: the Python with torch that trains beside Blender, and how it is found.
 
-In the environment's folder, `venv-N` is an environment that `requests.environment_job` made, in which the file `ready`
+In the environment's folder, `venv-N` is an environment that `requests.environment_make` made, in which the file `ready`
 says that it passed the check, and `choice.json` names an interpreter that is used instead.
 """
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from ..errors import StgaError
 from ..files import read_json
 from .environment_use import READY
+from .own_python import own_python
 from .requirements import REQUIREMENTS, package_name
 
 PYTHON_VARIABLE = "STGA_PYTHON"
@@ -36,11 +37,11 @@ def find_training_python(folder: Path, preferred: str = "") -> str:
     if missing:
         version = sys.version.split()[0]
         raise StgaError(
-            f"No training environment: {sys.executable} (Python {version}) lacks {', '.join(missing)}. Make one in the "
-            "add-on's preferences or with `blender --background --command stga environment make`, choose one with "
-            f"`… environment use PATH`, or set {PYTHON_VARIABLE}"
+            f"No training environment: {own_python()} (Python {version}) lacks {', '.join(missing)}. Install the "
+            "complete edition of the add-on, choose a Python that has them in its preferences or with `blender "
+            f"--background --command stga environment use PATH`, or set {PYTHON_VARIABLE}"
         )
-    return sys.executable
+    return own_python()
 
 
 def stored_choice(folder: Path) -> str:
@@ -82,7 +83,7 @@ def venv_python(venv: Path) -> Path:
 
 
 def missing_packages() -> list[str]:
-    """What training needs and this interpreter lacks, by the names pip uses."""
+    """What training needs and this interpreter lacks, by the names of the packages."""
     return [package_name(text) for module, text in REQUIREMENTS.items() if find_spec(module) is None]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
+from .own_python import own_python
 from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, remove_status_folder
 
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
@@ -102,13 +103,16 @@ def end_with_this_process() -> Callable[[], None] | None:
 def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, str]:
     """Environment variables for the interpreter `python`: the path of this package, and none of Blender's own Python.
 
-    Another process of this interpreter finds the packages that this process does: Blender's extensions have a folder
-    for theirs, which its Python does not search by itself.
+    Another process of this interpreter finds the packages that this process does, and no others: Blender's extensions
+    have a folder for theirs, which its Python does not search by itself, and Blender ignores the user's site-packages.
     """
-    kept = {name: value for name, value in variables.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
-    own_paths = filter(None, sys.path) if python == sys.executable else ()
+    is_own = python in (sys.executable, own_python())
+    own_paths = filter(None, sys.path) if is_own else ()
+    dropped = ("PYTHON",) if is_own else ("PYTHONHOME", "PYTHONSTARTUP")
+    kept = {name: value for name, value in variables.items() if not name.startswith(dropped)}
     return {
         **kept,
+        **({"PYTHONNOUSERSITE": "1"} if is_own else {}),
         "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *own_paths]),
         "PYTHONSAFEPATH": "1",
         "PYTHONDONTWRITEBYTECODE": "1",  # the extension's folder belongs to Blender

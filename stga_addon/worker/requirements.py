@@ -13,7 +13,7 @@ REQUIREMENTS = {
     "matplotlib": "matplotlib>=3.8,<4",
     "av": "av>=14,<19",
 }
-"""Imported module -> requirement as pip reads it."""
+"""Imported module -> requirement."""
 TRACKING_REQUIREMENTS = (
     "numpy>=1.26,<2; python_version < '3.13'",
     "opencv-python-headless>=4.9,<5",

@@ -137,7 +137,7 @@ def test_missing_training_environment(stga, extension, folder, monkeypatch, caps
     for module in (extension.operators.command_line, extension.stga_addon.worker.environment):
         monkeypatch.setattr(module, "missing_packages", lambda: ["torch"])
     assert stga("train", folder, "--out", folder / "run") == 2
-    assert "blender --background --command stga environment make" in capsys.readouterr().err
+    assert "`blender --background --command stga environment use PATH`" in capsys.readouterr().err
     bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 

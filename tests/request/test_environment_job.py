@@ -9,17 +9,15 @@ from pathlib import Path
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.requests import environment_job
+from stga_addon.requests import environment_job, environment_make
 from stga_addon.requests.environment_job import (
-    InstallStep,
     check_arguments,
     check_python,
     describe_check,
-    install_steps,
-    make_environment,
     remove_environment,
     store_choice,
 )
+from stga_addon.requests.environment_make import InstallStep, install_steps, make_environment
 from stga_addon.worker import environment
 from stga_addon.worker.environment import (
     ADAPTERS_FILE,
@@ -79,7 +77,7 @@ def test_install_steps_of_tracking(tmp_path):
 @pytest.mark.parametrize(("newest", "status"), [((3, 11), 0), ((99, 0), 1)])
 def test_old_python_is_refused_first(newest, status, tmp_path, monkeypatch):
     """Catches gigabytes downloaded for a Python that cannot use them."""
-    monkeypatch.setattr(environment_job, "MIN_PYTHON", newest)
+    monkeypatch.setattr(environment_make, "MIN_PYTHON", newest)
     looking = install_steps(tmp_path, sys.executable, None)[0]
     done = subprocess.run(looking.command, capture_output=True, text=True)
     assert done.returncode == status
@@ -138,10 +136,10 @@ def test_check_in_a_worker(tmp_path):
 @pytest.fixture
 def tiny(monkeypatch):
     """An installation of the virtual environment alone, without pip."""
-    monkeypatch.setattr(environment_job, "SIZE_GB", 0.0)
+    monkeypatch.setattr(environment_make, "SIZE_GB", 0.0)
     made = [sys.executable, "-m", "venv", "--without-pip"]
     monkeypatch.setattr(
-        environment_job, "install_steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])]
+        environment_make, "install_steps", lambda venv, *_: [InstallStep("making the environment", [*made, str(venv)])]
     )
 
 
@@ -203,7 +201,7 @@ def test_failing_step_names_its_reason(printed, reason, tiny, tmp_path, monkeypa
     log = status_folder(tmp_path) / LOG_FILE
     script = f"import sys; open({str(log)!r}, 'a').write({printed + chr(10)!r}); sys.exit(1)"
     monkeypatch.setattr(
-        environment_job, "install_steps", lambda *_: [InstallStep("installing torch", [sys.executable, "-c", script])]
+        environment_make, "install_steps", lambda *_: [InstallStep("installing torch", [sys.executable, "-c", script])]
     )
     with pytest.raises(StgaError, match=f"installing torch failed: .*{reason}"):
         make_environment(tmp_path, sys.executable)
@@ -213,8 +211,8 @@ def test_optional_step_may_fail(tiny, tmp_path, monkeypatch):
     """Catches a failure where pytorch.org cannot be reached, but PyPI can."""
     monkeypatch.setattr(environment_job, "check_python", lambda python, folder: "good")
     failing = InstallStep("failing", [sys.executable, "-c", "raise SystemExit(1)"], optional=True)
-    making = environment_job.install_steps
-    monkeypatch.setattr(environment_job, "install_steps", lambda *given: [*making(*given), failing])
+    making = environment_make.install_steps
+    monkeypatch.setattr(environment_make, "install_steps", lambda *given: [*making(*given), failing])
     assert make_environment(tmp_path, sys.executable) == "good"
 
 
@@ -228,7 +226,7 @@ def test_cancel_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
         ),
         InstallStep("waiting", [sys.executable, "-c", script]),
     ]
-    monkeypatch.setattr(environment_job, "install_steps", lambda *_: steps)
+    monkeypatch.setattr(environment_make, "install_steps", lambda *_: steps)
     assert make_environment(tmp_path, sys.executable) == ""
     assert inspect_worker(folder).state == WorkerState.CANCELLED
     assert not list(tmp_path.glob("venv*"))
@@ -236,7 +234,7 @@ def test_cancel_stops_pip_and_cleans_up(tiny, tmp_path, monkeypatch):
 
 def test_small_disk_is_refused(tmp_path, monkeypatch):
     """Catches a full disk after half an hour of downloading."""
-    monkeypatch.setattr(environment_job.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
+    monkeypatch.setattr(environment_make.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**8}))
     with pytest.raises(StgaError, match=r"has 0\.1 GB free, the environment needs 1\.5 GB"):
         make_environment(tmp_path, sys.executable, "cpu")
 
@@ -260,7 +258,9 @@ def chosen(tmp_path, monkeypatch):
 def test_order_of_choices(chosen, tiny, monkeypatch):
     """Catches a farm's variable, the preferences or a stored choice that is overruled by a lower one."""
     monkeypatch.setattr(environment, "missing_packages", lambda: ["torch"])
-    with pytest.raises(StgaError, match=rf"lacks torch.*stga environment make`.* use PATH`, or set {PYTHON_VARIABLE}"):
+    with pytest.raises(
+        StgaError, match=rf"lacks torch.*complete edition.*environment use PATH`, or set {PYTHON_VARIABLE}"
+    ):
         find_training_python(chosen)
     monkeypatch.setattr(environment, "missing_packages", list)
     assert find_training_python(chosen) == sys.executable
@@ -337,7 +337,7 @@ def test_installation_does_not_see_other_packages(tiny, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/bundled")
     monkeypatch.setattr(environment_job, "check_python", lambda python, folder: "good")
     code = "import os, sys; sys.exit('PYTHONPATH' in os.environ)"
-    making = environment_job.install_steps
+    making = environment_make.install_steps
     step = InstallStep("looking", [sys.executable, "-c", code])
-    monkeypatch.setattr(environment_job, "install_steps", lambda *given: [*making(*given), step])
+    monkeypatch.setattr(environment_make, "install_steps", lambda *given: [*making(*given), step])
     assert make_environment(tmp_path, sys.executable) == "good"

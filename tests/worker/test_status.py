@@ -21,6 +21,7 @@ from stga_addon.worker.launch import (
     start_worker,
     worker_environment,
 )
+from stga_addon.worker.own_python import own_python
 from stga_addon.worker.status import (
     CANCEL_FILE,
     LOG_FILE,
@@ -359,6 +360,35 @@ def test_own_interpreter_finds_the_bundled_packages(monkeypatch):
     monkeypatch.setattr(sys, "path", ["", "/extensions/site-packages"])
     expected = os.pathsep.join([str(ROOT), "/extensions/site-packages"])
     assert worker_environment({}, sys.executable)["PYTHONPATH"] == expected
+
+
+def test_own_interpreter_is_isolated(monkeypatch, tmp_path):
+    """Catches a worker of Blender's Python that imports from the user's site-packages or runs the user's settings."""
+    theirs = tmp_path / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
+    theirs.mkdir(parents=True)
+    (theirs / "strange_package.py").touch()
+    variables = {**os.environ, "PYTHONUSERBASE": str(tmp_path), "PYTHONWARNINGS": "ignore"}
+    looking = "import importlib.util as u, sys; sys.exit(3 if u.find_spec('strange_package') else 0)"
+    variables["PYTHONPATH"] = str(theirs)
+    for environment, code in ((variables, 3), (worker_environment(variables, sys.executable), 0)):
+        command = [sys.executable, "-c", looking]
+        assert subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, check=False).returncode == code
+    assert "PYTHONWARNINGS" in worker_environment(variables, "/usr/bin/python3")
+
+
+def test_own_python(monkeypatch, tmp_path):
+    """Catches a program of PATH taken for the Python that Blender has as the system's library."""
+    program = tmp_path / f"bin/python{sys.version_info[0]}.{sys.version_info[1]}"
+    program.parent.mkdir()
+    program.touch()
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", "/elsewhere/shims/python3")
+    own_python.cache_clear()
+    try:
+        assert own_python() == (str(program) if os.name == "posix" else sys.executable)
+        assert worker_environment({"PYTHONPATH": "/other"}, str(program))["PYTHONNOUSERSITE"] == "1"
+    finally:
+        own_python.cache_clear()
 
 
 def test_log_lines(tmp_path):

@@ -36,7 +36,7 @@ class RayEngine:
     def __init__(self, address: str) -> None:
         """Raises StgaError where Ray is not installed, or the cluster cannot be reached."""
         if find_spec("ray") is None:
-            raise StgaError("--engine ray: the package ray is not installed (pip install 'stga-addon[ray]')")
+            raise StgaError("--engine ray: the package ray is not installed (it is the extra `ray` of stga-addon)")
         if not address and TOKEN_MODE not in os.environ:  # other users of this machine cannot submit to it
             os.environ.update({TOKEN_MODE: "token", TOKEN: secrets.token_hex(32)})
         import ray  # reads the environment

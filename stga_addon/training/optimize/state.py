@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import Field, dataclass, field, fields, replace
-from collections.abc import Callable
-from dataclasses import Field, dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 

@@ -1,0 +1,142 @@
+"""The complete edition in a Blender whose Python has nothing but numpy, without a network: Train works at once."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+import bpy
+from capture.factory import write_flame_capture
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.flame_capture import OWN_MODELS
+from stga_addon.development.editions import complete
+from stga_addon.development.package import ROOT, build_zip
+from stga_addon.development.wheels import Target, check_wheels, collect_wheels, this_platform
+from stga_addon.errors import StgaError
+from stga_addon.perform.perform import perform
+from stga_addon.progress import ignore
+from stga_addon.requests.values import Train
+from stga_addon.training.settings import make_settings
+
+OWN_PACKAGES = (
+    "bpy",
+    "numpy",
+    "numpy.libs",
+    "zstandard",
+    "requests",
+    "urllib3",
+    "idna",
+    "certifi",
+    "charset_normalizer",
+)
+"""What a Blender's Python has of its own."""
+OFFLINE = ["unshare", "-rn"]
+ITERATIONS = 6
+SCRIPT = """
+import json, sys, time
+from pathlib import Path
+import bpy
+archive, home = sys.argv[1], Path(sys.argv[2])
+result = {"before": [name for name in ("torch", "numba", "scipy") if __import__("importlib.util").util.find_spec(name)]}
+bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=False)
+bpy.ops.wm.read_factory_settings(use_empty=True)
+module = "bl_ext.user_default.stga"
+begin = time.perf_counter()
+bpy.ops.preferences.addon_enable(module=module)
+result["enabling_s"] = time.perf_counter() - begin
+result["heavy"] = sorted({"torch", "numba"} & set(sys.modules))
+result["installer"] = hasattr(bpy.types, "STGA_OT_make_environment")
+bpy.ops.stga.open_demo()
+settings = bpy.context.scene.stga
+result["run"], result["minutes"] = settings.run_folder, settings.minutes
+bpy.ops.stga.train(directory=settings.run_folder, iterations=int(sys.argv[3]), python=sys.executable)
+bpy.ops.stga.show_avatar(filepath=settings.avatar)
+bpy.ops.stga.open_demo()
+result["next run"] = settings.run_folder
+result["log"] = (Path(result["run"]) / "job/worker.log").read_text()
+files = bpy.context.preferences.extensions.repos["user_default"].directory
+environment = sys.modules[module + ".stga_addon.requests.environment_job"]
+result["check"] = environment.check_python(sys.executable)
+bpy.ops.preferences.addon_disable(module=module)
+index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
+bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
+installed = Path(files)
+result["left"] = [str(path) for where, what in ((installed.parent, "*torch*"), (installed, "stga*")) for path in where.rglob(what)]
+print("RESULT " + json.dumps(result))
+"""
+
+
+@pytest.fixture(scope="module")
+def target() -> Target:
+    return Target(this_platform(), f"{sys.version_info[0]}.{sys.version_info[1]}", ("4.2.0", "5.1.0"))
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
+    model.rename(folder / OWN_MODELS[0])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def archive(target: Target, demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = ROOT / "wheels" / target.name
+    try:
+        check_wheels(collect_wheels(folder, target), target)
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo)
+
+
+def bare_python(folder: Path) -> Path:
+    """A Python of this version with Blender and numpy alone."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    site = next(folder.glob("lib/python*/site-packages"))
+    for name in OWN_PACKAGES:
+        source = Path(bpy.__file__).parents[1] / name
+        if source.exists():
+            (site / name).symlink_to(source)
+    return folder / "bin/python"
+
+
+@pytest.mark.slow
+def test_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
+    """Catches a missing wheel, a worker that needs another Python or a network, and files that uninstalling leaves."""
+    python = bare_python(tmp_path / "bare")
+    offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
+    profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    command = [*offline, str(python), "-c", SCRIPT, str(archive), str(tmp_path), str(ITERATIONS)]
+    done = subprocess.run(command, cwd=tmp_path, env=kept | profile, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))
+    result = json.loads(line.removeprefix("RESULT "))
+    print({name: result[name] for name in ("enabling_s", "check")})
+    assert (result["before"], result["heavy"], result["installer"]) == ([], [], False)
+    assert result["run"] == str(tmp_path / "STGA Demo/run")
+    assert result["next run"] == str(tmp_path / "STGA Demo/run 2")
+    assert result["minutes"] == 1.0
+    assert result["left"] == []
+    perform(Train(tmp_path / "here", demo, make_settings("global", iterations=ITERATIONS)), ignore, print)
+    found, expected = (read_avatar(folder / "avatar.npz").splats for folder in (Path(result["run"]), tmp_path / "here"))
+    np.testing.assert_allclose(found.xyz, expected.xyz, atol=1e-5)
+    np.testing.assert_allclose(found.sh, expected.sh, atol=1e-3)
+
+
+def test_bundled_wheels_are_unmodified(archive: Path, target: Target) -> None:
+    """Catches a wheel that the build changes, and a zip whose manifest names others than it holds."""
+    with zipfile.ZipFile(archive) as made:
+        names = {name for name in made.namelist() if name.startswith("wheels/")}
+        for name in names:
+            assert made.read(name) == (ROOT / "wheels" / target.name / Path(name).name).read_bytes()
+        manifest = made.read("blender_manifest.toml").decode()
+    assert names
+    assert all(f'"./{name}"' in manifest for name in names)

@@ -1,0 +1,111 @@
+"""The editions' wheels, manifests and files, and the repository's page; Blender's part is in tests/blender."""
+
+import re
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from stga_addon.development.editions import INSTALLER_FILES, PLATFORM, SMALL, complete, edition_manifest
+from stga_addon.development.package import ROOT, build_zip, extension_files, fetch_wheels, read_manifest
+from stga_addon.development.wheels import PINS, TARGETS, Target, check_wheels, needs
+from stga_addon.errors import StgaError
+from stga_addon.worker.requirements import REQUIREMENTS
+
+LINUX = Target("linux-x64", "3.11", ("4.2.0", "5.1.0"))
+WINDOWS = Target("windows-x64", "3.13", ("5.1.0", ""))
+NATIVE = {
+    "linux-x64": "cp{0}-cp{0}-manylinux_2_27_x86_64.manylinux_2_28_x86_64",
+    "windows-x64": "cp{0}-cp{0}-win_amd64",
+    "macos-arm64": "cp{0}-cp{0}-macosx_12_0_arm64",
+}
+
+
+def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: str) -> Path:
+    path = folder / f"{name}-{version}-{tag}.whl"
+    text = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+    text += "".join(f"Requires-Dist: {requirement}\n" for requirement in requirements)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{name}-{version}.dist-info/METADATA", text)
+    return path
+
+
+def wheel_set(folder: Path, target: Target) -> list[Path]:
+    """A wheel of the pinned version for each package that training needs; torch and numba with their dependencies."""
+    pins = {pin.split("==")[0]: pin.split("==")[1] for key in ("", "3.11") for pin in PINS[key]}
+    tag = NATIVE[target.platform].format(target.python.replace(".", ""))
+    extra = {
+        "torch": ("sympy", 'nvidia-things; platform_system == "Linux" and extra == "cuda"'),
+        "numba": ("llvmlite",),
+    }
+    names = {text.split(">=")[0] for text in REQUIREMENTS.values()} - {"numpy"} | {"llvmlite"}
+    wheels = [make_wheel(folder, name, pins[name], tag, *extra.get(name, ())) for name in sorted(names)]
+    return [*wheels, make_wheel(folder, "sympy", "1.14.0", "py3-none-any")]
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
+def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
+    """Catches wheels of another system or Python in a zip, and a missing or too old dependency, on every target."""
+    wheels = wheel_set(tmp_path, target)
+    check_wheels(wheels, target)
+    for other in TARGETS:
+        if other != target:
+            with pytest.raises(StgaError, match="does not run on"):
+                check_wheels(wheels, other)
+    with pytest.raises(StgaError, match="needs sympy"):
+        check_wheels(wheels[:-1], target)
+    with pytest.raises(StgaError, match="training needs av"):
+        check_wheels([wheel for wheel in wheels if not wheel.name.startswith("av-")], target)
+    torch = next(wheel for wheel in wheels if wheel.name.startswith("torch-"))
+    old = make_wheel(tmp_path, "torch", "1.0", torch.name.split("-", 2)[2].removesuffix(".whl"))
+    with pytest.raises(StgaError, match=r"needs torch.*hold 1\.0"):
+        check_wheels([wheel for wheel in wheels if wheel != torch] + [old], target)
+
+
+def test_markers_are_those_of_the_target(tmp_path: Path) -> None:
+    """Catches dependencies of this computer in the zip of another system: pip evaluates markers where it runs."""
+    wheel = make_wheel(
+        tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"', 'dll; os_name == "nt"',
+        'old; python_version < "3.12"', 'more; extra == "more"',
+    )  # fmt: skip
+    assert needs(wheel, LINUX) == ["cuda", "old"]
+    assert needs(wheel, WINDOWS, {"more"}) == ["dll", "more"]
+
+
+def test_manifest_of_an_edition() -> None:
+    """Catches a zip that Blender offers on another platform or to a Blender with another Python."""
+    manifest = read_manifest(ROOT)
+    for target in TARGETS:
+        made = tomllib.loads(edition_manifest(manifest, complete(target), ["a.whl"]))
+        assert (made["platforms"], made["wheels"]) == ([target.platform], ["./wheels/a.whl"])
+        assert made["blender_version_min"] == target.blender[0]
+        assert made.get("blender_version_max", "") == target.blender[1]
+    small = tomllib.loads(edition_manifest(manifest, SMALL, [Path(name).name for name in manifest["wheels"]]))
+    assert small == {name: value for name, value in manifest.items() if name != "build"}
+
+
+def test_no_way_to_install_in_the_platform_edition(tmp_path: Path) -> None:
+    """Catches code in the platform edition that installs packages, downloads something, or runs what it downloaded."""
+    try:
+        fetch_wheels(ROOT / "wheels")
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    forbidden = re.compile(r"\bpip\b|ensurepip|\"venv\"|urllib|http\.client|import (requests|socket)\b")
+    with zipfile.ZipFile(build_zip(tmp_path, edition=PLATFORM)) as archive:
+        texts = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
+        manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+    assert {name: found for name, text in texts.items() if (found := forbidden.search(text))} == {}
+    assert list(manifest["permissions"]) == ["files"]
+    with zipfile.ZipFile(build_zip(tmp_path, edition=SMALL)) as archive:
+        small = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
+    assert set(small) > set(texts)
+    assert any(forbidden.search(text) for text in small.values()), "the search finds what the small edition has"
+
+
+def test_left_out_files_exist() -> None:
+    """Catches a file that moved, whose old name keeps nothing out of an edition."""
+    for name in PLATFORM.left_out:
+        assert (ROOT / name.strip("/")).is_file()
+    left = {file.relative_to(ROOT).as_posix() for file in extension_files(ROOT, read_manifest(ROOT), complete(LINUX))}
+    assert not left & {name.strip("/") for name in INSTALLER_FILES}
