@@ -153,6 +153,17 @@ def test_the_loss_in_the_metrics_survives_a_crash(unbroken: Path, continued: Pat
     assert ours == pytest.approx(theirs, rel=1e-6)
 
 
+def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a farm's wish that is ignored, and a nonsensical one that ends in a traceback or in no checkpoints."""
+    for text, seconds in (("", None), ("0.5", 0.5), ("0", 0.0)):
+        monkeypatch.setenv("STGA_CHECKPOINT_S", text)
+        assert run_module._asked_interval_s() == seconds
+    for text in ("soon", "-1", "nan", "inf"):
+        monkeypatch.setenv("STGA_CHECKPOINT_S", text)
+        with pytest.raises(StgaError, match="STGA_CHECKPOINT_S: expected seconds between checkpoints"):
+            run_module._asked_interval_s()
+
+
 def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path) -> None:
     """Catches what an artist painted replaced by the rule when a run resumes that had no checkpoint yet."""
     painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
