@@ -18,6 +18,7 @@ from .environment import TestEnvironment
 from .export import ExportAvatar
 from .export_cameras import ExportCameras
 from .export_head_model import ExportHeadModel
+from .export_performance import ExportPerformance
 from .failure_report import CopyReport
 from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
@@ -84,6 +85,7 @@ CLASSES = (
     ImportPly,
     ExportAvatar,
     ExportCameras,
+    ExportPerformance,
     OpenNpz,
     CaptureDrop,
     PerformanceDrop,
@@ -101,6 +103,7 @@ def _import_menu(menu: Any, context: Any) -> None:
 
 def _export_menu(menu: Any, context: Any) -> None:
     menu.layout.operator(ids.EXPORT_AVATAR, text="Gaussian Head Avatar (STGA)")
+    menu.layout.operator(ids.EXPORT_PERFORMANCE, text="ARKit Curves (STGA)")
     menu.layout.operator(ids.EXPORT_CAMERAS, text="Cameras for Tracking (STGA)")
     menu.layout.operator(ids.EXPORT_HEAD_MODEL, text="Head Model for Tracking (STGA)")
 

@@ -70,7 +70,7 @@ def parsed_gain(text: str) -> tuple[str, float]:
     """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError for other text."""
     name, _, number = text.partition("=")
     if name not in (*PARTS, "head", *ARKIT_SHAPES):
-        raise StgaError(f"'{text}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
+        raise StgaError(f"'{name}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
     try:
         value = float(number)
     except ValueError:

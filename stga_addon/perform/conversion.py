@@ -1,5 +1,6 @@
 """Conversion between motions of FLAME heads and performances in ARKit's 52 blend shapes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from ..capture.open import open_capture
 from ..driving.face_video import is_video, watched_performance
 from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, write_performance
-from ..driving.open_motion import NEEDS_FLAME, performed, prepared_performance
+from ..driving.open_motion import NEEDS_FLAME, MotionOptions, adapted, performed, prepared_performance
 from ..driving.performance import Performance
 from ..driving.read_performance import is_performance, read_performance
 from ..errors import StgaError
@@ -62,8 +63,17 @@ def _write_shapes(request: ConvertMotion) -> None:
     capture = open_capture(request.source, request.flame)
     if capture.flame is None:
         raise StgaError(f"{request.source}: was not tracked with FLAME, so it has no parameters of expression and pose")
-    performance = captured_performance(capture.flame, str(request.source), playback_fps(capture, numbered=True))
-    write_performance(request.output, prepared_performance(performance, request.options, request.fps))
+    sequence = capture.flame
+    if request.options.neutral != "none":  # of the parameters: what leaks into them are no weights from 0 to 1
+        frames, _ = adapted(
+            [sequence.frame(timestep) for timestep in sequence.timesteps],
+            MotionOptions(neutral=request.options.neutral),
+        )
+        known = dict(zip(sequence.timesteps, frames, strict=True))
+        sequence = replace(sequence, frame=known.__getitem__)
+    performance = captured_performance(sequence, str(request.source), playback_fps(capture, numbered=True))
+    options = replace(request.options, neutral="none")
+    write_performance(request.output, prepared_performance(performance, options, request.fps))
 
 
 def _person(request: ConvertMotion) -> FlameSequence:

@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 
 FOLDER, PICTURES = Path(sys.argv[sys.argv.index("--") + 1]), int(sys.argv[sys.argv.index("--") + 2])
-PORT, RATE, SECONDS = 21111, 60, 10.0
+PORT, RATE, SECONDS, PICTURES_PER_SECOND = 21111, 60, 10.0, 10
 seen: dict[str, Any] = {"version": bpy.app.version_string}
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 sessions = sys.modules[f"{extension}.operators.live_session"]
@@ -27,9 +27,8 @@ names = sys.modules[f"{extension}.stga_addon.driving.live.live_link_face"].PACKE
 bpy.context.preferences.view.show_splash = False
 
 
-def packet(number: int) -> bytes:
-    """A face that speaks, smiles, blinks and turns."""
-    t = number / RATE
+def packet(number: int, t: float) -> bytes:
+    """A face that speaks, smiles, blinks and turns, after t seconds."""
     wave = lambda hertz, phase=0.0: 0.5 - 0.5 * np.cos(2 * np.pi * (hertz * t + phase))  # noqa: E731
     values = {
         "jawOpen": 0.7 * wave(1.1) * wave(0.23),
@@ -54,7 +53,8 @@ def send() -> None:
     """A phone, until the session has ended."""
     sender, begin, number = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), time.monotonic(), 0
     while not seen.get("quit"):
-        sender.sendto(packet(number), ("127.0.0.1", PORT))
+        moment = seen.get("_moment", number / RATE)
+        sender.sendto(packet(number, moment), ("127.0.0.1", PORT))
         number += 1
         time.sleep(max(0.0, begin + number / RATE - time.monotonic()))
 
@@ -81,9 +81,19 @@ def set_up() -> None:
     space.show_region_ui = True
     settings = bpy.context.scene.stga.drive
     settings.port = PORT
-    for other in area.regions:
-        if other.type == "UI":
-            other.active_panel_category = "STGA"
+    if PICTURES:
+        only_drive_panel()
+
+
+def only_drive_panel() -> None:
+    """Leave the sidebar's tab with the Drive panel open, for pictures."""
+    ui = sys.modules[f"{extension}.ui.panel"]
+    kept = [sys.modules[f"{extension}.ui.motion"].MotionPanel, sys.modules[f"{extension}.ui.drive"].DrivePanel]
+    for panel in reversed(ui.CLASSES):
+        bpy.utils.unregister_class(panel)
+    for panel in kept:
+        panel.bl_options = set()
+        bpy.utils.register_class(panel)
 
 
 def count_draws() -> None:
@@ -94,7 +104,9 @@ def count_draws() -> None:
 
 def steps() -> Any:
     set_up()
-    yield 1.0
+    yield 0.5
+    sys.modules[f"{extension}.stga_addon.scene.viewports"].open_sidebar("STGA", bpy.data.screens)
+    yield 0.5
     threading.Thread(target=send, daemon=True).start()
     window, area, region = viewport()
     with bpy.context.temp_override(window=window, area=area, region=region):
@@ -114,8 +126,10 @@ def steps() -> Any:
     begin = time.monotonic()
     if PICTURES:
         for number in range(PICTURES):
+            seen["_moment"] = number / PICTURES_PER_SECOND
+            yield 0.1
+            bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
             screenshot(f"picture_{number:03d}")
-            yield 0.05
     else:
         yield SECONDS
     took = time.monotonic() - begin

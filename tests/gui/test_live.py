@@ -22,7 +22,8 @@ PICTURES = int(os.environ.get("STGA_GUI_PICTURES", "0"))
 
 
 def test_a_phone_moves_the_head(tmp_path: Path) -> None:
-    """Catches a head that lags behind a phone with splats on, and Esc that does not stop it."""
+    """Catches a head that lags behind a phone with splats on, or behind what a display by software draws, and Esc that
+    does not stop it."""
     archive = build_zip(tmp_path)
     blender(tmp_path, "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
     model = synthetic_flame(0)
@@ -40,4 +41,4 @@ def test_a_phone_moves_the_head(tmp_path: Path) -> None:
     assert "traceback" not in seen, seen["traceback"]
     print(seen)
     assert seen["stopped by Esc"]
-    assert PICTURES or seen["poses per second"] >= MIN_POSES_PER_SECOND
+    assert PICTURES or seen["poses per second"] >= min(MIN_POSES_PER_SECOND, 0.9 * seen["draws per second"])

@@ -1,0 +1,45 @@
+"""Exports what the head plays as curves of ARKit's shapes, for other characters."""
+
+from typing import Any, ClassVar
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..stga_addon.driving.inverse import captured_performance, write_performance
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.rig.motion import sample_motion
+from ..stga_addon.scene.timeline import frames_per_second
+from . import ids
+from .common import capture_of, file_path, flame_of, head_of, needs_rig, reporting
+
+
+class ExportPerformance(bpy.types.Operator, ExportHelper):
+    """Export expression, jaw, eyes and neck of the head in the scene's frame range as curves of ARKit's 52 shapes"""
+
+    bl_idname = ids.EXPORT_PERFORMANCE
+    bl_label = "Export ARKit Curves"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    filepath: bpy.props.StringProperty(
+        name="File",
+        description="CSV file in Live Link Face's layout",
+        subtype="FILE_PATH",
+        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    )
+    filename_ext = ".csv"
+    filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_rig(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        head, scene = head_of(context), context.scene
+        path = file_path(self.filepath, "curves").with_suffix(self.filename_ext)
+        own = flame_of(capture_of(head), head.name)
+        frames = range(scene.frame_start, scene.frame_end + 1)
+        motion = sample_motion(head, own, frames, lambda sentence: self.report({"WARNING"}, sentence))
+        write_performance(path, captured_performance(motion, head.name, frames_per_second(scene)))
+        self.report({"INFO"}, f"Exported {len(frames)} frames to {path}")
+        return {"FINISHED"}
