@@ -19,8 +19,11 @@ from ..stga_addon.render.recording import Recorder, check_output
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import RenderRecording
 from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.gpu.context import has_gpu_context
+from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
 from ..stga_addon.scene.render.composite import srgb_background
+from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.timeline import frames_per_second
 from ..stga_addon.worker.status import status_writer
@@ -89,8 +92,8 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             return False
         if not needs_idle(cls, context, Kind.VIDEO):
             return False
-        if not has_training_python(context):
-            cls.poll_message_set("Needs a training environment, which is made in the add-on's preferences")
+        if not (has_training_python(context) or has_gpu_context()):
+            cls.poll_message_set("Needs a GPU, or a Python that trains, which is chosen in the add-on's preferences")
             return False
         return True
 
@@ -109,9 +112,11 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             output = output.with_name(f"{output.name}.mp4")
         if self.format == "png" and output.suffix.lower() == ".mp4":
             output = output.with_suffix("")
-        self._python = training_python(context)
+        self._python = training_python(context) if has_training_python(context) else None
         frames = self._frames(context)
-        self._recording = _Recording(context, output, frames, self._cameras(context, len(frames)))
+        self._recording = _Recording(
+            context, output, frames, self._cameras(context, len(frames)), drawn=self._python is None
+        )
         if bpy.app.background:
             return self._record_and_render(context)
         self._timer = context.window_manager.event_timer_add(RECORDING_INTERVAL_S, window=context.window)
@@ -176,11 +181,14 @@ class _Recording:
     Until the worker takes over, this process is that of the request in the folder, and writes its status.
     """
 
-    def __init__(self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None) -> None:
+    def __init__(
+        self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None, drawn: bool
+    ) -> None:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
         self._view_layer = context.view_layer
         self._cache, self._posed = SplatCache(), (-1, list[PosedSplats]())
+        self._layers: list[SceneLayer] = []
         self._recorded, self.output, self.is_cancelled = 0, output, False
         check_output(output)
         self._files = ExitStack()
@@ -190,6 +198,7 @@ class _Recording:
             self._status = self._files.enter_context(status_writer(self.folder))
             failed.callback(self._files.close)
             self._recorder = Recorder(self.folder / RECORDING)
+            self._drawn = DrawnVideo(self.folder, output, srgb_background(context.scene)) if drawn else None
             self._status.update(0.0, "Recording")
             monitor.follow(context.scene, Kind.VIDEO, output, self.folder)
             monitor.check_now(context.scene, Kind.VIDEO)
@@ -202,19 +211,31 @@ class _Recording:
         with bpy.context.temp_override(scene=self._scene, view_layer=self._view_layer):
             if frame != self._posed[0]:
                 self._scene.frame_set(frame)
-                layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
-                self._posed = frame, [layer.posed() for layer in layers]
+                self._layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
+                self._posed = frame, [layer.posed() for layer in self._layers]
             given = None if self._cameras is None else self._cameras[self._recorded]
             camera = given or scene_camera(bpy.context.evaluated_depsgraph_get())
-        self._recorder.add(self._posed[1], camera)
+        if self._drawn is None:
+            self._recorder.add(self._posed[1], camera)
+        else:
+            self._drawn.add(self._layers, camera)
         self._recorded += 1
         self.is_cancelled = self._status.update(self._recorded / len(self._frames), "Recording")
         return self._recorded < len(self._frames)
 
-    def render(self, python: str) -> None:
-        """End the recording, and start its worker. Raises StgaError on a full disk, and as `request.start` does."""
+    def render(self, python: str | None) -> None:
+        """End the recording, and start its worker; without one, encode what was drawn.
+
+        Raises StgaError on a full disk, and as `request.start` does.
+        """
         self._restore()
         self._recorder.close()
+        if python is None:
+            assert self._drawn is not None
+            self._drawn.encode(frames_per_second(self._scene))
+            self._files.close()
+            monitor.check_now(self._scene, Kind.VIDEO)
+            return
         self._files.close()
         request = RenderRecording(
             self._recorder.path,

@@ -3,7 +3,6 @@
 from typing import Any
 
 from ..operators import ids, monitor
-from ..operators.training_python import has_training_python
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.worker.status import WorkerState
 from .request import draw_end, draw_running
@@ -17,8 +16,6 @@ def draw_video(layout: Any, context: Any) -> None:
     video = monitor.state_of(context.scene, Kind.VIDEO)
     if video.subject is None:
         layout.operator(ids.RENDER_VIDEO, text="Render Video…", icon="RENDER_ANIMATION")
-        if not has_training_python(context):
-            draw_text(layout, context, "Render Video needs a training environment", "INFO")
         return
     box = draw_end(layout, context, video)
     if video.snapshot.state == WorkerState.FINISHED:

@@ -1,9 +1,11 @@
 """Carrying out requests: the only place that knows which work a request is, and that loads it."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import walk_packages
 from time import monotonic
 from typing import Any
 
@@ -18,6 +20,8 @@ from ..tracking.folder import is_written
 from ..training.run.folder import has_run
 from ..worker.status import StatusWriter, status_writer
 
+LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
+"""Rooms that a worker which trains loads before it begins."""
 PREVIEW_INTERVAL_S = 4.0
 """Seconds between two previews of a training."""
 WORK: dict[type[Any], tuple[str, str]] = {
@@ -71,12 +75,23 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
         writer.update(0.0, "Starting")
         try:
             request = read_request(folder)
+            if isinstance(request, Train | Resume | Refine | Extend):
+                _load_ahead()
             left = resumed(request) if resume else request
             result = perform(left, _StatusReport(writer, also), say) if left else _tracked(request)
         except Cancelled:
             return None
         write_result(folder, result)
         return result
+
+
+def _load_ahead() -> None:
+    """Load what a training loads later, at its end too: an update of the add-on may exchange the files meanwhile."""
+    for room in LOADED_AHEAD:
+        package = import_module(f"..{room}", __package__)
+        for module in walk_packages(package.__path__, f"{package.__name__}."):
+            with suppress(ImportError):  # a package that not every Python has, and that nothing here needs
+                import_module(module.name)
 
 
 def resumed(request: Request) -> Request | None:

@@ -159,3 +159,18 @@ def choose_image_file(settings: Any, file_format: str, color_mode: str, color_de
     if hasattr(settings, "media_type"):  # from Blender 5.0 on
         settings.media_type = "IMAGE"
     settings.file_format, settings.color_mode, settings.color_depth = file_format, color_mode, color_depth
+
+
+def choose_video_file(render: Any) -> None:
+    """Let a scene render to an MP4 file, H.264 of high quality."""
+    if hasattr(render.image_settings, "media_type"):  # from Blender 5.0 on
+        render.image_settings.media_type = "VIDEO"
+    render.image_settings.file_format = "FFMPEG"
+    render.ffmpeg.format, render.ffmpeg.codec = "MPEG4", "H264"
+    render.ffmpeg.constant_rate_factor = "HIGH"
+
+
+def sequencer_strips(scene: Any) -> Any:
+    """The strips of a scene's video sequencer, which is made; `sequences` before Blender 4.4."""
+    editor = scene.sequence_editor_create()
+    return editor.strips if hasattr(editor, "strips") else editor.sequences

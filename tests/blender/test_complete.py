@@ -12,7 +12,6 @@ import pytest
 
 pytest.importorskip("bpy")
 
-import bpy
 from capture.factory import write_flame_capture
 
 from stga_addon.avatar.file import read_avatar
@@ -69,7 +68,8 @@ bpy.ops.preferences.addon_disable(module=module)
 index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
 installed = Path(files)
-result["left"] = [str(path) for where, what in ((installed.parent, "*torch*"), (installed, "stga*")) for path in where.rglob(what)]
+found = [*installed.parent.rglob("*torch*"), *installed.glob("stga*")]
+result["left"] = [str(path) for path in found]
 print("RESULT " + json.dumps(result))
 """
 
@@ -101,7 +101,7 @@ def bare_python(folder: Path) -> Path:
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     site = next(folder.glob("lib/python*/site-packages"))
     for name in OWN_PACKAGES:
-        source = Path(bpy.__file__).parents[1] / name
+        source = Path(np.__file__).parents[1] / name
         if source.exists():
             (site / name).symlink_to(source)
     return folder / "bin/python"

@@ -1,0 +1,97 @@
+"""A video drawn by Blender's GPU and encoded by Blender's FFmpeg: where no Python here has the rasterizer."""
+
+import shutil
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...capture.camera import Camera
+from ...errors import StgaError
+from ...files import replacing
+from ...render.recording import finished, is_video
+from ..compat import choose_video_file, sequencer_strips
+from ..layers import SceneLayer
+from .engine import draw_image
+
+
+class DrawnVideo:
+    """Draws the images into a folder as PNGs, one call each; `encode` makes the output of them.
+
+    background: sRGB in 0…1; None: transparent in PNGs, black in a video.
+    """
+
+    def __init__(self, folder: Path, output: Path, background: tuple[float, float, float] | None) -> None:
+        self._folder, self._output, self._background = folder, output, background
+        self._images: list[Path] = []
+
+    def add(self, layers: Sequence[SceneLayer], camera: Camera) -> None:
+        """Draw an image. Raises StgaError where the GPU cannot, or the disk is full."""
+        image = draw_image(list(layers), camera)
+        if image is None:
+            raise StgaError("The video cannot be drawn: this Blender has no GPU context, or not the memory")
+        path = self._folder / f"{len(self._images) + 1:04d}.png"
+        with replacing(path) as partial:
+            partial.write_bytes(png_bytes(finished(image, self._background, is_video(self._output))))
+        self._images.append(path)
+
+    def encode(self, fps: float) -> None:
+        """Write the video, or copy the PNGs to the output folder. Raises StgaError."""
+        if is_video(self._output):
+            with replacing(self._output) as partial:
+                shutil.copyfile(_encode(self._images, fps), partial)
+            return
+        for image in self._images:
+            with replacing(self._output / image.name) as partial:
+                shutil.copyfile(image, partial)
+
+
+def png_bytes(pixels: np.ndarray) -> bytes:
+    """A PNG of (H, W, 3 or 4) uint8 sRGB, as the PNG specification (ISO/IEC 15948) lays it out; no pillow is needed."""
+    height, width, channels = pixels.shape
+    rows = np.zeros((height, 1 + width * channels), np.uint8)  # the filter of each row: none
+    rows[:, 1:] = pixels.reshape(height, -1)
+    header = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
+    packed = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def _encode(images: Sequence[Path], fps: float) -> Path:
+    """Encode with the sequencer of a scene of its own, which is removed; returns the file beside the images."""
+    size = bpy.data.images.load(str(images[0]))
+    width, height = size.size
+    bpy.data.images.remove(size)
+    video = images[0].with_name("video.mp4")
+    scene = bpy.data.scenes.new("STGA video")
+    try:
+        strip = sequencer_strips(scene).new_image("images", str(images[0]), 1, 1)
+        for image in images[1:]:
+            strip.elements.append(image.name)
+        scene.frame_start, scene.frame_end = 1, len(images)
+        _set_up_render(scene.render, width, height, fps)
+        scene.view_settings.view_transform = "Standard"
+        scene.render.filepath = str(video)
+        bpy.ops.render.render(animation=True, scene=scene.name)
+    except RuntimeError as error:
+        raise StgaError(f"Blender could not encode the video ({str(error).strip()})") from error
+    finally:
+        bpy.data.scenes.remove(scene)
+    if not video.is_file():
+        raise StgaError("Blender could not encode the video; see the console")
+    return video
+
+
+def _set_up_render(render: Any, width: int, height: int, fps: float) -> None:
+    render.resolution_x, render.resolution_y = width + width % 2, height + height % 2  # even, as the format needs
+    render.resolution_percentage = 100
+    render.fps = max(round(fps), 1)
+    render.fps_base = render.fps / fps
+    render.use_sequencer, render.use_file_extension = True, True
+    choose_video_file(render)

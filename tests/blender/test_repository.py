@@ -1,0 +1,118 @@
+"""The repository on loopback, in a real Blender: install, update from a lower version while a worker trains.
+
+STGA_BLENDER is the command that starts the Blender; several, separated by " ; ", are tried one after another.
+"""
+
+import functools
+import http.server
+import json
+import os
+import shlex
+import subprocess
+import sys
+import sysconfig
+import threading
+import time
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from capture.factory import write_mesh_capture
+
+from stga_addon import __version__
+from stga_addon.development.package import ROOT, build_zip, fetch_wheels
+from stga_addon.development.repository import INDEX, PAGE, write_repository
+from stga_addon.errors import StgaError
+
+BLENDERS = [shlex.split(command) for command in os.environ.get("STGA_BLENDER", "").split(" ; ") if command.strip()]
+pytestmark = pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender")
+OLD_VERSION = "0.1.9"
+ITERATIONS = 150
+"""Of a training that is still at work when the update has ended."""
+
+
+@pytest.fixture(scope="module")
+def zips(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The built zip, and one that says that it is older."""
+    try:
+        fetch_wheels(ROOT / "wheels")
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    new = build_zip(tmp_path_factory.mktemp("new"))
+    old = tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip"
+    with zipfile.ZipFile(new) as source, zipfile.ZipFile(old, "w") as made:
+        for entry in source.infolist():
+            data = source.read(entry)
+            if entry.filename == "blender_manifest.toml":
+                data = data.replace(f'version = "{__version__}"'.encode(), f'version = "{OLD_VERSION}"'.encode(), 1)
+            made.writestr(entry, data)
+    return old, new
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    """A folder on loopback, and its address."""
+    folder = tmp_path / "served"
+    folder.mkdir()
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def extension(blender: list[str], profile: Path, *arguments: str) -> str:
+    command = [*blender, "--background", "--online-mode", "--command", "extension", *arguments]
+    variables = {**os.environ, "BLENDER_USER_RESOURCES": str(profile)}
+    done = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blender", BLENDERS, ids=lambda command: "-".join(command[-2:]))
+def test_install_and_update(blender: list[str], zips: tuple[Path, Path], served: tuple[Path, str], tmp_path) -> None:
+    """Catches an index that Blender cannot read, an update that fails, and one that ends a training."""
+    (folder, address), profile, (old, new) = served, tmp_path / "profile", zips
+    index = write_repository([old], folder / "stga", blender)
+    assert index == folder / "stga" / INDEX
+    extension(blender, profile, "repo-add", "stga_test", "--url", f"{address}/stga/{INDEX}")
+    extension(blender, profile, "install", "--sync", "--enable", "stga")
+    installed = next(profile.rglob("stga/blender_manifest.toml"))
+    assert tomllib.loads(installed.read_text())["version"] == OLD_VERSION
+
+    capture, run = write_mesh_capture(tmp_path / "capture"), tmp_path / "run"
+    # -S: without the checkout, which an editable installation puts on the path
+    command = [sys.executable, "-S", "-m", "stga_addon", "train", str(capture), "--out", str(run)]
+    path = os.pathsep.join([str(installed.parent), sysconfig.get_path("platlib")])
+    variables = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
+    training = subprocess.Popen([*command, "--iterations", str(ITERATIONS)], cwd=tmp_path, env=variables)
+    try:
+        while not (run / "run.json").exists() and training.poll() is None:
+            time.sleep(0.2)
+        write_repository([new], folder / "stga", blender)
+        extension(blender, profile, "update", "--sync")
+        assert tomllib.loads(installed.read_text())["version"] == __version__
+        assert training.wait(timeout=600) == 0
+    finally:
+        training.kill()
+    assert (run / "avatar.npz").is_file()
+
+
+@pytest.mark.parametrize("blender", BLENDERS[:1], ids=lambda command: "-".join(command[-2:]))
+def test_index_and_page(blender: list[str], zips: tuple[Path, Path], tmp_path: Path) -> None:
+    """Catches a page that names other files than the index, and a repository left half-written."""
+    _, new = zips
+    index = write_repository([new], tmp_path / "repository", blender)
+    entries = json.loads(index.read_text())["data"]
+    assert [entry["version"] for entry in entries] == [__version__]
+    assert new.name in (tmp_path / "repository" / PAGE).read_text()
+    assert (tmp_path / "repository" / new.name).read_bytes() == new.read_bytes()
+    with pytest.raises(StgaError, match="no zips"):
+        write_repository([], tmp_path / "repository", blender)
+    (tmp_path / "broken.zip").write_bytes(b"no zip")
+    with pytest.raises(StgaError, match="index"):
+        write_repository([tmp_path / "broken.zip"], tmp_path / "repository", blender)
+    assert index.is_file()
