@@ -1,13 +1,14 @@
 """Colors of an avatar's splats under the light of a scene."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
-from ..avatar.splats import SH_C0
+from ..avatar.splats import SH_C0, no_strain_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
 from ..capture.rigid import weighted_procrustes
 from ..errors import StgaError
@@ -22,9 +23,9 @@ REFLECTANCE = 0.04
 """Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
 MIN_IRRADIANCE = 0.15
 """Least irradiance of the capture that color is divided by, as a share of its mean: what was darker is noise."""
-HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.1
-"""Part of what arrived in the capture that came back as highlights, which is taken from the recorded colors; at least
-MIN_DIFFUSE_SHARE of them remains."""
+HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.14, 0.1
+"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes, which mirror what is
+in front of them; it is taken from the recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
 VIEW_DIRECTIONS, MIN_VIEW_COSINE = 96, 0.3
 """Recorded colors are means over as many directions from which a splat's surface is seen."""
 
@@ -151,7 +152,8 @@ class Relighter:
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
         linear = srgb_to_linear(np.maximum(color, 0))
-        highlight = HIGHLIGHT_SHARE * self.irradiance / np.pi
+        share = np.where(self.roughness > 0, np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE))
+        highlight = share[:, None] * self.irradiance / np.pi
         albedo = np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
         damping = self.light.damping
         if damping:
@@ -191,3 +193,14 @@ class Relighter:
     @staticmethod
     def _unit(vectors: np.ndarray) -> np.ndarray:
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def albedo_avatar(avatar: Avatar) -> Avatar:
+    """The avatar without its light: colors are albedo in sRGB, from every side and under every strain the same.
+
+    Raises StgaError where the avatar has no light.
+    """
+    color = linear_to_srgb(np.clip(Relighter(avatar).albedo, 0, 1))
+    sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
+    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
+    return replace(avatar, splats=splats, light=None)
