@@ -20,7 +20,7 @@ from .posed_points import RIGID_SIZE
 from .seen_surface import RecordedTake
 from .solve import Observation, normal_equations, smooth_take
 
-MIN_TIMESTEPS = 4
+MIN_TIMESTEPS = 6
 """Below it, a texture averaged over the take is no evidence of how its timesteps differ."""
 SETTLED_WEIGHT = 0.1
 """Least weight of a timestep in the texture of a settled take."""
@@ -38,8 +38,9 @@ FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 8), (0, 3)), 1
 """The same for the best start; and the level in which points that were not fitted tell whether it is better."""
 OPENINGS_M = 0.008, 0.016
 """By which the chin is moved for further starts."""
-USUAL_FACTOR = 1.25
-"""Other starts are tried where the first explains the images worse than those so far by this factor (median)."""
+USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
+"""Other starts are tried where the first leaves a region of the face worse explained, by this factor, than it is at
+this share of the timesteps so far."""
 DAMPING = 1e-3
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which a level is done."""
@@ -105,7 +106,7 @@ def fit_dense(
     before: tuple[_Shot, _Solved] | None = None
     for number, timestep in enumerate(reversed(timesteps) if settled else timesteps):
         report("Refinement" if settled else "Dense tracking", number, len(timesteps))
-        usual = np.median([own.coarse for own in solved.values()], axis=0) if solved else np.zeros(len(REGIONS))
+        usual = np.quantile([own.coarse for own in solved.values()], USUAL_QUANTILE, axis=0) if solved else np.zeros(len(REGIONS))
         shot = solver.shot(timestep)
         solved[timestep] = solver.solve(shot, texture, before, usual)
         before = shot, solved[timestep]

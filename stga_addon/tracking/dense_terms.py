@@ -31,7 +31,7 @@ class PyramidView:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly points are explained, from 0 to 1: over all, and by region (3,), NaN where no point is seen."""
+    """How badly points are explained, from 0 to 1: over all, and by region (3,); 0 where no point is seen."""
 
     all: float
     regions: np.ndarray
@@ -85,8 +85,7 @@ def misfit(
         share = np.where(inside, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
         total += np.bincount(head.region[rows], weight * share, len(REGIONS))
         weights += np.bincount(head.region[rows], weight, len(REGIONS))
-    regions = np.where(weights > 0, total / np.maximum(weights, 1e-9), np.nan)
-    return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), regions)
+    return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), total / np.maximum(weights, 1e-9))
 
 
 def _residual(

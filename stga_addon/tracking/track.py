@@ -184,10 +184,7 @@ def _by_images(
     take = replace(take, landmarks=dense.landmarks)
     dense = fit_dense(fit_surface(head, dense.fit, take, report), take, True, report)
     assert dense is not None
-    regions = {
-        name: {t: float(own.regions[row]) for t, own in dense.misfit.items() if np.isfinite(own.regions[row])}
-        for row, name in enumerate(REGIONS)
-    }
+    regions = {name: {t: float(own.regions[row]) for t, own in dense.misfit.items()} for row, name in enumerate(REGIONS)}
     return dense.fit, regions
 
 
