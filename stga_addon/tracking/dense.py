@@ -106,7 +106,8 @@ def fit_dense(
     before: tuple[_Shot, _Solved] | None = None
     for number, timestep in enumerate(reversed(timesteps) if settled else timesteps):
         report("Refinement" if settled else "Dense tracking", number, len(timesteps))
-        usual = np.quantile([own.coarse for own in solved.values()], USUAL_QUANTILE, axis=0) if solved else np.zeros(len(REGIONS))
+        known = [own.coarse for own in solved.values()] or [np.zeros(len(REGIONS))]
+        usual = np.quantile(known, USUAL_QUANTILE, axis=0)
         shot = solver.shot(timestep)
         solved[timestep] = solver.solve(shot, texture, before, usual)
         before = shot, solved[timestep]

@@ -184,8 +184,8 @@ def _by_images(
     take = replace(take, landmarks=dense.landmarks)
     dense = fit_dense(fit_surface(head, dense.fit, take, report), take, True, report)
     assert dense is not None
-    regions = {name: {t: float(own.regions[row]) for t, own in dense.misfit.items()} for row, name in enumerate(REGIONS)}
-    return dense.fit, regions
+    regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}
+    return dense.fit, {name: {t: own[row] for t, own in regions.items()} for row, name in enumerate(REGIONS)}
 
 
 def interpolated(parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]) -> dict[int, np.ndarray]:
