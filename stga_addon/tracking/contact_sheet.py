@@ -1,6 +1,6 @@
 """Contact sheet of a tracked take: errors of all views, and the mesh drawn over the worst."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,27 +41,43 @@ def write_contact_sheet(
     mesh: Callable[[int], np.ndarray],
     faces: np.ndarray,
     errors: Errors,
+    misfit: Errors | None = None,
 ) -> None:
     """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views with the mesh. What
     lies outside a view's mask is green.
 
-    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3).
+    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3). misfit: region of the
+    face -> timestep -> share of the images that is not explained; it is charted below, and counts as much as the
+    reprojection error in which views are the worst.
     Raises StgaError where the file cannot be written or a frame cannot be read.
     """
-    ranked = sorted(((px, name, t) for name, own in errors.items() for t, px in own.items()), reverse=True)
-    shown = ranked[: COLUMNS * ROWS]
+    misfit = misfit or {}
+    every = {(name, t): px for name, own in errors.items() for t, px in own.items()}
+    unexplained = {t: max(own.get(t, 0.0) for own in misfit.values()) for _, t in every} if misfit else {}
+    median = float(np.median(list(every.values()))) if every else 0.0
+    usual = float(np.median(list(unexplained.values()))) if unexplained else 0.0
+
+    def rank(view: tuple[str, int]) -> tuple[float, str, int]:
+        return every[view] / max(median, 1e-9) + unexplained.get(view[1], 0.0) / max(usual, 1e-9), *view
+
+    shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
     by_name = {camera.name: camera for camera in footage.cameras}
-    median = float(np.median([px for px, _, _ in ranked])) if ranked else 0.0
 
     def picture(camera: FootageCamera, timestep: int) -> np.ndarray:
         return _without_outside(camera.image(timestep), camera.mask(timestep))
 
     tiles = [
-        _tile(picture(by_name[name], t), cameras[name], mesh(t), faces, f"{name}, timestep {t}: {px:.1f} px")
-        for px, name, t in shown
+        _tile(picture(by_name[name], t), cameras[name], mesh(t), faces, _caption(name, t, every, unexplained))
+        for name, t in shown
     ]
+    rows = [(errors, median), (misfit, usual)] if misfit else [(errors, median)]
     with replacing(path) as partial:
-        _sheet(_chart(errors, footage.timesteps, median), tiles, median).save(partial, format="PNG")
+        _sheet(_chart(rows, footage.timesteps), tiles, median).save(partial, format="PNG")
+
+
+def _caption(name: str, timestep: int, errors: Mapping[tuple[str, int], float], misfit: Mapping[int, float]) -> str:
+    text = f"{name}, timestep {timestep}: {errors[name, timestep]:.1f} px"
+    return f"{text}, {misfit[timestep]:.0%} unexplained" if timestep in misfit else text
 
 
 def _sheet(chart: Image.Image, tiles: list[Image.Image], median: float) -> Image.Image:
@@ -86,18 +102,23 @@ def _tile_size() -> tuple[int, int]:
 # Chart
 
 
-def _chart(errors: Errors, timesteps: tuple[int, ...], median: float) -> Image.Image:
-    """A row a camera (of many, those with the largest errors) and a column a timestep."""
-    worst = {name: max(own.values(), default=0.0) for name, own in errors.items()}
-    names = sorted(sorted(worst, key=lambda name: -worst[name])[:MAX_CHART_ROWS], key=list(errors).index)
+def _chart(groups: Sequence[tuple[Errors, float]], timesteps: tuple[int, ...]) -> Image.Image:
+    """A row a camera or region (of many, those with the largest errors), and a column a timestep; groups: errors and
+    their median."""
+    rows = [(name, own[name], median) for own, median in groups for name in _worst_rows(own)]
     width = COLUMNS * (_tile_size()[0] + GAP) - GAP
-    chart = Image.new("RGB", (width, CELL_HEIGHT * len(names)), BACKGROUND)
-    for row, name in enumerate(names):
+    chart = Image.new("RGB", (width, CELL_HEIGHT * len(rows)), BACKGROUND)
+    for row, (name, errors, median) in enumerate(rows):
         _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
-        cells = np.array([_error_color(errors[name].get(t), median) for t in timesteps], np.uint8)[None]
+        cells = np.array([_error_color(errors.get(t), median) for t in timesteps], np.uint8)[None]
         strip = Image.fromarray(cells).resize((width - NAME_WIDTH, CELL_HEIGHT - 1), Image.Resampling.NEAREST)
         chart.paste(strip, (NAME_WIDTH, row * CELL_HEIGHT))
     return chart
+
+
+def _worst_rows(errors: Errors) -> list[str]:
+    worst = {name: max(own.values(), default=0.0) for name, own in errors.items()}
+    return sorted(sorted(worst, key=lambda name: -worst[name])[:MAX_CHART_ROWS], key=list(errors).index)
 
 
 def _error_color(error: float | None, median: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Correction of a tracked take by heads that were posed by hand at some timesteps."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,8 @@ def correct_capture(
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
     chosen = SurfacePoints(places.face[used], places.barycentric[used])
-    heads = corrected(person, chosen, solved, seen, rows, span)
+    trust = np.where(seen, _explained(out, timesteps), 0.0)
+    heads = corrected(person, chosen, solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
         path = out / PARAMETERS / f"{timestep:05d}.npz"
@@ -74,15 +75,15 @@ def corrected(
     model: FlameModel,
     points: SurfacePoints,
     solved: np.ndarray,
-    seen: np.ndarray,
+    trust: np.ndarray,
     keys: Mapping[int, np.ndarray],
     span: int,
 ) -> np.ndarray:
     """Parameters (T, E + 18) that pass through the keys (row -> (E + 18,)) and return to `solved` within `span` rows.
 
-    model: of the person, with expressions alone; seen (T,) bool: rows that have landmarks. The change is smooth, and
-    moves the surface points of rows with landmarks as little as possible; less and less so towards a key, whose
-    neighbors are likely to be wrong in the same way.
+    model: of the person, with expressions alone; trust (T,) from 0 to 1: in the rows as they were solved. The
+    change is smooth, and moves the surface points of rows that are trusted as little as possible; less and less so
+    towards a key, whose neighbors are likely to be wrong in the same way.
     """
     from scipy.sparse import block_diag, csc_matrix, diags, kron
     from scipy.sparse.linalg import spsolve
@@ -96,10 +97,10 @@ def corrected(
     for row, values in keys.items():
         change[row] = values - solved[row]
     near = np.flatnonzero(distance <= span + 2)
-    trust = seen[near] * (distance[near] / (span + 1)) ** 2
+    shares = trust[near] * (distance[near] / (span + 1)) ** 2
     # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter for translation.
     blocks = [
-        share * _stiffness(model, points, solved[row]) + np.eye(size) for row, share in zip(near, trust, strict=True)
+        share * _stiffness(model, points, solved[row]) + np.eye(size) for row, share in zip(near, shares, strict=True)
     ]
     matrix = block_diag(blocks)
     second = _second_differences(near)
@@ -194,6 +195,23 @@ def _landmarks(out: Path, footage: Footage, places: SurfacePoints, used: np.ndar
     return found
 
 
+def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
+    """Region -> timestep -> share of the images that is not explained, of a report; empty where it has none."""
+    return {
+        name: {int(t): float(value) for t, value in own.items()} for name, own in report.get("image_misfit", {}).items()
+    }
+
+
+def _explained(out: Path, timesteps: Sequence[int]) -> np.ndarray:
+    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain; 1 where that is not known."""
+    try:
+        misfit = _misfit(read_json(out / REPORT_FILE))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise StgaError(f"{out / REPORT_FILE}: image_misfit: expected shares by region and timestep") from error
+    worst = [max((own.get(t, 0.0) for own in misfit.values()), default=0.0) for t in timesteps]
+    return 1 - np.clip(worst, 0.0, 1.0)
+
+
 def _report_errors(
     out: Path,
     capture: Capture,
@@ -219,4 +237,4 @@ def _report_errors(
         out / REPORT_FILE,
         {**report, "median_reprojection_px": round(float(np.median(every)), 3), "reprojection_px": rounded},
     )
-    write_contact_sheet(out / SHEET_FILE, footage, cameras, capture.mesh, capture.faces, errors)
+    write_contact_sheet(out / SHEET_FILE, footage, cameras, capture.mesh, capture.faces, errors, _misfit(report))

@@ -56,6 +56,12 @@ class PosedPoints:
         """(N, 3) meters; rigid (18,): pose, then translation."""
         return self._posed(coefficients, rigid).positions
 
+    def triangle_normals(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
+        """(N, 3) unit normals of the posed triangles that the points lie on."""
+        a, b, c = self._posed(coefficients, rigid).corners.reshape(-1, 3, 3).swapaxes(0, 1)
+        normals = np.cross(b - a, c - a)
+        return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20))
+
     def linearized(self, coefficients: np.ndarray, rigid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed, count = self._posed(coefficients, rigid), len(self.barycentric)
@@ -85,7 +91,8 @@ class PosedPoints:
         skin = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
         posed = (skin @ corrected[..., None])[..., 0] + self.weights @ moved
         positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:]
-        return _Posed(positions, rigid[:POSE_SIZE].reshape(-1, 3), local, rotations, places, moved, corrected, skin)
+        angles = rigid[:POSE_SIZE].reshape(-1, 3)
+        return _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
 
     def _corrective_dirs(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
         """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root has none."""
@@ -132,7 +139,8 @@ class PosedPoints:
 @dataclass(frozen=True)
 class _Posed:
     """One evaluation: positions (N, 3); of J joints axis-angles (J, 3), local and world rotations (J, 3, 3), places in
-    the world (J, 3) and `_moves` (J, 3); of the 3 N corners, corrected positions and blended rotations (3 N, 3, 3)."""
+    the world (J, 3) and `_moves` (J, 3); of the 3 N corners, corrected positions, blended rotations (3 N, 3, 3) and
+    positions."""
 
     positions: np.ndarray
     angles: np.ndarray
@@ -142,6 +150,7 @@ class _Posed:
     moved: np.ndarray
     corrected: np.ndarray
     skin: np.ndarray
+    corners: np.ndarray
 
 
 def _moves(rotations: np.ndarray, places: np.ndarray, joints: np.ndarray) -> np.ndarray:

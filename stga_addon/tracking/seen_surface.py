@@ -64,6 +64,16 @@ class RecordedTake:
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
     """Centers of about `count` triangles, spread evenly over the area of the head's large connected parts."""
+    vertices, faces = head.model.v_template, head.model.faces
+    large = large_parts(head)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.cumsum(np.where(large, np.linalg.norm(np.cross(b - a, c - a), axis=1), 0.0))
+    face = np.unique(np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1]))
+    return SurfacePoints(face, np.full((len(face), 3), 1 / 3))
+
+
+def large_parts(head: HeadModel) -> np.ndarray:
+    """(F,) bool: triangles of connected parts larger than eyeballs and teeth."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -72,11 +82,7 @@ def surface_points(head: HeadModel, count: int) -> SurfacePoints:
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
     _, part = connected_components(graph, directed=False)
     extent = np.array([np.ptp(vertices[part == number], axis=0).max() for number in range(part.max() + 1)])
-    large = (extent > MIN_PART_SHARE * np.ptp(vertices, axis=0).max())[part[faces[:, 0]]]
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.where(large, np.linalg.norm(np.cross(b - a, c - a), axis=1), 0.0))
-    face = np.unique(np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1]))
-    return SurfacePoints(face, np.full((len(face), 3), 1 / 3))
+    return np.asarray((extent > MIN_PART_SHARE * np.ptp(vertices, axis=0).max())[part[faces[:, 0]]])
 
 
 def seen_surface(

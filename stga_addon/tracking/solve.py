@@ -1,6 +1,6 @@
 """Least squares for identity, expression and pose from triangulated landmarks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,10 @@ CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations stop."""
 WINDOW, OVERLAP = 192, 24
 """Timesteps solved at once, and how many of them two windows share: memory does not grow with the take."""
+
+
+Terms = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Timestep's number and parameters (E + 18,) -> its Gauss–Newton matrix and right-hand side, which are changed."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def solve_identity(
     sized = np.concatenate([columns[0], scale_sigma * model.v_template[..., None], columns[1]], axis=2)
     points = PosedPoints(replace(model, shapedirs=sized), places)
     shared, own = known + 1, expressions + RIGID_SIZE
-    prior = np.concatenate([np.ones(shared), np.tile(_precision(head), len(observations))])
+    prior = np.concatenate([np.ones(shared), np.tile(parameter_precision(head), len(observations))])
     state = np.zeros(shared + own * len(observations))
     for number, start in enumerate(rigid):
         state[shared + own * (number + 1) - RIGID_SIZE : shared + own * (number + 1)] = start
@@ -104,15 +108,18 @@ def solve_take(
     cuts, are not smoothed. Memory does not grow with the take beyond its observations.
     """
     points = PosedPoints(head.model, places)
-    solved = start.copy()
-    for first in range(0, len(start), WINDOW - OVERLAP):
-        window = slice(first, min(first + WINDOW, len(start)))
-        found = _solve_window(head, points, observations[window], solved[window])
-        kept = 0 if first == 0 else OVERLAP // 2
-        solved[first + kept : window.stop] = found[kept:]
-        if window.stop == len(start):
-            break
-    return solved
+    return _solve_windows(head, lambda row, values: normal_equations(points, values, observations[row]), start)
+
+
+def smooth_take(head: HeadModel, start: np.ndarray, terms: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Parameters (T, E + 18) of consecutive timesteps from the Gauss–Newton matrix and right-hand side that each has at
+    `start`, with the prior and smoothness over time."""
+
+    def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        matrix, right = terms[row]
+        return matrix.copy(), right - matrix @ (values - start[row])
+
+    return _solve_windows(head, linear, start)
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
@@ -135,19 +142,29 @@ def normal_equations(
     return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
 
 
-def _solve_window(
-    head: HeadModel, points: PosedPoints, observations: Sequence[Observation], start: np.ndarray
-) -> np.ndarray:
+def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray) -> np.ndarray:
+    solved = start.copy()
+    for first in range(0, len(start), WINDOW - OVERLAP):
+        window = slice(first, min(first + WINDOW, len(start)))
+        found = _solve_window(head, terms, first, solved[window])
+        kept = 0 if first == 0 else OVERLAP // 2
+        solved[first + kept : window.stop] = found[kept:]
+        if window.stop == len(start):
+            break
+    return solved
+
+
+def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray) -> np.ndarray:
     from scipy.linalg import solveh_banded
 
     count, size = start.shape
-    prior, stiffness = _precision(head), _acceleration_precision(head.model)
+    prior, stiffness = parameter_precision(head), _acceleration_precision(head.model)
     state = start.copy()
     for _ in range(TAKE_ITERATIONS):
         band = np.zeros((2 * size + 1, count * size)) if count > 2 else np.zeros((size, count * size))
         right = np.zeros((count, size))
-        for number, observation in enumerate(observations):
-            block, right[number] = normal_equations(points, state[number], observation)
+        for number in range(count):
+            block, right[number] = terms(first + number, state[number])
             block[np.diag_indices(size)] += prior
             right[number] -= prior * state[number]
             for offset in range(size):
@@ -175,7 +192,7 @@ def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stif
                 band[(row - column) * size, at : at + size] += share * first * other
 
 
-def _precision(head: HeadModel) -> np.ndarray:
+def parameter_precision(head: HeadModel) -> np.ndarray:
     """(E + 18,) inverse variances of a timestep's parameters around zero."""
     joints = [
         JOINT_SIGMA_RAD[name] if present else (ABSENT_SIGMA,) * 3

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from os.path import realpath
 from pathlib import Path
@@ -17,6 +17,8 @@ from ..files import read_json, write_json
 from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
+from .dense import fit_dense
+from .dense_head import REGIONS
 from .detectors import make_detector
 from .fit import (
     MAX_HEAD_SCALE,
@@ -31,7 +33,7 @@ from .fit import (
 )
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
 from .footage.model import Footage, FootageCamera
-from .head_model import read_head_model
+from .head_model import HeadModel, read_head_model
 from .landmarks import (
     CameraLandmarks,
     Report,
@@ -64,12 +66,15 @@ class TrackingReport:
     interpolated     timesteps without a face, filled from their neighbors
     scale            meters per unit of the cameras' world
     warnings         one sentence each
+    image_misfit     region of the face -> timestep -> share of the images' points that are not explained, from 0 to 1;
+                     empty for takes too short for dense tracking
     """
 
     reprojection_px: Mapping[str, Mapping[int, float]]
     interpolated: tuple[int, ...]
     scale: float
     warnings: tuple[str, ...]
+    image_misfit: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
 
     @property
     def median_px(self) -> float:
@@ -130,7 +135,7 @@ def track(
     fit = fit_head(head, places, reliable, take, report, metric)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
     recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
-    fit = fit_surface(head, fit, recorded, report)
+    fit, misfits = _by_images(head, fit, recorded, report)
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
@@ -150,6 +155,7 @@ def track(
         _warnings(footage, found, fit, keep and not metric)
         + scale_warnings(fit, places, reliable, footage, found)
         + matte_warnings,
+        misfits,
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -160,11 +166,26 @@ def track(
         lambda timestep: posed_mesh(fit, parameters[timestep]),
         fit.head.model.faces,
         result.reprojection_px,
+        result.image_misfit,
     )
     if landmarks is not None:  # what a correction of the capture starts from
         write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
     write_capture(out, footage, fit, parameters, meshes, report)
     return result
+
+
+def _by_images(
+    head: HeadModel, fit: HeadFit, take: RecordedTake, report: Report
+) -> tuple[HeadFit, dict[str, dict[int, float]]]:
+    """The fit moved onto what the images show, and region -> timestep -> how badly they are explained (`Misfit`)."""
+    dense = fit_dense(fit, take, report=report)
+    if dense is None:
+        return fit_surface(head, fit, take, report), {}
+    take = replace(take, landmarks=dense.landmarks)
+    dense = fit_dense(fit_surface(head, dense.fit, take, report), take, True, report)
+    assert dense is not None
+    regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}
+    return dense.fit, {name: {t: own[row] for t, own in regions.items()} for row, name in enumerate(REGIONS)}
 
 
 def interpolated(parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]) -> dict[int, np.ndarray]:
@@ -314,14 +335,15 @@ def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadF
 
 
 def _as_json(result: TrackingReport) -> dict[str, Any]:
-    errors = {
-        name: {str(timestep): round(px, 3) for timestep, px in own.items()}
-        for name, own in result.reprojection_px.items()
-    }
     return {
         "median_reprojection_px": round(result.median_px, 3),
         "meters_per_unit": result.scale,
         "interpolated": list(result.interpolated),
         "warnings": list(result.warnings),
-        "reprojection_px": errors,
+        "reprojection_px": _rounded(result.reprojection_px),
+        "image_misfit": _rounded(result.image_misfit),
     }
+
+
+def _rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
+    return {name: {str(timestep): round(value, 3) for timestep, value in own.items()} for name, own in values.items()}

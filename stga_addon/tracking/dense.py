@@ -1,0 +1,262 @@
+"""Dense tracking: expression and pose that explain the images by the head's own texture (analysis by synthesis).
+
+Landmarks fail where faces do most; the skin between them does not. As in Face2Face (Thies et al. 2016), the texture is
+averaged over cameras and timesteps of the fit so far, and every timestep is moved by Gauss–Newton until the texture,
+under that view's lighting, looks like the images.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..capture.model import evenly_spread
+from .appearance import Texture, average_texture, pyramid, robust
+from .dense_head import HELD_OUT_LEVEL, REGIONS, DenseHead
+from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, samples
+from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, triangulated
+from .landmarks import Report
+from .posed_points import RIGID_SIZE
+from .seen_surface import RecordedTake
+from .solve import Observation, normal_equations, smooth_take
+
+MIN_TIMESTEPS = 6
+"""Below it, a texture averaged over the take is no evidence of how its timesteps differ."""
+SETTLED_WEIGHT = 0.1
+"""Least weight of a timestep in the texture of a settled take."""
+TEXTURE_TIMESTEPS, MAX_CAMERAS = 32, 8
+"""Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are compared."""
+LANDMARK_SHARE, INNER_SHARE = 0.01, 0.3
+"""Weight of landmarks beside the images; of those on eyeballs, whose reflections no texture shows."""
+REGION_SCALE_M = 0.004
+"""Median distance of a region's landmarks from the head at which the region's weight has fallen to a quarter."""
+DISAGREEMENT_M = 0.0015
+"""The same, of the distance beyond that at most timesteps, for landmarks of which a fit begins again."""
+START_STEPS, START_LEVEL = ((3, 2), (2, 2)), 2
+"""Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which starts are compared."""
+FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 8), (0, 3)), 1
+"""The same for the best start; and the level in which points that were not fitted tell whether it is better."""
+OPENINGS_M = 0.008, 0.016
+"""By which the chin is moved for further starts."""
+USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
+"""Other starts are tried where the first leaves a region of the face worse explained, by this factor, than it is at
+this share of the timesteps so far."""
+DAMPING = 1e-3
+CONVERGED_STEP = 1e-3
+"""Largest change of a parameter (standard deviations, radians, meters) after which a level is done."""
+MAX_TURN = 0.3
+"""Of a joint in one step, in radians."""
+MAX_GROWTH, SMALL_MISS_M = 1.5, 0.001
+"""Of the landmarks' distance in a region that the images do not explain better."""
+
+
+@dataclass(frozen=True)
+class DenseFit:
+    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly images are explained at
+    each timestep."""
+
+    fit: HeadFit
+    landmarks: Mapping[int, TimestepLandmarks]
+    misfit: Mapping[int, Misfit]
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """What is known of a timestep: views, triangulated landmarks, and where the fit so far is."""
+
+    views: Sequence[PyramidView]
+    landmarks: Observation
+    start: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit of the regions (3,) in coarse images,
+    misfit, distances of the landmarks (L,), and whether it is better than the start."""
+
+    values: np.ndarray
+    visible: np.ndarray
+    terms: tuple[np.ndarray, np.ndarray]
+    coarse: np.ndarray
+    misfit: Misfit
+    missed: np.ndarray
+    better: bool
+
+
+def fit_dense(
+    fit: HeadFit,
+    take: RecordedTake,
+    settled: bool = False,
+    report: Report = lambda stage, done, total: None,
+) -> DenseFit | None:
+    """Expression and pose of every timestep from the images; None where the take is too short for it.
+
+    Each timestep starts where the fit is, and where that explains the images badly, where optical flow carries its
+    neighbor and with the mouth opened wider. It keeps what it had unless points are explained better that were not
+    fitted.
+    settled: the fit is one of images already; every timestep counts in the texture, not only those at rest, and the
+    take is followed backwards.
+    """
+    timesteps = sorted(take.landmarks)
+    if len(timesteps) < MIN_TIMESTEPS:
+        return None
+    solver = _Solver(fit, take)
+    texture = solver.texture(evenly_spread(timesteps, TEXTURE_TIMESTEPS), settled)
+    solved: dict[int, _Solved] = {}
+    before: tuple[_Shot, _Solved] | None = None
+    for number, timestep in enumerate(reversed(timesteps) if settled else timesteps):
+        report("Refinement" if settled else "Dense tracking", number, len(timesteps))
+        known = [own.coarse for own in solved.values()] or [np.zeros(len(REGIONS))]
+        usual = np.quantile(known, USUAL_QUANTILE, axis=0)
+        shot = solver.shot(timestep)
+        solved[timestep] = solver.solve(shot, texture, before, usual)
+        before = shot, solved[timestep]
+    ordered = [solved[timestep] for timestep in timesteps]
+    smooth = smooth_take(solver.head.head, np.stack([own.values for own in ordered]), [own.terms for own in ordered])
+    parameters = {t: solver.head.complete(values) for t, values in zip(timesteps, smooth, strict=True)}
+    moved = replace(fit, parameters=parameters)
+    return DenseFit(moved, solver.agreeing(moved, solved), {t: solved[t].misfit for t in timesteps})
+
+
+class _Solver:
+    """Gauss–Newton at the timesteps of a take."""
+
+    def __init__(self, fit: HeadFit, take: RecordedTake) -> None:
+        self.head = DenseHead(fit.head, take.places, take.reliable)
+        self._fit, self._take = fit, take
+
+    def shot(self, timestep: int) -> _Shot:
+        """Read a timestep."""
+        parameters, world = self._fit.parameters[timestep], self._fit.to_capture
+        start = self.head.reduced(parameters)
+        center, views = self.head.positions(start).mean(0), []
+        for camera, image in evenly_spread(self._take.images(timestep), MAX_CAMERAS):
+            own = world.camera(camera)
+            views.append(PyramidView(camera.world_to_camera.tobytes(), own, pyramid(own, image, center)))
+        model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
+        seen = by_visibility(self._take.landmarks[timestep], self._fit.head, places, parameters, world)
+        found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
+        return _Shot(views, observed_landmarks(found, world, reliable), start)
+
+    def texture(self, timesteps: Sequence[int], settled: bool) -> Texture:
+        """The texture that these timesteps show."""
+        starts = [self.head.reduced(self._fit.parameters[t]) for t in timesteps]
+        weights = np.maximum(self.head.rest(starts), SETTLED_WEIGHT if settled else 0.0)
+        found = []
+        for timestep, start, weight in zip(timesteps, starts, weights, strict=True):
+            views = self.shot(timestep).views
+            visible = self.head.visibility(start, [view.camera for view in views])
+            found += samples(self.head, views, start, weight * visible)
+        return average_texture(found)
+
+    def solve(self, shot: _Shot, texture: Texture, before: tuple[_Shot, _Solved] | None, usual: np.ndarray) -> _Solved:
+        """The parameters that explain a timestep best; before: another timestep and its result."""
+        cameras = [view.camera for view in shot.views]
+        visible = self.head.visibility(shot.start, cameras)
+        best, error = self._started(shot, texture, shot.start, visible)
+        if (error.regions > USUAL_FACTOR * usual).any():
+            others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
+            if before is not None:
+                others.append(flow_start(self.head, before[0].views, before[1].visible, before[1].values, shot.views))
+            for other in others:
+                values, found = self._started(shot, texture, other, visible)
+                if found.all < error.all:
+                    best, error = values, found
+        visible = self.head.visibility(best, cameras)
+        best = self._descended(shot, texture, best, visible, FINE_STEPS)
+        return self._judged(shot, texture, best, visible, error.regions)
+
+    def _judged(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, coarse: np.ndarray
+    ) -> _Solved:
+        """The result, or the start where the result is not better."""
+        old, new = (
+            misfit(self.head, shot.views, visible, texture, own, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
+            for own in (shot.start, values)
+        )
+        was, missed = self._missed(shot.landmarks, shot.start), self._missed(shot.landmarks, values)
+        if new.all < old.all and not self._burst(shot.landmarks, was, missed, new.regions >= old.regions):
+            terms = self._terms(shot, texture, values, visible, 0)
+            return _Solved(values, visible, terms, coarse, new, missed, True)
+        matrix, _ = normal_equations(self.head.landmarks, shot.start, shot.landmarks)
+        terms = matrix, self.head.precision * shot.start  # the start is where these are least
+        return _Solved(shot.start, visible, terms, coarse, old, was, False)
+
+    def _burst(self, landmarks: Observation, was: np.ndarray, now: np.ndarray, worse: np.ndarray) -> bool:
+        """Whether landmarks are missed by much more in a region that the images do not explain better."""
+        for region in np.flatnonzero(worse):
+            use = (self.head.landmark_region == region) & (landmarks.weight > 0)
+            if use.any() and np.median(now[use]) > MAX_GROWTH * np.median(was[use]) + SMALL_MISS_M:
+                return True
+        return False
+
+    def _started(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
+    ) -> tuple[np.ndarray, Misfit]:
+        """Parameters after the steps in coarse images, and how badly these are explained."""
+        values = self._descended(shot, texture, values, visible, START_STEPS)
+        return values, misfit(self.head, shot.views, visible, texture, values, START_LEVEL, START_LEVEL)
+
+    def _descended(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, plan: Sequence[tuple[int, int]]
+    ) -> np.ndarray:
+        """Parameters after up to so many steps in each level of the plan."""
+        for level, steps in plan:
+            for _ in range(steps):
+                step = self._step(shot, texture, values, visible, level)
+                values = values + step
+                if np.abs(step).max() < CONVERGED_STEP:
+                    break
+        return values
+
+    def _step(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int) -> np.ndarray:
+        """A damped Gauss–Newton step."""
+        matrix, right = self._terms(shot, texture, values, visible, level)
+        matrix = matrix + np.diag(self.head.precision)
+        matrix[np.diag_indices(len(matrix))] *= 1 + DAMPING
+        step = np.linalg.solve(matrix, right - self.head.precision * values)
+        return np.asarray(step / max(1.0, np.abs(step[-RIGID_SIZE:-3]).max() / MAX_TURN))
+
+    def _terms(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior."""
+        at, jacobian = self.head.linearized(values, level)
+        curvature, slope = photo_term(self.head, shot.views, visible, texture, values, at, level)
+        share = len(self.head.rows[0]) / len(at)  # a level weighs the same with fewer points
+        flat = jacobian.reshape(-1, len(values))
+        weighted = replace(shot.landmarks, weight=self._landmark_weight(shot.landmarks, values))
+        matrix, right = normal_equations(self.head.landmarks, values, weighted)
+        return matrix + share * flat.T @ (curvature @ jacobian).reshape(
+            flat.shape
+        ), right + share * flat.T @ slope.ravel()
+
+    def _landmark_weight(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
+        """(L,): of regions whose landmarks are far from the head, less."""
+        missed, weight = self._missed(landmarks, values), landmarks.weight.copy()
+        for region in range(len(REGIONS)):
+            own = self.head.landmark_region == region
+            if (own & (weight > 0)).any():
+                weight[own] *= robust(np.median(missed[own & (weight > 0)]), REGION_SCALE_M)
+        return np.asarray(weight * np.where(self.head.skin, LANDMARK_SHARE, INNER_SHARE))
+
+    def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
+        """(L,) distance in meters of the landmarks from the head, as far as the cameras determine it."""
+        away = self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]) - landmarks.position
+        return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", landmarks.root, away), axis=1))
+
+    def agreeing(self, fit: HeadFit, solved: Mapping[int, _Solved]) -> dict[int, TimestepLandmarks]:
+        """The take's landmarks, moved towards the fit in regions where they miss it by more than they mostly do."""
+        regions = [self.head.landmark_region == number for number in range(len(REGIONS))]
+        used = [own & self._take.reliable for own in regions]
+        missed = {t: [np.median(own.missed[use]) if use.any() else 0.0 for use in used] for t, own in solved.items()}
+        usual = np.median(list(missed.values()), axis=0)
+        moved = {}
+        for timestep, own in self._take.landmarks.items():
+            values = self.head.reduced(fit.parameters[timestep])
+            at = self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+            beyond = np.maximum(np.array(missed[timestep]) - usual, 0) * solved[timestep].better
+            weight = robust(beyond, DISAGREEMENT_M)[self.head.landmark_region][:, None]
+            seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
+            moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)
+        return moved

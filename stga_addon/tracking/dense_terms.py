@@ -1,0 +1,156 @@
+"""What dense tracking minimizes at one timestep: the difference of images from the texture, and optical flow."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..capture.camera import Camera
+from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, Level, Sample, Texture, fitted_light, robust, sampled, shading
+from .dense_head import REGIONS, DenseHead
+
+POINT_SHARE = 0.25
+"""Weight of a point in a view: neighboring points share pixels."""
+OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
+"""By level: squared difference in NOISE_LEVELS at which a point is explained by half."""
+FLOW_LEVEL, FLOW_POINTS, FLOW_ITERATIONS = 1, 2, 4
+"""Pyramid level of the images of optical flow, level of the points that it moves, and Gauss–Newton steps."""
+FLOW_SHARE, FLOW_SCALE_PX = 0.3, 2.0
+"""Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
+
+
+@dataclass(frozen=True)
+class PyramidView:
+    """One camera's image at a timestep: key and pose of the camera in the capture's world, and pyramid."""
+
+    key: bytes
+    camera: Camera
+    levels: Sequence[Level]
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How badly points are explained, from 0 to 1: over all, and by region (3,); 0 where no point is seen."""
+
+    all: float
+    regions: np.ndarray
+
+
+def samples(head: DenseHead, views: Sequence[PyramidView], values: np.ndarray, weight: np.ndarray) -> list[Sample]:
+    """What the views show of the head's points; weight (C, N)."""
+    at, basis = head.positions(values), head.light_basis(values)
+    found = []
+    for view, own in zip(views, weight, strict=True):
+        levels = [sampled(level.channels, level.camera.project(at)[0]).astype(np.float64) for level in view.levels]
+        found.append(Sample(view.key, levels, basis, own * _inside(view.levels[0].camera, at)))
+    return found
+
+
+def photo_term(
+    head: DenseHead, views: Sequence[PyramidView], visible: np.ndarray, texture: Texture, values: np.ndarray,
+    at: np.ndarray, level: int,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Gauss–Newton terms of the points `at` (M, 3) of a level: H (M, 3, 3) and b (M, 3) by their positions."""
+    matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
+    basis, rows = head.light_basis(values, level), head.rows[level]
+    for view, seen in zip(views, visible, strict=True):
+        own = view.levels[level]
+        weight = seen[rows] * texture.trust[rows] * _inside(own.camera, at)
+        near = np.flatnonzero(weight)
+        if not len(near):
+            continue
+        residual, pixels = _residual(view, texture, at[near], basis[near], weight[near], rows[near], level)
+        used = POINT_SHARE * weight[near] / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
+        gradient = np.stack([sampled(part, pixels) for part in own.gradient], axis=2) / NOISE_LEVELS  # channel, x or y
+        by_position = gradient @ projection_derivative(own.camera, at[near])
+        weighted = (used[:, None] * CHANNEL_WEIGHTS)[..., None] * by_position
+        matrix[near] += weighted.swapaxes(1, 2) @ by_position
+        right[near] -= (weighted * residual[..., None]).sum(1)
+    return matrix, right
+
+
+def misfit(
+    head: DenseHead, views: Sequence[PyramidView], visible: np.ndarray, texture: Texture, values: np.ndarray,
+    points: int, level: int,
+) -> Misfit:  # fmt: skip
+    """How badly a level's images are explained at the points of a level."""
+    at, basis, rows = head.level_positions(values, points), head.light_basis(values, points), head.rows[points]
+    total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
+    for view, seen in zip(views, visible, strict=True):
+        weight = seen[rows] * texture.trust[rows]
+        inside = _inside(view.levels[level].camera, at)
+        residual, _ = _residual(view, texture, at, basis, weight * inside, rows, level)
+        squared = residual**2 @ CHANNEL_WEIGHTS
+        share = np.where(inside, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
+        total += np.bincount(head.region[rows], weight * share, len(REGIONS))
+        weights += np.bincount(head.region[rows], weight, len(REGIONS))
+    return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), total / np.maximum(weights, 1e-9))
+
+
+def _residual(
+    view: PyramidView, texture: Texture, at: np.ndarray, basis: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+    level: int,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Channels (M, 3) of the image minus those of the lit texture, in NOISE_LEVELS, and the pixels (M, 2)."""
+    own = view.levels[level]
+    pixels, _ = own.camera.project(at)
+    values, target = sampled(own.channels, pixels), texture.values[view.key][level][rows]
+    light = fitted_light(values, target, basis, weight, texture.lights[view.key])
+    return (values - target * shading(basis, light)) / NOISE_LEVELS, pixels
+
+
+def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(N, 2, 3): derivatives of the pixels of points (N, 3) by their positions."""
+    turn = camera.world_to_camera[:3, :3]
+    x, y, z = (points @ turn.T + camera.world_to_camera[:3, 3]).T
+    z, none = np.maximum(z, 1e-6), np.zeros(len(points))
+    rows = [camera.fl_x / z, none, -camera.fl_x * x / z**2], [none, camera.fl_y / z, -camera.fl_y * y / z**2]
+    return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1) @ turn)
+
+
+def flow_start(
+    head: DenseHead, before: Sequence[PyramidView], visible: np.ndarray, values: np.ndarray, now: Sequence[PyramidView]
+) -> np.ndarray:
+    """Parameters at a timestep to which optical flow (DIS, Kroeger et al. 2016) carries the head of another one.
+
+    before, visible (C, N), values: of the other timestep.
+    """
+    targets = list(_flow_targets(head.level_positions(values, FLOW_POINTS), before, now))
+    weights = {view.key: own[head.rows[FLOW_POINTS]] for view, own in zip(before, visible, strict=True)}
+    moved = values
+    for _ in range(FLOW_ITERATIONS):
+        at, jacobian = head.linearized(moved, FLOW_POINTS)
+        matrix, right = np.diag(head.precision), -head.precision * moved
+        for key, camera, target in targets:
+            miss = camera.project(at)[0] - target
+            weight = np.repeat(FLOW_SHARE * weights[key] * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX), 2)
+            flat = (projection_derivative(camera, at) @ jacobian).reshape(len(weight), -1)
+            matrix, right = matrix + (flat.T * weight) @ flat, right - flat.T @ (weight * miss.ravel())
+        moved = moved + np.linalg.solve(matrix, right)
+    return moved
+
+
+def _flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[PyramidView]) -> Any:
+    """(key, camera, pixels (M, 2) that points at `at` have moved to) of each camera that saw both timesteps."""
+    import cv2
+
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    first = {view.key: view.levels[FLOW_LEVEL] for view in before}
+    for view in now:
+        level, old = view.levels[FLOW_LEVEL], first.get(view.key)
+        if old is None or old.channels.shape != level.channels.shape or min(old.channels.shape[:2]) < MIN_FLOW_SIDE_PX:
+            continue
+        pictures = [np.clip(own.channels[..., 0], 0, 255).astype(np.uint8) for own in (old, level)]
+        pixels, _ = old.camera.project(at)
+        yield view.key, level.camera, pixels + sampled(flow.calc(*pictures, None), pixels)
+
+
+MIN_FLOW_SIDE_PX = 32
+"""Smaller images are too small for the patches of DIS."""
+
+
+def _inside(camera: Camera, at: np.ndarray) -> np.ndarray:
+    """(N,) bool: points whose pixels lie in the image, a pixel from its border."""
+    pixels, depth = camera.project(at)
+    return np.asarray((pixels > 1).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1) & (depth > 0))
