@@ -118,7 +118,7 @@ def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
     area = _at(np.stack([along_x[:, 0], along_y[:, 0], constant[:, 0]], -1), x[:, 0], y[:, 0])
     with np.errstate(divide="ignore"):
         inverse = np.where(area != 0, 1 / area, 0.0)
-    return np.stack([along_x, along_y, constant], -1) * inverse[:, None, None]
+    return np.asarray(np.stack([along_x, along_y, constant], -1) * inverse[:, None, None])
 
 
 def _at(slopes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -105,7 +105,15 @@ def sum_by_triangle(rows, face, gradient, total, trained):
             total[f, c] += gradient[i, c]
 
 
-def scale_limit(rows, log_scale, face, unbound, limits, weight, gradient):
+def scale_limit(
+    rows: np.ndarray,
+    log_scale: np.ndarray,
+    face: np.ndarray,
+    unbound: np.ndarray,
+    limits: np.ndarray,
+    weight: float,
+    gradient: np.ndarray,
+) -> float:
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
 
     limits (2, F) per triangle, of bound and of unbound splats, in the unit of the splats' local scale. Returns the

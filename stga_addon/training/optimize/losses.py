@@ -25,7 +25,7 @@ def whole_image(height: int, width: int, parts: tuple[int, int] = (2, 4)) -> np.
 
 
 def _edges(side: int, count: int) -> list[int]:
-    return np.linspace(0, side, min(count, side) + 1).astype(int).tolist()
+    return [side * n // min(count, side) for n in range(min(count, side) + 1)]
 
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -53,7 +53,8 @@ def image_gradient(
 def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:
     """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
     unused = np.empty_like(image)
-    return image_gradient(image, target, whole_image(*image.shape[1:]), 1.0, unused)[1]
+    _, height, width = image.shape
+    return image_gradient(image, target, whole_image(height, width), 1.0, unused)[1]
 
 
 def scale_limits(capture: Capture, settings: TrainingSettings) -> np.ndarray:
