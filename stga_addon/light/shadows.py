@@ -64,7 +64,7 @@ class ShadowMap:
         from ..raster.cpu.shadow import add_depths
 
         self._project = light_projection(vertices, light, size)
-        self._light, self._texel_m = light, 2 * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2 / size
+        self._light, self._texel_m = light, float(np.linalg.norm(np.ptp(vertices, axis=0))) / size
         self.depth = np.full((size, size), np.inf, np.float32)
         add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
         for caster in casters:
@@ -95,4 +95,4 @@ class ShadowMap:
             cosine = (normals * away).sum(1) / np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         cosine = np.clip(cosine, 0.05, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
-        return np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)).astype(np.float32)
+        return np.asarray(np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32)
