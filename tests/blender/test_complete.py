@@ -61,13 +61,12 @@ bpy.ops.stga.show_avatar(filepath=settings.avatar)
 bpy.ops.stga.open_demo()
 result["next run"] = settings.run_folder
 result["log"] = (Path(result["run"]) / "job/worker.log").read_text()
-files = bpy.context.preferences.extensions.repos["user_default"].directory
 environment = sys.modules[module + ".stga_addon.requests.environment_job"]
 result["check"] = environment.check_python(sys.executable)
 bpy.ops.preferences.addon_disable(module=module)
 index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
-installed = Path(files)
+installed = Path(bpy.context.preferences.extensions.repos[index].directory)
 found = [*installed.parent.rglob("*torch*"), *installed.glob("stga*")]
 result["left"] = [str(path) for path in found]
 print("RESULT " + json.dumps(result))

@@ -37,6 +37,7 @@ OPERATORS = (
     "mark_key",
     "solve_again",
     "export_head_model",
+    "open_demo",
     "import_capture",
     "import_motion",
     "import_meshes",

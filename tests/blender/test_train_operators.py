@@ -365,9 +365,8 @@ def test_file_made_without_the_panel(extension, tmp_path):
 @pytest.mark.slow
 def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch):
     """Catches an environment that a script cannot make or test, and a network used although Blender is offline."""
-    monkeypatch.setattr(
-        extension.operators.environment, "environment_folder", lambda create=False: tmp_path / "environment"
-    )
+    for module in (extension.operators.environment, extension.operators.make_environment):
+        monkeypatch.setattr(module, "environment_folder", lambda create=False: tmp_path / "environment")
     python = str(tmp_path / "python")
     with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
         bpy.ops.stga.test_environment(python=python)
