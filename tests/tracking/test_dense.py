@@ -167,13 +167,13 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
 @pytest.mark.slow
 def test_track_reports_what_the_images_do_not_explain(tmp_path):
     """Catches dense tracking that `track` does not run, and a report without it."""
-    take = scene(np.radians([-30, 30]), openings=OPENINGS[:6], size=(70, 90)).take
+    take = scene(np.radians([-40, 0, 40]), openings=OPENINGS[:6], size=(100, 130)).take
     cameras = take.landmarks[0].cameras
     pictures = {(camera.position.tobytes(), t): image for t in range(6) for camera, image in take.images(t)}
     write_footage(tmp_path / "footage", cameras, 6, lambda camera, t: pictures[camera.position.tobytes(), t])
     write_flame(synthetic_head(0, 1).model, tmp_path / "head.npz")
     write_places(tmp_path / "points" / PLACES_FILE, take.places, take.reliable)
-    for number in range(2):
+    for number in range(3):
         points = np.stack([take.landmarks[t].points[number] for t in range(6)])
         write_npz(tmp_path / f"points/cam{number}.npz", {"timesteps": np.arange(6), "points": points})
     result = track(
