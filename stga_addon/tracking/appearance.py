@@ -1,6 +1,6 @@
 """Appearance of a head's surface points: sampled in pyramids of calibrated images, freed of lighting, averaged."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,8 +62,8 @@ class Texture:
     trust   (N,) from 0 to 1: low for what looks different from view to view, as hair, hands and the mouth's inside
     """
 
-    values: dict[bytes, Sequence[np.ndarray]]
-    lights: dict[bytes, np.ndarray]
+    values: Mapping[bytes, Sequence[np.ndarray]]
+    lights: Mapping[bytes, np.ndarray]
     trust: np.ndarray
 
 

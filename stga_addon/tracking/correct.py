@@ -206,9 +206,11 @@ def _explained(out: Path, timesteps: Sequence[int]) -> np.ndarray:
     """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain; 1 where that is not known."""
     try:
         misfit = _misfit(read_json(out / REPORT_FILE))
+        worst = [max((own.get(t, 0.0) for own in misfit.values()), default=0.0) for t in timesteps]
+        if not np.isfinite(worst).all():
+            raise ValueError
     except (ValueError, TypeError, AttributeError) as error:
         raise StgaError(f"{out / REPORT_FILE}: image_misfit: expected shares by region and timestep") from error
-    worst = [max((own.get(t, 0.0) for own in misfit.values()), default=0.0) for t in timesteps]
     return 1 - np.clip(worst, 0.0, 1.0)
 
 

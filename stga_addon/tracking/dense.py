@@ -18,7 +18,7 @@ from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, 
 from .landmarks import Report
 from .posed_points import RIGID_SIZE
 from .seen_surface import RecordedTake
-from .solve import Observation, normal_equations, smooth_take
+from .solve import Observation, acceleration_precision, normal_equations, smooth_take
 
 MIN_TIMESTEPS = 6
 """Below it, a texture averaged over the take is no evidence of how its timesteps differ."""
@@ -46,6 +46,11 @@ CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which a level is done."""
 MAX_TURN = 0.3
 """Of a joint in one step, in radians."""
+SETTLED_GAIN = 0.02
+"""By which a region's misfit has to fall for a settled timestep to be changed: below it, the surface that several
+cameras see is the better evidence."""
+KEPT_STIFFNESS = 100.0
+"""Of a timestep that keeps what it had, in the stiffness of the smoothness over time."""
 MAX_GROWTH, SMALL_MISS_M = 1.5, 0.001
 """Of the landmarks' distance in a region that the images do not explain better."""
 
@@ -100,7 +105,7 @@ def fit_dense(
     timesteps = sorted(take.landmarks)
     if len(timesteps) < MIN_TIMESTEPS:
         return None
-    solver = _Solver(fit, take)
+    solver = _Solver(fit, take, SETTLED_GAIN if settled else 0.0)
     texture = solver.texture(evenly_spread(timesteps, TEXTURE_TIMESTEPS), settled)
     solved: dict[int, _Solved] = {}
     before: tuple[_Shot, _Solved] | None = None
@@ -121,8 +126,8 @@ def fit_dense(
 class _Solver:
     """Gauss–Newton at the timesteps of a take."""
 
-    def __init__(self, fit: HeadFit, take: RecordedTake) -> None:
-        self.head = DenseHead(fit.head, take.places, take.reliable)
+    def __init__(self, fit: HeadFit, take: RecordedTake, min_gain: float) -> None:
+        self.head, self._min_gain = DenseHead(fit.head, take.places, take.reliable), min_gain
         self._fit, self._take = fit, take
 
     def shot(self, timestep: int) -> _Shot:
@@ -175,11 +180,13 @@ class _Solver:
             for own in (shot.start, values)
         )
         was, missed = self._missed(shot.landmarks, shot.start), self._missed(shot.landmarks, values)
-        if new.all < old.all and not self._burst(shot.landmarks, was, missed, new.regions >= old.regions):
+        gain = (old.regions - new.regions).max()
+        better = new.all < old.all and gain > self._min_gain
+        if better and not self._burst(shot.landmarks, was, missed, new.regions >= old.regions):
             terms = self._terms(shot, texture, values, visible, 0)
             return _Solved(values, visible, terms, coarse, new, missed, True)
-        matrix, _ = normal_equations(self.head.landmarks, shot.start, shot.landmarks)
-        terms = matrix, self.head.precision * shot.start  # the start is where these are least
+        stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
+        terms = stiff, self.head.precision * shot.start  # which the prior does not move
         return _Solved(shot.start, visible, terms, coarse, old, was, False)
 
     def _burst(self, landmarks: Observation, was: np.ndarray, now: np.ndarray, worse: np.ndarray) -> bool:

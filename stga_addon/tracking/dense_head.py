@@ -58,7 +58,8 @@ class DenseHead:
         self.landmarks = PosedPoints(self.head.model, places)
         self.skin = large_parts(person)[places.face]
         """(L,) bool: landmarks that are not on eyeballs or teeth."""
-        self.points = _face_points(person, places, reliable & self.skin)
+        skin = reliable & self.skin
+        self.points = _face_points(person, places, skin if skin.any() else reliable)
         held = np.arange(len(self.points)) % HELD_OUT == 0
         self.rows = [np.flatnonzero(~held)[::step] for step in STEPS] + [np.flatnonzero(held)]
         self._posed = [PosedPoints(self.head.model, _some(self.points, rows)) for rows in self.rows]

@@ -135,7 +135,8 @@ def _flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[P
     """(key, camera, pixels (M, 2) that points at `at` have moved to) of each camera that saw both timesteps."""
     import cv2
 
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    opencv: Any = cv2  # whose type stubs lack DIS
+    flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_FAST)
     first = {view.key: view.levels[FLOW_LEVEL] for view in before}
     for view in now:
         level, old = view.levels[FLOW_LEVEL], first.get(view.key)

@@ -158,7 +158,7 @@ def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray) 
     from scipy.linalg import solveh_banded
 
     count, size = start.shape
-    prior, stiffness = parameter_precision(head), _acceleration_precision(head.model)
+    prior, stiffness = parameter_precision(head), acceleration_precision(head.model)
     state = start.copy()
     for _ in range(TAKE_ITERATIONS):
         band = np.zeros((2 * size + 1, count * size)) if count > 2 else np.zeros((size, count * size))
@@ -202,7 +202,8 @@ def parameter_precision(head: HeadModel) -> np.ndarray:
     return np.concatenate([np.ones(head.model.n_expression), rigid**-2.0])
 
 
-def _acceleration_precision(model: FlameModel) -> np.ndarray:
+def acceleration_precision(model: FlameModel) -> np.ndarray:
+    """(E + 18,) inverse variances of second differences over time."""
     sigma = np.repeat(
         (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M),
         (model.n_expression, POSE_SIZE, TRANSLATION_SIZE),

@@ -42,9 +42,9 @@ def footage(folder, cameras, timesteps):
     return Footage(folder, tuple(found), tuple(range(timesteps)))
 
 
-def write(folder, take, errors):
+def write(folder, take, errors, misfit=None):
     cameras = {camera.name: camera.camera for camera in take.cameras}
-    write_contact_sheet(folder / "sheet.png", take, cameras, ball, FACES, errors)
+    write_contact_sheet(folder / "sheet.png", take, cameras, ball, FACES, errors, misfit)
     return np.asarray(Image.open(folder / "sheet.png").convert("RGB")).astype(int)
 
 
@@ -65,6 +65,16 @@ def test_worst_views_first(tmp_path):
     sheet = write(tmp_path, take, errors)
     corners = [plain[3, 3, :2].tolist() for plain, _ in pictures(sheet, 5)]
     assert corners == [[20, 20], [0, 40], [20, 0], [0, 0], [20, 40]]
+
+
+def test_what_images_do_not_explain_counts_beside_landmarks(tmp_path):
+    """Catches a sheet that hides the timesteps at which landmarks and head agree on what the images do not show."""
+    take = footage(tmp_path, 1, 4)
+    errors = {"cam0": {0: 1.0, 1: 1.3, 2: 1.0, 3: 1.0}}
+    sheet = write(tmp_path, take, errors, {"mouth": {0: 0.1, 1: 0.1, 2: 0.4, 3: 0.1}, "eyes": {0: 0.05, 3: 0.15}})
+    corners = [plain[3, 3, 1] for plain, _ in pictures(sheet, 4)]
+    assert corners == [40, 60, 20, 0]
+    assert len(sheet) == len(write(tmp_path, take, errors)) + 2 * 12  # a row of the chart for each region
 
 
 def test_mesh_lies_on_the_head(tmp_path):

@@ -148,6 +148,7 @@ def unconfident(out):
 
 
 SIZE = TAKE.shape[1]
+MISFIT = "image_misfit: expected shares by region and timestep"
 INTERPOLATED = r"interpolated: expected timesteps"
 PARAMETERS = rf"parameters: expected \(5, {SIZE}\) finite numbers"
 DAMAGES = {
@@ -159,6 +160,8 @@ DAMAGES = {
     "interpolated number": (changed(REPORT_FILE, interpolated=3), REPORT_FILE, INTERPOLATED),
     "interpolated lists": (changed(REPORT_FILE, interpolated=[[1]]), REPORT_FILE, INTERPOLATED),
     "interpolated texts": (changed(REPORT_FILE, interpolated=["2"]), REPORT_FILE, INTERPOLATED),
+    "misfit of lists": (changed(REPORT_FILE, image_misfit={"lower face": [0.1]}), REPORT_FILE, MISFIT),
+    "misfit of texts": (changed(REPORT_FILE, image_misfit={"lower face": {"0": "much"}}), REPORT_FILE, MISFIT),
     "interpolated not a number": (changed(REPORT_FILE, interpolated=[float("nan")]), REPORT_FILE, INTERPOLATED),
     "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
     "solved folder": (lambda out: (out / SOLVED_FILE).mkdir(), SOLVED_FILE, "is not a regular file"),
