@@ -87,7 +87,7 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     padded = np.pad(mask, 2)
     height, width = mask.shape
     around = (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)
-    return np.logical_and.reduce([padded[y : y + height, x : x + width] for y, x in around])
+    return np.asarray(np.logical_and.reduce([padded[y : y + height, x : x + width] for y, x in around]))
 
 
 def _darker_half(colors: np.ndarray) -> np.ndarray:

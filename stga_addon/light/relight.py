@@ -91,7 +91,7 @@ class Relighter:
         mesh = self.avatar.neutral.astype(np.float64)
         frames = face_frames(mesh, self.avatar.faces, mesh, self.avatar.convention)
         normals = self._unit(self._at_splats(vertex_normals(mesh, self.avatar.faces)))
-        return np.einsum("nji,nj->ni", frames.rotation[self.avatar.splats.face], normals).astype(np.float32)
+        return np.asarray(np.einsum("nji,nj->ni", frames.rotation[self.avatar.splats.face], normals).astype(np.float32))
 
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
         """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh` (V, 3): what
@@ -131,7 +131,7 @@ class Relighter:
         arriving += np.maximum(self.transfer @ world, 0) + self._at_splats(self.bounce.light(at_vertices))
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
         albedo = self._albedo(self.diffuse_color + self._strain_color(mesh)) if self._strained else self.albedo
-        return albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight
+        return np.asarray(albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight)
 
     def _sky_highlight(
         self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray, roughness: np.ndarray
@@ -147,7 +147,7 @@ class Relighter:
         z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
         share = np.minimum(x * x, 2 ** (-9.28 * cosine)) * x + y
         reflected = REFLECTANCE * (z - 1.04 * share) + 1.04 * share + w
-        return (seen * (reflected * self.occlusion)[:, None]).astype(np.float32)
+        return np.asarray((seen * (reflected * self.occlusion)[:, None]).astype(np.float32))
 
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
@@ -159,7 +159,7 @@ class Relighter:
         if damping:
             typical = np.exp(np.log(np.maximum(albedo, 1e-4)).mean(0))
             albedo = np.maximum(albedo, 1e-4) ** (1 - damping) * typical**damping
-        return albedo.astype(np.float32)
+        return np.asarray(albedo.astype(np.float32))
 
     @property
     def _strained(self) -> bool:
@@ -167,7 +167,7 @@ class Relighter:
 
     def _strain_color(self, mesh: np.ndarray) -> np.ndarray:
         splats = self.avatar.splats
-        return np.einsum("ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color)
+        return np.asarray(np.einsum("ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color))
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""
@@ -192,7 +192,7 @@ class Relighter:
 
     @staticmethod
     def _unit(vectors: np.ndarray) -> np.ndarray:
-        return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:

@@ -27,7 +27,7 @@ def barycentric(avatar: Avatar) -> np.ndarray:
     area = np.maximum(uu * vv - uv * uv, 1e-30)
     u, v = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
     weights = np.clip(np.stack([1 - u - v, u, v], axis=-1), 0, 1)
-    return weights / weights.sum(1, keepdims=True)
+    return np.asarray(weights / weights.sum(1, keepdims=True))
 
 
 def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:

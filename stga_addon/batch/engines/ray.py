@@ -42,11 +42,9 @@ class RayEngine:
         import ray  # reads the environment
 
         try:
-            quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
-            if address:
-                ray.init(address=address, **quiet)
-            else:  # "local": also where another cluster is running on this machine
-                ray.init(address="local", num_cpus=processors(), include_dashboard=False, **quiet)
+            # "local": also where another cluster is running on this machine
+            own: dict[str, Any] = {} if address else {"num_cpus": processors(), "include_dashboard": False}
+            ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
         self._ray = ray
