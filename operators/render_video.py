@@ -202,10 +202,12 @@ class _Recording:
         with bpy.context.temp_override(scene=self._scene, view_layer=self._view_layer):
             if frame != self._posed[0]:
                 self._scene.frame_set(frame)
-                layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
-                self._posed = frame, [layer.posed() for layer in layers]
+                self._cache.light.casters.forget()
+                self._layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
             own = self._cameras is None
             camera = scene_camera(bpy.context.evaluated_depsgraph_get()) if own else self._cameras[self._recorded]
+        if frame != self._posed[0] or any(layer.relit for layer in self._layers):
+            self._posed = frame, [layer.posed(camera.position) for layer in self._layers]
         self._recorder.add(self._posed[1], camera)
         self._recorded += 1
         self.is_cancelled = self._status.update(self._recorded / len(self._frames), "Recording")

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from .kernels import shadow_kernels
 from .values import Caster, Light
 
 MAP_SIZE = 512
@@ -59,8 +60,7 @@ class ShadowMap:
         casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
     ) -> None:
-        from ..raster.cpu.shadow import add_depths
-
+        add_depths = shadow_kernels().add_depths
         self._project = light_projection(vertices, light, size)
         self.depth = np.full((size, size), np.inf, np.float32)
         add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
@@ -69,9 +69,7 @@ class ShadowMap:
 
     def lit(self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP) -> np.ndarray:
         """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the surface."""
-        from ..raster.cpu.shadow import lit_shares
-
         found = np.empty(len(points), np.float32)
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
-        lit_shares(self.depth, places, np.float32(bias), np.float32(step), found)
+        shadow_kernels().lit_shares(self.depth, places, np.float32(bias), np.float32(step), found)
         return found

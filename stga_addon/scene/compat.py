@@ -159,3 +159,19 @@ def choose_image_file(settings: Any, file_format: str, color_mode: str, color_de
     if hasattr(settings, "media_type"):  # from Blender 5.0 on
         settings.media_type = "IMAGE"
     settings.file_format, settings.color_mode, settings.color_depth = file_format, color_mode, color_depth
+
+
+def light_strength(light: Any) -> np.ndarray:
+    """(3,) linear: a light's color times its energy, exposure (from 4.5 on) and color temperature (from 4.5 on)."""
+    color = np.array(light.color, np.float64) * light.energy * 2.0 ** getattr(light, "exposure", 0.0)
+    return color * np.array(light.temperature_color) if getattr(light, "use_temperature", False) else color
+
+
+def is_normalized(light: Any) -> bool:
+    """Whether a light's energy is that of its whole area, as always before 4.5; else it is per square meter."""
+    return bool(getattr(light, "normalize", True))
+
+
+def light_nodes(light: Any) -> Any:
+    """The node tree that a light uses, None where it uses none."""
+    return light.node_tree if light.use_nodes else None

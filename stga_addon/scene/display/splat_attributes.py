@@ -9,6 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar
+from ...avatar.light import AvatarLight
 from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 from ...capture.color import srgb_to_linear
@@ -38,10 +39,11 @@ Attributes = dict[str, tuple[str, str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SplatAttributes:
-    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh."""
+    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh; light of the avatar."""
 
     splats: Attributes
     neutral: Attributes
+    light: AvatarLight | None = None
 
 
 def avatar_attributes(avatar: Avatar) -> SplatAttributes:
@@ -52,7 +54,7 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
         FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
         NEUTRAL_AREA: ("FLOAT", "value", flat_floats(areas[avatar.splats.face])),
     }
-    return SplatAttributes(splats, _neutral_attributes(avatar, areas))
+    return SplatAttributes(splats, _neutral_attributes(avatar, areas), avatar.light)
 
 
 def _neutral_attributes(avatar: Avatar, areas: np.ndarray) -> Attributes:

@@ -12,6 +12,7 @@ from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
 from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
+from ..light.stored import read_light, write_light
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
 from .node_builder import is_splat_tree
@@ -53,7 +54,7 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
     _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
-    neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared.neutral)
+    neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared)
     set_input(splat_object, splat_nodes.NEUTRAL, neutral)
     # A sibling of the head: both have the same object space.
     splat_object.parent = head.parent
@@ -85,7 +86,7 @@ def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
 
     prepared: `avatar_attributes` of an avatar for which `can_update` is true.
     """
-    _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared.neutral)
+    _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared)
     write_splats(splat_object.data, prepared.splats)
 
 
@@ -177,6 +178,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         antialiased=bool(splat_object[tags.ANTIALIASED]),
         strain_range=read_strain_range(neutral.data),
         strain_position=read_strain_position(neutral.data),
+        light=read_light(neutral.data),
     )
 
 
@@ -215,14 +217,15 @@ def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
     return splat_object
 
 
-def _neutral_object(name: str, avatar: Avatar, attributes: Attributes) -> Any:
+def _neutral_object(name: str, avatar: Avatar, prepared: SplatAttributes) -> Any:
     mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
-    _write_neutral(mesh, attributes)
+    _write_neutral(mesh, prepared)
     return bpy.data.objects.new(name, mesh)
 
 
-def _write_neutral(mesh: Any, attributes: Attributes) -> None:
-    write_attributes(mesh, attributes, "FACE")
+def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
+    write_attributes(mesh, prepared.neutral, "FACE")
+    write_light(mesh, prepared.light)
     mesh.update()
 
 
