@@ -4,7 +4,7 @@
 
 Each FOLDER holds `capture_A` (a capture under light A whose head never turns), `truth_A` … `truth_E` (captures of the
 same head and cameras with split "train": held-out views under each light) and `lights.json`, which says what the lights
-are (`lighting`). Light A is not given; its level is, as the color of a gray card. LPIPS needs STGA_LPIPS.
+are (`lighting`). Light A is not given; its level is, as the colors of a gray ball. LPIPS needs STGA_LPIPS.
 Prints PSNR inside the mask / LPIPS / PSNR of eyes and mouth, and writes pictures beside the run with --pictures.
 """
 
@@ -19,7 +19,6 @@ import numpy as np
 from PIL import Image
 
 from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.avatar.splats import SH_C0, no_strain_color
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.model import Capture, View
@@ -29,14 +28,13 @@ from stga_addon.light.harmonics import even_directions, project, uniform
 from stga_addon.light.lamps import Lamps
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
-from stga_addon.render.render import render, render_avatar
+from stga_addon.render.render import render_avatar, render_colors
 from stga_addon.training.evaluate.lpips import load_network
 from stga_addon.training.evaluate.metrics import psnr
 
 LIGHTS = "ABCDE"
 BARS = {"B": (27.5, 0.036), "C": (29.0, 0.032), "D": (27.5, 0.052)}
 SMALL_PARTS = "left_eye", "right_eye", "mouth"
-FRONT = np.array([0.0, 0.0, 1.0])
 CARD_REFLECTANCE = 0.18
 
 
@@ -54,10 +52,15 @@ def lighting(spec: dict, **options: object) -> Lighting:
         lights.append(Light("area", power * np.array(color), 1.2 * toward, -toward, size=(side, side), tangent=tangent))
     for azimuth, elevation, strength, angle, color in spec["sun"]:
         lights.append(Light("sun", strength * np.array(color), direction=-direction(azimuth, elevation), angle=angle))
-    sky, (steps, colors) = even_directions(600), zip(*spec["world"], strict=True)
-    height = sky[:, 1] / 2 + 0.5
-    radiance = np.stack([np.interp(height, steps, [color[k] for color in colors]) for k in range(3)], axis=-1)
-    return Lighting(project(radiance, sky), tuple(lights), **options)  # type: ignore[arg-type]
+    sky = even_directions(600)
+    return Lighting(project(world_radiance(spec, sky), sky), tuple(lights), **options)  # type: ignore[arg-type]
+
+
+def world_radiance(spec: dict, directions: np.ndarray) -> np.ndarray:
+    """(N, 3) radiance of the world in directions (N, 3)."""
+    steps, colors = zip(*spec["world"], strict=True)
+    height = directions[:, 1] / 2 + 0.5
+    return np.stack([np.interp(height, steps, channel) for channel in zip(*colors, strict=True)], axis=-1)
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
@@ -66,18 +69,18 @@ def direction(azimuth: float, elevation: float) -> np.ndarray:
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-def gray_card(spec: dict) -> np.ndarray:
-    """(3,) linear color of a gray card at the origin that faces the front under a light."""
+BALL = np.array([direction(azimuth, elevation) for azimuth in (-50, 0, 50) for elevation in (-30, 0, 30)])
+"""(9, 3) normals of the gray ball that says how light the capture is."""
+
+
+def gray_ball(spec: dict) -> np.ndarray:
+    """(9, 3) linear colors of a gray ball at the origin under a light, where its normals are BALL."""
     values = lighting(spec, shadows=False)
     far = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])  # says only where the head is
     lamps = Lamps(values, far, np.zeros((0, 3), np.int32))
-    arriving = lamps.irradiance(np.zeros((1, 3)), FRONT[None])[0]
-    sky, (steps, colors) = even_directions(600), zip(*spec["world"], strict=True)
-    cosine = np.maximum(sky @ FRONT, 0) * 4 * np.pi / len(sky)
-    height = sky[:, 1] / 2 + 0.5
-    arriving = arriving + np.array(
-        [cosine @ np.interp(height, steps, [color[k] for color in colors]) for k in range(3)]
-    )
+    sky = even_directions(600)
+    cosine = np.maximum(BALL @ sky.T, 0) * 4 * np.pi / len(sky)
+    arriving = lamps.irradiance(np.zeros_like(BALL), BALL) + cosine @ world_radiance(spec, sky)
     return CARD_REFLECTANCE * arriving / np.pi
 
 
@@ -102,7 +105,7 @@ class Bench:
                 yield view, render_avatar(self.avatar, mesh, view.camera)
             else:
                 colors = relighter.colors(mesh, view.camera.position, values)
-                yield view, render_with_colors(self.avatar, mesh, view, colors)
+                yield view, render_colors(self.avatar, mesh, view.camera, colors)
 
     def score(self, name: str, relighter: Relighter | None, pictures: Path | None = None, **options: object):  # type: ignore[no-untyped-def]
         """Mean PSNR in the mask, LPIPS, PSNR of eyes and mouth."""
@@ -119,13 +122,6 @@ class Bench:
                 pictures.mkdir(parents=True, exist_ok=True)
                 Image.fromarray(pair).save(pictures / f"{name}_{view.timestep}_{view.camera_index}.png")
         return tuple(np.mean(found, axis=0))
-
-
-def render_with_colors(avatar: Avatar, mesh: np.ndarray, view: View, colors: np.ndarray) -> np.ndarray:
-    """(3, H, W) with colors (N, 3) of the splats instead of those that were trained."""
-    sh = ((colors - 0.5) / SH_C0).astype(np.float32)[:, None]
-    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(colors)))
-    return render(splats, view.camera, (1.0, 1.0, 1.0), avatar.frames(mesh), avatar.antialiased)
 
 
 def small_parts(capture: Capture, view: View) -> np.ndarray:
@@ -159,9 +155,9 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
     capture = open_capture(folder / "capture_A")
     avatar = trained(folder / "capture_A", run, seconds)
     bench = Bench(folder, avatar)
-    card = gray_card(bench.specs["A"])
-    light = estimate_light(capture, Known(card=card, toward=FRONT))
-    even = estimate_light(capture, Known(radiance=uniform(card / CARD_REFLECTANCE)))
+    ball = gray_ball(bench.specs["A"])
+    light = estimate_light(capture, Known(card=ball, toward=BALL))
+    even = estimate_light(capture, Known(radiance=uniform(ball.mean(0) / CARD_REFLECTANCE)))
     print(f"{folder.name}: {len(avatar.splats)} splats; residual {light.residual:.3f}, damping {light.damping:.2f}")
     relighter = Relighter(replace(avatar, light=light))
     rows = {

@@ -20,6 +20,7 @@ COMMANDS = (
     ".train",
     ".refine",
     ".extend",
+    ".relight",
     ".perform",
     ".batch",
     ".render",

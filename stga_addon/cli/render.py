@@ -26,6 +26,7 @@ COVERED = 0.0
 """Degrees of a turntable that covers what the cameras saw."""
 SAME_FIELDS = (
     "cameras", "turntable", "camera", "fps", "capture", "flame", "motion", "background", "principal_point", "device",
+    "light",
 )  # fmt: skip
 """Options that are fields of the request."""
 
@@ -64,6 +65,12 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         help=f"{MOTION_HELP}; at every timestep of it from each camera",
     )
     add_motion_options(parser)
+    parser.add_argument(
+        "--light", type=usable_path, metavar="FILE", help="environment (.hdr) or lights (.toml) that light the avatar"
+    )
+    parser.add_argument(
+        "--light-turn", type=real_number, metavar="DEGREES", help="turn that light around the head during the video"
+    )
     add_device(parser)
     parser.add_argument("--background", type=color, default="white", help="white (default), black or R,G,B in 0…1")
     add_principal_point(parser, "what cy means in the file of --cameras (default: as in training; of a PLY vhap)")
@@ -82,8 +89,9 @@ def run(options: Namespace) -> None:
     same = {name: getattr(options, name) for name in SAME_FIELDS}
     output, is_video = options.out or options.video, options.video is not None
     request = Render(
-        options.source, output, is_video, seconds=seconds, played=played, motion_options=motion_options(options), **same
-    )
+        options.source, output, is_video, seconds=seconds, played=played, motion_options=motion_options(options),
+        light_turn=options.light_turn or 0.0, **same,
+    )  # fmt: skip
     carry_out(request)
 
 

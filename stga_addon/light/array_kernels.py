@@ -40,7 +40,7 @@ def _add_group(corners: np.ndarray, low: np.ndarray, shape: np.ndarray, flat: np
     np.minimum.at(flat, y[inside] * size + x[inside], z)
 
 
-def lit_shares(depth: np.ndarray, points: np.ndarray, bias: float, step: float, lit: np.ndarray) -> None:
+def lit_shares(depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray) -> None:
     """As `raster.cpu.shadow.lit_shares`."""
     size, reach = len(depth), 1 if step > 0 else 0
     # The map with a border that blocks nothing; farther places are moved onto it.
@@ -112,10 +112,9 @@ def _ggx(
     width: np.ndarray, reflectance: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """As `raster.cpu.shade.ggx`, widened by the light's width."""
-    wide = np.minimum(alpha + np.float32(0.5) * width, 1)
-    square = wide * wide
+    square = np.minimum(alpha * alpha + np.float32(0.125) * width * width, 1)
     spread = half * half * (square - 1) + 1
-    distribution = np.divide(alpha, np.maximum(wide, 1e-12)) ** 2 * square / (np.pi * spread * spread)
+    distribution = square / np.maximum(np.pi * spread * spread, 1e-12)
     shadowing = facing * np.sqrt(toward_eye * toward_eye * (1 - square) + square)
     shadowing += toward_eye * np.sqrt(facing * facing * (1 - square) + square)
     fresnel = reflectance + (1 - reflectance) * (1 - fresnel_cosine) ** 5

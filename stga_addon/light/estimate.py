@@ -35,8 +35,9 @@ class Known:
     """What is known of a capture's light.
 
     radiance   (9, 3) harmonics in the capture's axes; None: estimated
-    card       (3,) linear color that a gray card of 18 % shows at the face, facing `toward`; None: the level is unknown
-    toward     (3,) unit vector
+    card       (K, 3) linear colors that a gray card of 18 % shows at the face, facing `toward`, or a gray ball where its
+               normal is that; None: the level is unknown
+    toward     (K, 3) unit vectors
     """
 
     radiance: np.ndarray | None = None
@@ -133,6 +134,6 @@ def _solve(color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: 
 
 
 def _level_with(radiance: np.ndarray, card: np.ndarray, toward: np.ndarray) -> np.ndarray:
-    """The light at the level and white balance at which a gray card facing `toward` shows the color `card`."""
-    arriving = (basis(toward[None]) * LAMBERT @ radiance)[0]
-    return radiance * (np.pi * card / CARD_REFLECTANCE / np.maximum(arriving, 1e-6))
+    """The light at the level and white balance at which gray that faces `toward` (K, 3) shows the colors (K, 3)."""
+    arriving = (basis(toward) * LAMBERT @ radiance).mean(0)
+    return np.asarray(radiance * (np.pi * card.mean(0) / CARD_REFLECTANCE / np.maximum(arriving, 1e-6)))

@@ -40,7 +40,7 @@ class Lamps:
             return found
         lit = np.ones((max(1, len(self._maps)), len(points)), np.float32)
         for row, shadow in zip(lit, self._maps, strict=False):
-            row[:] = shadow.lit(points)
+            row[:] = shadow.lit(points, normals=normals)
         shade_kernels().add_lights(
             np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32),
             np.asarray(eye, np.float32), np.asarray(roughness, np.float32),

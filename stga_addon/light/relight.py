@@ -22,7 +22,7 @@ REFLECTANCE = 0.04
 """Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
 MIN_IRRADIANCE = 0.15
 """Least irradiance of the capture that color is divided by, as a share of its mean: what was darker is noise."""
-HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.045, 0.1
+HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.1
 """Part of what arrived in the capture that came back as highlights, which is taken from the recorded colors; at least
 MIN_DIFFUSE_SHARE of them remains."""
 VIEW_DIRECTIONS, MIN_VIEW_COSINE = 96, 0.3

@@ -9,9 +9,11 @@ from .values import Caster, Light
 
 MAP_SIZE = 512
 """Texels a side of a light's shadow map, which just holds the head."""
-BIAS_M, LIFT_M = 0.004, 0.002
-"""A surface shades what lies deeper by BIAS_M; points are lifted off the surface by LIFT_M along its normal, so that it
-does not shade itself."""
+LIFT_M = 0.002
+"""Points are lifted off the surface by as much along its normal, so that it does not shade itself."""
+BIAS_M, MAX_BIAS_M = 0.001, 0.006
+"""A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the taps, at most
+MAX_BIAS_M."""
 TAP_STEP = 2.0
 """Texels between the 3 × 3 places that are looked up, for a soft edge about as wide as a splat."""
 Projection = Callable[[np.ndarray], np.ndarray]
@@ -62,14 +64,33 @@ class ShadowMap:
     ) -> None:
         add_depths = shadow_kernels().add_depths
         self._project = light_projection(vertices, light, size)
+        self._light, self._texel_m = light, 2 * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2 / size
         self.depth = np.full((size, size), np.inf, np.float32)
         add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
         for caster in casters:
             add_depths(self._project(caster.vertices), np.ascontiguousarray(caster.faces, np.int32), self.depth)
 
-    def lit(self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP) -> np.ndarray:
-        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the surface."""
-        found = np.empty(len(points), np.float32)
+    def lit(
+        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP, normals: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the surface.
+
+        normals (N, 3): of the surface there, which make `bias` larger on slopes.
+        """
+        found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
+        if normals is not None:
+            biases = self._slope_bias(points, normals, bias, step)
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
-        shadow_kernels().lit_shares(self.depth, places, np.float32(bias), np.float32(step), found)
+        shadow_kernels().lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
+
+    def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:
+        """(N,) float32 meters."""
+        if self._light.kind == "sun":
+            cosine = -(normals @ self._light.direction)
+        else:
+            away = self._light.position - points
+            cosine = (normals * away).sum(1) / np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        cosine = np.clip(cosine, 0.05, 1)
+        slope = np.sqrt(1 - cosine**2) / cosine
+        return np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)).astype(np.float32)

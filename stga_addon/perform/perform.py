@@ -35,6 +35,7 @@ WORK: dict[type[Any], tuple[str, str]] = {
     values.Analyze: (".analysis", "analyze"),
     values.TimePresets: (".analysis", "time_each_preset"),
     values.Evaluate: (".evaluation", "evaluate_run"),
+    values.Relight: (".relighting", "relight"),
 }
 """Request -> the module that carries it out, loaded when it is needed, and its function."""
 

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from ..avatar.file import read_avatar
+from ..avatar.file import Avatar, read_avatar
 from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import covered_angles, to_and_fro, turntable
 from ..capture.model import View
@@ -18,10 +18,12 @@ from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.ply import is_ply, read_ply
 from ..files import replacing
 from ..flame.sequence import sequence_mesh
+from ..light.light_file import read_lighting, turned
+from ..light.relight import Relighter
 from ..progress import Report, Say, counted
 from ..render.compose import Composer
 from ..render.render import render as render_splats
-from ..render.render import render_avatar, to_uint8
+from ..render.render import render_avatar, render_colors, to_uint8
 from ..render.video import sequence_writer, video_writer
 from ..requests.results import Written
 from ..requests.values import Render
@@ -58,14 +60,14 @@ def render(request: Render, report: Report, say: Say) -> Written:
 class _Subject:
     """What is rendered.
 
-    image      view -> image (3, H, W)
+    image      view and share of the film, 0 to 1 -> image (3, H, W)
     timesteps  of its motion, ascending; none where nothing moves
     center     of the head or splats at the first timestep, (3,) meters
     fps        at which it plays
     views      of its capture
     """
 
-    image: Callable[[View], np.ndarray]
+    image: Callable[[View, float], np.ndarray]
     timesteps: tuple[int, ...]
     center: Callable[[], np.ndarray]
     fps: float
@@ -80,7 +82,7 @@ def _write_pictures(folder: Path, subject: _Subject, views: Sequence[View], repo
         raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
     for view, name in counted(zip(views, names, strict=True), len(views), report, "Rendering", "Image"):
         with replacing(folder / name) as partial:
-            Image.fromarray(to_uint8(subject.image(view))).save(partial, format="PNG")
+            Image.fromarray(to_uint8(subject.image(view, 0.0))).save(partial, format="PNG")
 
 
 def _film(request: Render, subject: _Subject, views: Sequence[View], report: Report) -> None:
@@ -96,8 +98,8 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
     path = [replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)]
     writer = video_writer(request.output, subject.fps) if request.video else sequence_writer(request.output)
     with writer as write:
-        for view in counted(path, len(path), report, "Rendering", "Image"):
-            write(to_uint8(subject.image(view)))
+        for n, view in enumerate(counted(path, len(path), report, "Rendering", "Image")):
+            write(to_uint8(subject.image(view, n / len(path))))
 
 
 def _turntable_images(request: Render, fps: float) -> int:
@@ -139,9 +141,11 @@ def _principal_point(source: Path) -> str:
 def _subject(request: Render, composer: Composer) -> _Subject:
     """An avatar with its capture, or a plain world-space PLY."""
     if is_ply(request.source):
+        if request.light is not None:
+            raise StgaError(f"{request.source}: is a PLY, whose light is not known; --light needs an avatar")
         splats = read_ply(request.source)
         return _Subject(
-            lambda view: render_splats(splats, view.camera, request.background, composer=composer),
+            lambda view, _: render_splats(splats, view.camera, request.background, composer=composer),
             (),
             lambda: np.median(splats.xyz, axis=0),
             playback_fps(None, request.fps),
@@ -156,7 +160,7 @@ def _subject(request: Render, composer: Composer) -> _Subject:
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
-        lambda view: render_avatar(avatar, mesh(view), view.camera, request.background, composer),
+        _pictured(request, avatar, mesh, composer),
         capture.timesteps,
         lambda: _middle(capture.mesh(capture.timesteps[0])),
         playback_fps(capture, request.fps),
@@ -176,11 +180,28 @@ def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
         return sequence_mesh(sequence, timestep)
 
     return _Subject(
-        lambda view: render_avatar(avatar, mesh(view.timestep), view.camera, request.background, composer),
+        _pictured(request, avatar, lambda view: mesh(view.timestep), composer),
         tuple(sequence.timesteps),
         lambda: _middle(mesh(sequence.timesteps[0])),
         request.fps or motion.fps or DEFAULT_FPS,
     )
+
+
+def _pictured(
+    request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
+) -> Callable[[View, float], np.ndarray]:
+    """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is asked for."""
+    if request.light is None:
+        return lambda view, _: render_avatar(avatar, mesh(view), view.camera, request.background, composer)
+    relighter, lighting = Relighter(avatar), read_lighting(request.light)
+
+    def picture(view: View, share: float) -> np.ndarray:
+        posed = mesh(view)
+        light = turned(lighting, _middle(posed), request.light_turn * share) if request.light_turn else lighting
+        colors = relighter.colors(posed, view.camera.position, light)
+        return render_colors(avatar, posed, view.camera, colors, request.background, composer)
+
+    return picture
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:

@@ -31,6 +31,7 @@ from ..training.run.open_run import OpenedRun, device_of, open_run
 from ..training.run.progress import Progress as TrainingProgress
 from ..training.run.progress import Report as TrainingReport
 from ..training.run.replay import is_faced
+from .relighting import add_light
 
 MAX_NAMED_VIEWS = 6
 """Views that a warning names."""
@@ -77,10 +78,18 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
         return report(_as_progress(progress))
 
     avatar = prepared.train(report_training)
-    lines = [*report_run(prepared.folder), f"avatar: {avatar}"]
+    lines = [*report_run(prepared.folder), f"avatar: {avatar}", *_light_of(prepared, avatar, report)]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
     return Written(avatar, tuple(lines))
+
+
+def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
+    """Write the light of the capture into the avatar; what there is to say about it, or why there is none."""
+    try:
+        return add_light(avatar, with_refined_tracking(prepared.capture, prepared.folder), report=report)
+    except StgaError as error:  # an avatar without it is whole
+        return (f"light: not estimated ({error})",)
 
 
 def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:

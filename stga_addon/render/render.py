@@ -15,11 +15,13 @@ From a PLY file to a picture:
 `cpu.autograd.render_differentiable` renders torch tensors that require gradients.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..avatar.embedding import WORLD, FaceFrames
 from ..avatar.file import Avatar
-from ..avatar.splats import Splats
+from ..avatar.splats import SH_C0, Splats, no_strain_color
 from ..capture.camera import Camera
 from ..raster.cpu.layout import Parameters
 from ..raster.cpu.rasterize import frames_in_camera, render_forward
@@ -66,6 +68,20 @@ def render_avatar(
 ) -> np.ndarray:
     """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of `render`."""
     return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer)
+
+
+def render_colors(
+    avatar: Avatar,
+    mesh: np.ndarray,
+    camera: Camera,
+    colors: np.ndarray,
+    background: tuple[float, float, float] = WHITE,
+    composer: Composer | None = None,
+) -> np.ndarray:
+    """`render_avatar` with sRGB colors (N, 3) of the splats, as `light.relight` finds them, instead of their own."""
+    sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
+    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
+    return render(splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -231,6 +231,8 @@ class Render:
     played          meshes that stand in for those of the capture
     background      sRGB in 0…1
     principal_point  convention of `cameras`; None: that of the avatar
+    light           environment (.hdr) or lights (.toml) that the avatar is shown in; None: as recorded
+    light_turn      degrees by which that light turns around the head during a video or turntable
     """
 
     source: Path
@@ -249,6 +251,8 @@ class Render:
     principal_point: str | None = setting(None, choices=PRINCIPAL_POINTS)
     device: str = device_field()
     motion_options: MotionOptions = field(default_factory=MotionOptions)
+    light: Path | None = None
+    light_turn: float = setting(0.0, -36000, 36000)
 
     @property
     def is_film(self) -> bool:
@@ -261,6 +265,8 @@ class Render:
             raise StgaError(f"{self.output}: a video's name ends in .mp4")
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
+        if self.light_turn and (self.light is None or not self.is_film):
+            raise StgaError("--light-turn: has no effect without --light and --video or --turntable")
 
 
 @dataclass(frozen=True)
@@ -399,9 +405,30 @@ class Evaluate:
     capture: Path | None = None
 
 
+@dataclass(frozen=True)
+class Relight:
+    """Find out the light of a run's capture, and keep it in the run's avatar, so that scenes can light it.
+
+    light           environment (.hdr) that the capture was recorded in; None: estimated from the capture
+    card            sRGB of a gray card of 18 % that faces the central camera at the face: the light's level and white
+    flame, capture  the FLAME model file and the folder of the run's capture, if they have moved
+    """
+
+    run: Path
+    light: Path | None = None
+    card: tuple[float, float, float] | None = setting(None, 0, 1)
+    flame: Path | None = None
+    capture: Path | None = None
+
+    def check(self) -> None:
+        """Raise StgaError where light and card say the same."""
+        if self.light is not None and self.card is not None:
+            raise StgaError("--gray-card: has no effect with --light, whose level is known")
+
+
 Request = (
     Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderRecording | Export
-    | ConvertMotion | Analyze | TimePresets | Evaluate
+    | ConvertMotion | Analyze | TimePresets | Evaluate | Relight
 )  # fmt: skip
 
 

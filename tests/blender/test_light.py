@@ -17,7 +17,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from light.scenes import lit_avatar  # noqa: E402
 
-from stga_addon.light.harmonics import even_directions  # noqa: E402
 from stga_addon.light.lamps import Lamps  # noqa: E402
 from stga_addon.light.shadows import LIFT_M  # noqa: E402
 from stga_addon.light.surface import vertex_normals  # noqa: E402
@@ -25,7 +24,6 @@ from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import hide_object, show_avatar, stored_avatar  # noqa: E402
 from stga_addon.scene.light import settings  # noqa: E402
-from stga_addon.scene.light.world import radiance_in, small_image  # noqa: E402
 from stga_addon.scene.layers import Relit  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 

@@ -6,8 +6,10 @@ import trimesh
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.light import AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.capture.color import linear_to_srgb
 from stga_addon.light.bounce import Bounce
 from stga_addon.light.harmonics import uniform
+from stga_addon.light.relight import HIGHLIGHT_SHARE
 from stga_addon.light.transfer import transfer_of
 
 RADIUS = 0.1
@@ -47,13 +49,9 @@ def lit_avatar(albedo: tuple[float, float, float] = (0.5, 0.3, 0.2), radiance: f
     light = uniform(np.full(3, radiance))
     arriving = transfer @ light
     arriving = arriving + Bounce(vertices, faces, occlusion).light(arriving)
-    avatar_light = AvatarLight(
-        light.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), np.zeros(len(vertices), np.float32), 0.0
-    )
+    skin = np.zeros(len(vertices), np.float32)
+    avatar_light = AvatarLight(light.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), skin, 0.0)
     count = len(faces)
-    from stga_addon.capture.color import linear_to_srgb
-    from stga_addon.light.relight import HIGHLIGHT_SHARE
-
     color = linear_to_srgb(arriving[faces].mean(1) / np.pi * (np.array(albedo) + HIGHLIGHT_SHARE))
     sh = np.zeros((count, (degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (color - 0.5) / SH_C0

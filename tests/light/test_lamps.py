@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from light.scenes import ball_and_plate, blocked
 
+from light.scenes import ball_and_plate, blocked
 from stga_addon.light.lamps import Lamps
 from stga_addon.light.shadows import LIFT_M
 from stga_addon.light.surface import vertex_normals

@@ -1,8 +1,8 @@
 """Transfer and ambient occlusion against rays cast at every triangle, and against a sphere's closed form."""
 
 import numpy as np
-from light.scenes import ball_and_plate, blocked
 
+from light.scenes import ball_and_plate, blocked
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions
 from stga_addon.light.shadows import LIFT_M
 from stga_addon.light.surface import vertex_normals
@@ -21,7 +21,7 @@ def test_transfer_and_occlusion_are_those_of_cast_rays():
     np.testing.assert_allclose(occlusion, (seen * cosine).sum(0) / cosine.sum(0), atol=0.12)
     assert np.abs(occlusion - (seen * cosine).sum(0) / cosine.sum(0)).mean() < 0.008
     assert np.abs(transfer - expected).mean() < 0.01
-    assert occlusion[: 162].min() < 0.7, "the plate hides no sky"
+    assert occlusion[:162].min() < 0.7, "the plate hides no sky"
 
 
 def test_an_open_surface_receives_the_closed_form():

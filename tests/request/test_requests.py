@@ -48,6 +48,7 @@ from stga_addon.requests.values import (
     Extend,
     Played,
     Refine,
+    Relight,
     Render,
     RenderRecording,
     Request,
@@ -108,6 +109,8 @@ REQUESTS: tuple[Request, ...] = (
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
     Evaluate(Path("r"), "test", capture=HEAD),
+    Relight(Path("r"), card=(0.5, 0.4, 0.5), capture=HEAD),
+    Render(Path("r"), Path("v.mp4"), True, light=Path("sunset.hdr"), light_turn=360.0),
     ConvertMotion(Path("take.csv"), Path("m.npz"), HEAD, options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None)),
 )
 RESULTS: tuple[Result, ...] = (

@@ -7,7 +7,7 @@ import numpy as np
 from . import jit, part_jit
 from .threads import parallel
 
-ZERO, HALF, ONE, TWO, PI = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0, np.pi))
+ZERO, EIGHTH, HALF, ONE, TWO, PI = (np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi))
 SUN, POINT, SPOT, AREA = 0, 1, 2, 3
 KIND, POSITION, DIRECTION, COLOR, CONE, FADE = 0, 1, 4, 7, 10, 11
 MAP, DIFFUSE, SPECULAR, WIDTH, COLUMNS = 12, 13, 14, 15, 16
@@ -20,15 +20,13 @@ MIN_FACING = np.float32(0.05)
 
 
 @part_jit
-def ggx(facing, toward_eye, half, fresnel_cosine, alpha, reflectance, normalization):
+def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
     """Reflected share per steradian and cosine of a GGX lobe with Smith's shadowing and Schlick's Fresnel term.
 
-    facing, toward_eye, half: cosines of the normal to light, eye and the direction half between them. normalization:
-    the lobe is widened from that α² to `alpha`² by the light's own size (Karis 2013).
+    facing, toward_eye, half: cosines of the normal to light, eye and the direction half between them. square: α².
     """
-    square = alpha * alpha
     spread = half * half * (square - ONE) + ONE
-    distribution = normalization * square / (PI * spread * spread)
+    distribution = square / (PI * spread * spread)
     shadowing = facing * math.sqrt(toward_eye * toward_eye * (ONE - square) + square)
     shadowing += toward_eye * math.sqrt(facing * facing * (ONE - square) + square)
     fade = ONE - fresnel_cosine
@@ -77,9 +75,8 @@ def add_lights(begin, end, points, normals, eye, roughness, reflectance, lights,
                 scale = ONE / math.sqrt(max(hx * hx + hy * hy + hz * hz, np.float32(1e-12)))
                 half = min(max((nx * hx + ny * hy + nz * hz) * scale, ZERO), ONE)
                 fresnel_cosine = min(max((vx * hx + vy * hy + vz * hz) * scale, ZERO), ONE)
-                wide = min(alpha + HALF * width, ONE)
-                share = alpha / wide
-                gloss = ggx(facing, toward_eye, half, fresnel_cosine, wide, reflectance[n], share * share)
+                wide = min(alpha * alpha + EIGHTH * width * width, ONE)  # slopes by roughness and by the light's size
+                gloss = ggx(facing, toward_eye, half, fresnel_cosine, wide, reflectance[n])
             for k in range(3):
                 arriving = light[COLOR + k] * strength * facing
                 irradiance[n, k] += arriving * light[DIFFUSE]

@@ -9,12 +9,12 @@ import numpy as np
 from ...avatar.file import Avatar
 from ...light.harmonics import rotated
 from ...light.relight import Relighter
-from ...light.values import Lighting, no_world
+from ...light.values import Light, Lighting, no_world
 from ..layers import Relit
 from .casters import Casters
 from .lights import in_avatar_space, is_linked, light_of
 from .settings import lighting_settings
-from .world import WorldLight, harmonics_of, world_light
+from .world import WorldLight, split_world, world_light
 
 
 MAX_KEPT = 64
@@ -27,7 +27,7 @@ class SceneLight:
         self.casters = Casters()
         self._relighters: dict[int, Relighter] = {}
         self._relit: dict[tuple[int, bytes], tuple[Any, Relit]] = {}
-        self._worlds: dict[WorldLight, np.ndarray] = {}
+        self._worlds: dict[WorldLight, tuple[np.ndarray, tuple[Light, ...]]] = {}
 
     def relit(
         self, splat_object: Any, head: Any, avatar: Avatar, vertices: np.ndarray, to_world: np.ndarray,
@@ -66,9 +66,10 @@ class SceneLight:
                 lights.append(in_avatar_space(light, to_world))
         white = np.maximum(np.array(settings.white, np.float64), 1e-3)
         red, green, blue = (white / white.mean()).tolist()
+        world, suns = self._world(depsgraph, to_world) if settings.world else (no_world(), ())
         return Lighting(
-            world=self._world(depsgraph, to_world) if settings.world else no_world(),
-            lights=tuple(lights),
+            world=world,
+            lights=(*lights, *suns),
             mode=settings.mode,
             mix=settings.mix,
             exposure=settings.exposure,
@@ -78,19 +79,21 @@ class SceneLight:
             shadows=settings.shadows,
         )
 
-    def _world(self, depsgraph: Any, to_world: np.ndarray) -> np.ndarray:
-        """(9, 3) in the space that `to_world` takes to the world; black where the world's nodes are not understood."""
+    def _world(self, depsgraph: Any, to_world: np.ndarray) -> tuple[np.ndarray, tuple[Light, ...]]:
+        """Harmonics (9, 3) and suns in the space that `to_world` takes to the world; black where the world's nodes are
+        not understood."""
         light = world_light(depsgraph.scene_eval.world)
         if light is None:
-            return no_world()
+            return no_world(), ()
         if light.image is not None:
             light = light._replace(image=light.image.original)
         if light not in self._worlds:
-            self._worlds = {light: harmonics_of(light)}
+            self._worlds = {light: split_world(light)}
+        world, suns = self._worlds[light]
         if light.image is None:
-            return self._worlds[light]
+            return world, suns
         u, _, v = np.linalg.svd(to_world[:3, :3])
-        return rotated(self._worlds[light], (u @ v).T)
+        return rotated(world, (u @ v).T), tuple(in_avatar_space(sun, to_world) for sun in suns)
 
     def _relighter(self, uid: int, avatar: Avatar) -> Relighter:
         if uid not in self._relighters or self._relighters[uid].avatar is not avatar:

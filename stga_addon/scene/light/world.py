@@ -6,13 +6,10 @@ import numpy as np
 from mathutils import Euler
 
 from ...capture.color import srgb_to_linear
-from ...light.harmonics import even_directions, project, uniform
+from ...light.environment import split_environment
+from ...light.harmonics import uniform
+from ...light.values import Light
 from ..compat import world_nodes
-
-DIRECTIONS = 4096
-"""In which an environment texture is looked up."""
-MAX_ROWS = 64
-"""Height that an environment texture is averaged down to."""
 
 
 class WorldLight(NamedTuple):
@@ -51,40 +48,23 @@ def world_light(world: Any) -> WorldLight | None:
     return None if rotation is None else WorldLight((strength,) * 3, texture.image, tuple(rotation.ravel().tolist()))
 
 
-def harmonics_of(light: WorldLight) -> np.ndarray:
-    """(9, 3) of `WorldLight`; reads the image's pixels."""
+def split_world(light: WorldLight) -> tuple[np.ndarray, tuple[Light, ...]]:
+    """Harmonics (9, 3) of `WorldLight`, and its suns, both in the world's axes; reads the image's pixels."""
     if light.image is None:
-        return uniform(light.color)
-    directions = even_directions(DIRECTIONS)
-    radiance = radiance_in(small_image(light.image), directions @ np.reshape(light.rotation, (3, 3)).T)
-    return project(radiance * light.color, directions)
+        return uniform(light.color), ()
+    radiance = image_pixels(light.image)[::-1] * np.array(light.color)
+    return split_environment(radiance, np.reshape(light.rotation, (3, 3)).T)
 
 
-def small_image(image: Any) -> np.ndarray:
-    """(H, W, 3) linear pixels of an image, averaged to MAX_ROWS, bottom row first. Missing images are pink in Blender,
-    and black here."""
+def image_pixels(image: Any) -> np.ndarray:
+    """(H, W, 3) linear pixels of an image, bottom row first; black where its file is missing."""
     width, height = image.size
-    if not width or not height or not image.channels:
-        return np.zeros((1, 1, 3))
+    if not width or not height or image.channels < 3:
+        return np.zeros((2, 4, 3))
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)
-    pixels = pixels.reshape(height, width, image.channels)[..., : min(3, image.channels)]
-    if not image.is_float and image.colorspace_settings.name == "sRGB":
-        pixels = srgb_to_linear(pixels)
-    step = max(1, height // MAX_ROWS)
-    rows, columns = height // step, max(1, width // step)
-    pixels = pixels[: rows * step, : columns * step] if width >= step else pixels[: rows * step]
-    blocks = pixels.reshape(rows, step, columns, -1, pixels.shape[-1])
-    return np.broadcast_to(blocks.mean((1, 3), dtype=np.float64), (rows, columns, 3))
-
-
-def radiance_in(image: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(N, 3) of an equirectangular image (H, W, 3), bottom row first, in unit directions (N, 3), as Cycles reads it."""
-    height, width = image.shape[:2]
-    x, y, z = directions.T
-    column = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * width
-    row = (1 - np.arccos(np.clip(z, -1, 1)) / np.pi) * height
-    return np.asarray(image[np.clip(row.astype(int), 0, height - 1), column.astype(int) % width])
+    pixels = pixels.reshape(height, width, image.channels)[..., :3]
+    return pixels if image.is_float or image.colorspace_settings.name != "sRGB" else srgb_to_linear(pixels)
 
 
 def _rotation(vector: Any) -> np.ndarray | None:

@@ -1,0 +1,139 @@
+"""Environments: Radiance .hdr files, and equirectangular images as harmonics and suns."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import StgaError
+from ..files import file_size
+from .harmonics import basis
+from .values import Light
+
+MAX_PIXELS, MAX_HEADER_BYTES = 1 << 26, 1 << 16
+HEADER = re.compile(rb"#\?(?:RADIANCE|RGBE)[^\n]*\n(?:[^\n]*\n){0,200}?\n-Y (\d{1,6}) \+X (\d{1,6})\n")
+MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF
+"""Widths of images whose rows may be compressed."""
+MAX_SUNS = 4
+SUN_CONTRAST = 12.0
+"""How much brighter than the mean of the environment a pixel must be to belong to a sun."""
+SUN_RADIUS = np.radians(12)
+"""Bright pixels within this angle of the brightest one are one sun."""
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From Blender's axes (z up) to those of a capture that its add-on shows upright (y up, the face looks along z)."""
+
+
+def read_hdr(path: Path) -> np.ndarray:
+    """(H, W, 3) float32 linear radiance of a Radiance picture (.hdr, RGBE), rows from the top.
+
+    Reads flat and run-length encoded rows (Ward, "Real Pixels", Graphics Gems II). Raises StgaError.
+    """
+    file_size(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    header = HEADER.match(data[:MAX_HEADER_BYTES])
+    if header is None:
+        raise StgaError(f"{path}: is not a Radiance picture (.hdr) with rows from the top")
+    height, width = int(header[1]), int(header[2])
+    if not 0 < height * width <= MAX_PIXELS:
+        raise StgaError(f"{path}: claims {width} x {height} pixels; at most {MAX_PIXELS} are read")
+    body = np.frombuffer(data, np.uint8)[header.end() :]
+    try:
+        pixels = _rows(body, height, width)
+    except (IndexError, ValueError) as error:
+        raise StgaError(f"{path}: ends within its pixels, or its rows are damaged") from error
+    exponent = pixels[..., 3:].astype(np.float32)
+    scale = np.where(exponent > 0, np.exp2(exponent - 136), 0)
+    return np.asarray((pixels[..., :3] + np.float32(0.5)) * scale, np.float32)
+
+
+def _rows(body: np.ndarray, height: int, width: int) -> np.ndarray:
+    """(H, W, 4) uint8. Raises IndexError or ValueError where the data end early."""
+    packed = MIN_RUN_WIDTH <= width <= MAX_RUN_WIDTH and body[0] == body[1] == 2 and body[2] < 128
+    if not packed:
+        return body[: height * width * 4].reshape(height, width, 4)
+    pixels, at = np.empty((height, 4, width), np.uint8), 0
+    for row in pixels:
+        if tuple(body[at : at + 4]) != (2, 2, width >> 8, width & 255):
+            raise ValueError("not the start of a row")
+        at += 4
+        for channel in row:
+            at = _unpacked(body, at, channel)
+    return pixels.transpose(0, 2, 1)
+
+
+def _unpacked(body: np.ndarray, at: int, channel: np.ndarray) -> int:
+    """Fill a channel (W,) of a row from run-length encoded data; returns where these end."""
+    filled = 0
+    while filled < len(channel):
+        count = int(body[at])
+        if count > 128:
+            channel[filled : filled + count - 128] = body[at + 1]
+            at, filled = at + 2, filled + count - 128
+        elif count:
+            channel[filled : filled + count] = body[at + 1 : at + 1 + count]
+            at, filled = at + 1 + count, filled + count
+        else:
+            raise ValueError("a run of nothing")
+    if filled > len(channel):
+        raise ValueError("a run beyond the row")
+    return at
+
+
+def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (H, W, 3) that the pixels of an equirectangular image show, and their solid angles (H, 1).
+
+    Blender's: z up, the image's middle shows +x, its quarter to the left +y.
+    """
+    polar = np.pi * (np.arange(height) + 0.5) / height
+    turn = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
+    ring = np.sin(polar)[:, None]
+    vectors = np.stack(
+        [ring * np.cos(turn), ring * np.sin(turn), np.broadcast_to(np.cos(polar)[:, None], (height, width))], axis=-1
+    )
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return vectors, ((edges[:-1] - edges[1:]) * 2 * np.pi / width)[:, None]
+
+
+def split_environment(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> tuple[np.ndarray, tuple[Light, ...]]:
+    """Harmonics (9, 3) of an environment, and its brightest parts as suns, which throw shadows.
+
+    image: (H, W, 3) linear radiance, equirectangular as `pixel_directions`. rotation: (3, 3) from Blender's axes to
+    those of the result. Suns are what is brighter than SUN_CONTRAST times the mean, at most MAX_SUNS; harmonics hold
+    the rest, so that both together have the environment's irradiance.
+    """
+    image = smaller(np.asarray(image, np.float64))
+    vectors, angle = pixel_directions(*image.shape[:2])
+    vectors = vectors @ rotation.T
+    rest, level = image.copy(), image.sum(2)
+    limit = SUN_CONTRAST * (level * angle).sum() / (angle.sum() * image.shape[1])
+    suns = []
+    while len(suns) < MAX_SUNS and level.max() > limit:
+        brightest = vectors.reshape(-1, 3)[level.argmax()]
+        near = (vectors @ brightest > np.cos(SUN_RADIUS)) & (level > limit)
+        arriving = np.where(near[..., None], rest, 0) * angle[..., None]
+        power = arriving.sum((0, 1))
+        toward = (arriving.sum(2)[..., None] * vectors).sum((0, 1))
+        opening = 2 * np.arccos(1 - (near * angle).sum() / (2 * np.pi))
+        suns.append(Light("sun", power, direction=-toward, angle=float(opening)))
+        rest[near], level = 0, np.where(near, 0, level)
+    values = (rest * angle[..., None]).reshape(-1, 3)
+    return np.asarray(basis(vectors.reshape(-1, 3)).T @ values), tuple(suns)
+
+
+def harmonics_of(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> np.ndarray:
+    """(9, 3) of a whole environment, see `split_environment`."""
+    image = smaller(np.asarray(image, np.float64))
+    vectors, angle = pixel_directions(*image.shape[:2])
+    return np.asarray(basis((vectors @ rotation.T).reshape(-1, 3)).T @ (image * angle[..., None]).reshape(-1, 3))
+
+
+def smaller(image: np.ndarray, height: int = 128) -> np.ndarray:
+    """The image averaged over squares of pixels to at most about twice `height` rows."""
+    step = max(1, image.shape[0] // height)
+    rows, columns = image.shape[0] // step * step, image.shape[1] // step * step
+    if step == 1:
+        return image
+    return np.asarray(image[:rows, :columns].reshape(rows // step, step, columns // step, step, -1).mean((1, 3)))

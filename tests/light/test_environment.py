@@ -1,0 +1,103 @@
+"""Environments and files of lights: what is written is read, and an environment keeps its light."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.light.environment import harmonics_of, pixel_directions, read_hdr, split_environment
+from stga_addon.light.harmonics import LAMBERT, basis
+from stga_addon.light.light_file import read_lighting, turned
+
+
+def rgbe(pixels: np.ndarray) -> np.ndarray:
+    """(…, 4) uint8 of radiance (…, 3): Ward's shared exponent, rounded down."""
+    exponent = np.floor(np.log2(np.maximum(pixels.max(-1), 1e-30))).astype(int) + 1
+    mantissa = np.floor(pixels * 256 / np.exp2(exponent)[..., None])
+    return np.concatenate([mantissa, exponent[..., None] + 128], axis=-1).astype(np.uint8)
+
+
+def write_hdr(path: Path, pixels: np.ndarray, packed: bool) -> Path:
+    """A Radiance picture with flat rows, or run-length encoded ones."""
+    height, width = pixels.shape[:2]
+    body, data = rgbe(pixels), b""
+    for row in body:
+        if not packed:
+            data += row.tobytes()
+            continue
+        data += struct.pack(">BBH", 2, 2, width)
+        for channel in row.T:
+            if len(set(channel)) == 1:
+                data += bytes(b for n in [min(127, width)] for b in (128 + n, channel[0]))
+                rest = channel[127:]
+            else:
+                rest = channel
+            for start in range(0, len(rest), 100):
+                part = rest[start : start + 100]
+                data += bytes([len(part)]) + part.tobytes()
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y %d +X %d\n" % (height, width) + data)
+    return path
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_hdr_pixels(tmp_path, packed):
+    """Catches rows, channels or exponents that are read wrongly, flat and run-length encoded."""
+    pixels = np.exp(np.random.default_rng(0).normal(size=(5, 200, 3)) * 3)
+    pixels[1] = [0.5, 2.0, 100.0]
+    path = write_hdr(tmp_path / "a.hdr", pixels, packed)
+    found = read_hdr(path)
+    assert found.dtype == np.float32
+    scale = np.exp2(np.floor(np.log2(pixels.max(-1, keepdims=True))) + 1) / 256
+    assert (np.abs(found - pixels) <= scale).all()
+    for cut in (-1, 40, 10):
+        damaged = tmp_path / "b.hdr"
+        damaged.write_bytes(path.read_bytes()[:cut])
+        with pytest.raises(StgaError, match=r"b\.hdr"):
+            read_hdr(damaged)
+
+
+def test_an_environment_keeps_its_irradiance():
+    """Catches suns that are counted twice, solid angles of poles, and directions other than Blender's."""
+    image = np.full((64, 128, 3), 0.2)
+    vectors, angle = pixel_directions(64, 128)
+    assert (angle * 128).sum() == pytest.approx(4 * np.pi)
+    np.testing.assert_allclose(vectors[32, 64], [1, 0, 0], atol=0.05)
+    np.testing.assert_allclose(vectors[32, 32], [0, 1, 0], atol=0.05)
+    sun = vectors @ (toward := np.array([0.6, 0.0, 0.8])) > np.cos(np.radians(4))
+    image[sun] = [400.0, 300.0, 200.0]
+    world, suns = split_environment(image, np.eye(3))
+    assert len(suns) == 1
+    np.testing.assert_allclose(-suns[0].direction, toward, atol=0.02)
+    assert 0.1 < suns[0].angle < 0.2
+    for normal in (toward, np.array([1.0, 0, 0]), np.array([0, 0, -1.0])):
+        truth = (image * angle[..., None] * np.maximum(vectors @ normal, 0)[..., None]).sum((0, 1))
+        sh = (basis(normal[None]) * LAMBERT @ world)[0] + suns[0].color * max(-suns[0].direction @ normal, 0)
+        np.testing.assert_allclose(sh, truth, rtol=0.02, atol=0.05)
+    np.testing.assert_allclose(harmonics_of(image, np.eye(3))[0], world[0] + suns[0].color * 0.28209, rtol=1e-3)
+
+
+def test_lights_of_a_text_file(tmp_path):
+    """Catches defaults, strength and color that are lost, and mistakes without a sentence."""
+    path = tmp_path / "lights.toml"
+    path.write_text(
+        'world = [0.1, 0.2, 0.3]\nexposure = 1.5\n[[lights]]\nkind = "sun"\nstrength = 3\ncolor = [1, 0.5, 0.25]\n'
+        'direction = [0, -2, 0]\n[[lights]]\nkind = "area"\nstrength = 10\nposition = [1, 1, 1]\nsize = [0.2, 0.4]\n'
+    )
+    lighting = read_lighting(path)
+    np.testing.assert_allclose(lighting.lights[0].color, [3, 1.5, 0.75])
+    np.testing.assert_allclose(lighting.lights[0].direction, [0, -1, 0])
+    assert (lighting.exposure, lighting.lights[1].size, lighting.shadows) == (1.5, (0.2, 0.4), True)
+    np.testing.assert_allclose((basis(np.eye(3)[:1]) @ lighting.world)[0], [0.1, 0.2, 0.3])
+    around = turned(lighting, np.zeros(3), 90)
+    np.testing.assert_allclose(around.lights[1].position, [1, 1, -1], atol=1e-9)
+    for text, message in (
+        ("lights = 3", "lights"), ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"), ("sky = 1", "sky"), ("world = ", "TOML"),
+        ('[[lights]]\nkind = "sun"\nstrength = -1', "strength"), ("roughness = 0", "roughness"),
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(StgaError, match=message):
+            read_lighting(path)
+    with pytest.raises(StgaError, match=r"\.hdr"):
+        read_lighting(tmp_path / "light.png")

@@ -1,0 +1,95 @@
+"""The estimate of a capture's light, from colors made with a known one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from light.scenes import ball_and_plate
+from stga_addon.light.estimate import HARD_RESIDUAL, fit_light
+from stga_addon.light.eyes import wet_roughness
+from stga_addon.light.harmonics import LAMBERT, basis, even_directions, project, rotated, uniform
+from stga_addon.light.observe import Observed
+from stga_addon.light.surface import vertex_normals
+from stga_addon.light.transfer import transfer_of
+
+SKIN = np.array([0.5, 0.36, 0.25])
+
+
+def soft_light() -> np.ndarray:
+    light = uniform((0.6, 0.6, 0.6))
+    light[1:4] = [[0.3] * 3, [0.5] * 3, [-0.2] * 3]
+    return light
+
+
+@pytest.fixture(scope="module")
+def received() -> np.ndarray:
+    """(F, 9) transfer of the triangles of a ball under a plate."""
+    vertices, faces = ball_and_plate(3)
+    return np.asarray(transfer_of(vertices, faces, 96)[0][faces].mean(1), np.float64)
+
+
+def recorded(received: np.ndarray, light: np.ndarray, turns: list[np.ndarray]) -> Observed:
+    """Colors of skin with spots of other colors and highlights on some triangles."""
+    rng = np.random.default_rng(1)
+    albedo = SKIN * rng.uniform(0.9, 1.1, (len(received), 1))
+    albedo[rng.random(len(received)) < 0.15] *= 0.2
+    colors = np.stack([albedo / np.pi * (received @ rotated(light, turn)) for turn in turns])
+    colors *= rng.normal(1, 0.02, colors.shape)
+    colors[:, rng.random(len(received)) < 0.05] += 0.3
+    colors[:, rng.random(len(received)) < 0.2] = np.nan
+    return Observed(np.maximum(colors, 1e-3), np.stack(turns))
+
+
+def test_a_soft_light_is_found_despite_spots_and_highlights(received):
+    """Catches light that is drawn to hair, brows and highlights, and one that turns with the head."""
+    angle = np.radians(25)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    light = soft_light()
+    found, residual = fit_light(recorded(received, light, [np.eye(3), turn, turn.T]), received)
+    normals = even_directions(200)
+    have, want = (np.maximum(basis(normals) * LAMBERT @ each, 0)[:, 1] for each in (found, light))
+    have *= want.mean() / have.mean()
+    assert np.abs(have - want).mean() < 0.03 * want.mean()
+    assert residual < HARD_RESIDUAL / 2
+
+
+def test_a_hard_light_is_told(received):
+    """Catches a lamp that is taken for soft light: degree 2 cannot hold its shadow's edge."""
+    vertices, faces = ball_and_plate(3)
+    normals = vertex_normals(vertices, faces)[faces].mean(1)
+    toward = np.array([0.9, 0.1, 0.3]) / np.linalg.norm([0.9, 0.1, 0.3])
+    lit = np.maximum(normals @ toward, 0) + 0.05
+    colors = (SKIN / np.pi * 3 * lit[:, None])[None]
+    _, residual = fit_light(Observed(np.maximum(colors, 1e-3), np.eye(3)[None]), received)
+    assert residual > HARD_RESIDUAL
+
+
+def test_a_known_light_is_kept(received):
+    """Catches an estimate in place of the environment that was given."""
+    light = soft_light()
+    found, _ = fit_light(recorded(received, light, [np.eye(3)]), received, light)
+    np.testing.assert_array_equal(found, light)
+
+
+def test_eyeballs_are_found(shared_data: Path):
+    """Catches eyes without a highlight of their own, and skin that is taken for one."""
+    from stga_addon.capture.open import open_capture
+
+    capture = open_capture(shared_data / "studio_head")
+    wet = wet_roughness(capture.neutral, capture.faces) > 0
+    eyes = np.zeros(len(wet), bool)
+    eyes[capture.faces[capture.regions["left_eye"] | capture.regions["right_eye"]]] = True
+    assert wet.sum() > 100
+    assert eyes[wet].mean() > 0.95
+
+
+def test_harmonics_turn_with_their_axes():
+    """Catches a rotation that is applied the other way round."""
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    sky, light = even_directions(2000), rng.normal(size=3)
+    sharp = np.maximum(sky @ light, 0)[:, None]
+    expected = project(np.maximum(sky @ (turn @ light), 0)[:, None], sky)
+    np.testing.assert_allclose(rotated(project(sharp, sky), turn), expected, atol=2e-3)
