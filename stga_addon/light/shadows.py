@@ -1,6 +1,7 @@
 """Shadow maps: what a light sees of a head and of other objects."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,8 +21,22 @@ Projection = Callable[[np.ndarray], np.ndarray]
 """Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light cannot see them."""
 
 
-def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
-    """How a light sees space: parallel for a sun, else in perspective from its position, around the head.
+@dataclass(frozen=True)
+class LightView:
+    """How a light sees space: parallel for a sun, else in perspective from its position.
+
+    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit of slope.
+    """
+
+    axes: np.ndarray
+    origin: np.ndarray
+    scale: float
+    is_parallel: bool
+    size: int
+
+
+def light_view(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> LightView:
+    """The view of a light around the head (V, 3).
 
     A light inside the sphere around the head sees it under a wide angle, and loses what lies behind it.
     """
@@ -38,17 +53,27 @@ def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -
     across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
-    origin = center if light.kind == "sun" else light.position
+    return LightView(axes, center if light.kind == "sun" else light.position, scale, light.kind == "sun", size)
+
+
+def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
+    """What `light_view` sees, as a function of points."""
+    view = light_view(vertices, light, size)
 
     def project(points: np.ndarray) -> np.ndarray:
-        local = (points - origin) @ axes
-        if light.kind != "sun":
+        local = (points - view.origin) @ view.axes
+        if not view.is_parallel:
             depth = local[:, 2:]
             local[:, :2] /= np.where(depth > 1e-4, depth, np.nan)
-        local[:, :2] = local[:, :2] * scale + size / 2
+        local[:, :2] = local[:, :2] * view.scale + size / 2
         return np.asarray(local, np.float32)
 
     return project
+
+
+def texel_meters(vertices: np.ndarray, size: int = MAP_SIZE) -> float:
+    """About how wide a texel of a shadow map is on the head (V, 3)."""
+    return float(np.linalg.norm(np.ptp(vertices, axis=0))) / size
 
 
 class ShadowMap:
@@ -64,7 +89,7 @@ class ShadowMap:
     ) -> None:
         add_depths = shadow_kernels().add_depths
         self._project = light_projection(vertices, light, size)
-        self._light, self._texel_m = light, 2 * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2 / size
+        self._light, self._texel_m = light, texel_meters(vertices, size)
         self.depth = np.full((size, size), np.inf, np.float32)
         add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
         for caster in casters:
