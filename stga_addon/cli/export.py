@@ -37,6 +37,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         action="store_true",
         help="web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take stay in the page",
     )
+    parser.add_argument(
+        "--albedo", action="store_true", help="leave out the capture's light: colors are the albedo (docs/light.md)"
+    )
     parser.add_argument("--out", type=usable_path, required=True)
 
 
@@ -54,6 +57,7 @@ def run(options: Namespace) -> None:
     request = Export(
         options.avatar, options.out, options.format, options.capture, options.flame, played, options.timestep,
         options.frames, fps, options.motion_only, options.motion, motion_options(options),
+        options.albedo,
     )  # fmt: skip
     carry_out(request)
 

@@ -1,20 +1,25 @@
-"""Show what a capture holds, and which effects training on it would use."""
+"""Show what a capture holds, and which effects training on it would use; or what an avatar holds."""
 
 import json
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 
+from ..avatar.file import read_avatar
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
 from ..requests.results import Analyzed
 from ..requests.values import Analyze
 from ..schema import to_json
 from ..training.effects.decisions import parse_choices
+from ..training.run.folder import RUN
 from .arguments import add_capture, add_device, add_effects
 from .carry_out import carry_out
 from .inputs import open_named_capture, principal_point_of
 from .table import print_table
 
-NAME, HELP = "info", "show what a capture holds, and which effects training on it would use"
+NAME, HELP = "info", "show what a capture, a run or an avatar file holds, and which effects training would use"
+
+UNKNOWN_LIGHT = "light: unknown; `stga relight RUN` estimates it"
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -29,6 +34,9 @@ def run(options: Namespace) -> None:
     from ..capture.summary import summarize_capture
     from ..training.effects.plan import describe_effects
 
+    if (options.capture / RUN).exists() or options.capture.suffix == ".npz":
+        _describe_avatar(options.capture)
+        return
     if options.presets and not options.json:
         raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
     capture = None if options.json else open_named_capture(options)
@@ -43,3 +51,14 @@ def run(options: Namespace) -> None:
     if found.plan:
         print()
         print_table(describe_effects(found.plan))
+
+
+def _describe_avatar(path: Path) -> None:
+    """Print what a run's avatar, or an avatar file, holds."""
+    from ..perform.inputs import avatar_path
+    from ..perform.relighting import describe_light
+
+    avatar = read_avatar(avatar_path(path))
+    rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
+    lines = (UNKNOWN_LIGHT,) if avatar.light is None else describe_light(avatar.light)
+    print_table([*rows, *((name, text.strip()) for name, _, text in (line.partition(":") for line in lines))])

@@ -35,8 +35,8 @@ class Known:
     """What is known of a capture's light.
 
     radiance   (9, 3) harmonics in the capture's axes; None: estimated
-    card       (K, 3) linear colors that a gray card of 18 % shows at the face, facing `toward`, or a gray ball where its
-               normal is that; None: the level is unknown
+    card       (K, 3) linear colors of a gray card of 18 % at the face that faces `toward`, or of a gray ball where that
+               is its normal; None: the level is unknown
     toward     (K, 3) unit vectors
     """
 

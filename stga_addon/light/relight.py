@@ -1,13 +1,14 @@
 """Colors of an avatar's splats under the light of a scene."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
-from ..avatar.splats import SH_C0
+from ..avatar.splats import SH_C0, no_strain_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
 from ..capture.rigid import weighted_procrustes
 from ..errors import StgaError
@@ -191,3 +192,14 @@ class Relighter:
     @staticmethod
     def _unit(vectors: np.ndarray) -> np.ndarray:
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def albedo_avatar(avatar: Avatar) -> Avatar:
+    """The avatar without its light: colors are albedo in sRGB, from every side and under every strain the same.
+
+    Raises StgaError where the avatar has no light.
+    """
+    color = linear_to_srgb(np.clip(Relighter(avatar).albedo, 0, 1))
+    sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
+    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
+    return replace(avatar, splats=splats, light=None)

@@ -8,6 +8,7 @@ from ..errors import StgaError
 from ..export.formats import FORMATS, Meshes, check_free_space, export_avatar, range_bytes
 from ..export.playback import playback_fps
 from ..format import format_bytes
+from ..light.relight import albedo_avatar
 from ..progress import Report, Say, counted
 from ..requests.results import Written
 from ..requests.values import Export
@@ -19,6 +20,8 @@ from .motion import motion_capture, open_avatar_motion
 def export(request: Export, report: Report, say: Say) -> Written:
     """Write the file or the folder. Says how much room several frames take; raises StgaError."""
     avatar, capture = open_avatar(request)
+    if request.albedo:
+        avatar = albedo_avatar(avatar)
     if request.motion is not None:
         capture = motion_capture(request, open_avatar_motion(request, avatar, say), capture)
     fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")

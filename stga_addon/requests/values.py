@@ -283,6 +283,7 @@ class Export:
     fps             of a format that has a frame rate; None: the capture's
     motion_only     of a web page: leave out the blend shapes and the skeleton of the FLAME model
     motion          another person's motion, which drives the avatar instead, with `motion_options`
+    albedo          leave out the light of the capture: colors are the albedo, for programs that light splats
     """
 
     source: Path
@@ -297,6 +298,7 @@ class Export:
     motion_only: bool = False
     motion: Path | None = None
     motion_options: MotionOptions = field(default_factory=MotionOptions)
+    albedo: bool = False
 
     def check(self) -> None:
         """Raise StgaError for a file name of another format."""

@@ -93,7 +93,8 @@ def test_lights_of_a_text_file(tmp_path):
     around = turned(lighting, np.zeros(3), 90)
     np.testing.assert_allclose(around.lights[1].position, [1, 1, -1], atol=1e-9)
     for text, message in (
-        ("lights = 3", "lights"), ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"), ("sky = 1", "sky"), ("world = ", "TOML"),
+        ("lights = 3", "lights"),
+        ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"), ("sky = 1", "sky"), ("world = ", "TOML"),
         ('[[lights]]\nkind = "sun"\nstrength = -1', "strength"), ("roughness = 0", "roughness"),
     ):  # fmt: skip
         path.write_text(text)

@@ -48,8 +48,8 @@ def add_depths(points, faces, depth):
 def lit_shares(begin, end, depth, points, bias, step, lit):
     """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not block it.
 
-    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block. step: texels between the
-    3 × 3 places that are looked up bilinearly around a point; 0: one place.
+    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block. step: texels between
+    the 3 × 3 places that are looked up bilinearly around a point; 0: one place.
     """
     size, reach = len(depth), 1 if step > 0 else 0
     for n in range(begin, end):
