@@ -20,6 +20,7 @@ from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
+from .light import EstimateLight, HeadShadow
 from .pose import PoseHead
 from .preview_images import PreviewImages
 from .render_video import RenderVideo
@@ -58,6 +59,8 @@ CLASSES = (
     ShowAvatar,
     StandardView,
     MoreBounces,
+    EstimateLight,
+    HeadShadow,
     PreviewImages,
     RenderVideo,
     ApplyMotion,

@@ -34,6 +34,8 @@ EXPORT_AVATAR = "stga.export_avatar"
 EXPORT_CAMERAS = "stga.export_cameras"
 STANDARD_VIEW = "stga.standard_view"
 MORE_BOUNCES = "stga.more_bounces"
+ESTIMATE_LIGHT = "stga.estimate_light"
+HEAD_SHADOW = "stga.head_shadow"
 PREVIEW_IMAGES = "stga.preview_images"
 
 TAB = "STGA"  # of the 3D viewport's sidebar

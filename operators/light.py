@@ -1,17 +1,20 @@
 """The light of avatars: estimated from the capture, and their shadows onto the scene."""
 
-from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
 from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.requests.values import Relight
+from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
 from ..stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow
 from . import ids
-from .common import reporting, scene_settings
+from .common import file_path, flame_model_path, reporting, scene_settings
+from .request import needs_idle, start
+from .training_python import training_python
 
 
 def _needs_splats(operator: Any, context: Any) -> bool:
@@ -23,6 +26,28 @@ def _needs_splats(operator: Any, context: Any) -> bool:
         pass
     operator.poll_message_set("Show an avatar first")
     return False
+
+
+class EstimateLight(bpy.types.Operator):
+    """Find out the light of the capture that the avatar was trained on, so that the scene can light the avatar"""
+
+    bl_idname = ids.ESTIMATE_LIGHT
+    bl_label = "Estimate Light"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    directory: bpy.props.StringProperty(
+        name="Run Folder", description="Folder of the avatar's run", subtype="DIR_PATH", options=PATH_OPTIONS
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_idle(cls, context, Kind.LIGHT) and _needs_splats(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        run = file_path(self.directory or scene_settings(context).run_folder, "run folder")
+        start(context.scene, Relight(run, flame=flame_model_path(context)), training_python(context))
+        return {"FINISHED"}
 
 
 class HeadShadow(bpy.types.Operator):

@@ -7,11 +7,13 @@ import bpy
 from ..operators import ids
 from ..operators.common import scene_settings
 from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
 from ..stga_addon.scene.light.settings import lighting_settings
 from ..stga_addon.scene.light.stored import read_light
 from ..stga_addon.scene.light.world import world_light
+from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
 
@@ -30,13 +32,17 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         light = _light(scene_settings(context).splats)
         if light is None:
             draw_text(layout, context, "The avatar does not know the light of its capture", "INFO")
-            layout.operator(ids.ESTIMATE_LIGHT, icon="LIGHT_SUN")
+            if not draw_running(layout, context, Kind.LIGHT):
+                folder = scene_settings(context).run_folder
+                layout.operator(ids.ESTIMATE_LIGHT, icon="LIGHT_SUN").directory = folder
             return
         layout.row().prop(settings, "mode", expand=True)
         if settings.mode != "recorded":
             self._draw_settings(layout, context, settings)
         if light.damping:
-            draw_text(layout, context, f"The capture's light was hard: albedo is evened out by {light.damping:.0%}", "INFO")
+            draw_text(
+                layout, context, f"The capture's light was hard: albedo is evened out by {light.damping:.0%}", "INFO"
+            )
         layout.operator(ids.HEAD_SHADOW)
 
     def _draw_settings(self, layout: Any, context: Any, settings: Any) -> None:

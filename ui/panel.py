@@ -17,6 +17,7 @@ from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
 from .continue_panel import ContinuePanel
 from .effects import EffectsPanel
+from .lighting import LightingPanel
 from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
@@ -123,6 +124,7 @@ CLASSES = (
     ContinuePanel,
     EffectsPanel,
     ShowPanel,
+    LightingPanel,
     MotionPanel,
     ArkitPanel,
     ExpressionPanel,

@@ -7,7 +7,19 @@ from pathlib import Path
 from ..training.run.folder import AVATAR
 from ..worker.status import WorkerSnapshot, WorkerState
 from .folder import PREVIEW
-from .values import Analyze, Extend, Refine, RenderRecording, Request, Resume, SelectForTake, SolveAgain, Track, Train
+from .values import (
+    Analyze,
+    Extend,
+    Refine,
+    Relight,
+    RenderRecording,
+    Request,
+    Resume,
+    SelectForTake,
+    SolveAgain,
+    Track,
+    Train,
+)
 
 CHECK_INTERVAL_S = 0.5
 SLICE_INTERVAL_S = 0.02
@@ -21,6 +33,7 @@ class Kind(StrEnum):
     TRACKING = "tracking"
     ANALYSIS = "analysis"
     SELECTION = "selection"
+    LIGHT = "light"
     VIDEO = "video"
     ENVIRONMENT = "environment"
 
@@ -35,11 +48,12 @@ SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
     Analyze: (Kind.ANALYSIS, "capture"),
     SelectForTake: (Kind.SELECTION, "capture"),
     RenderRecording: (Kind.VIDEO, "output"),
+    Relight: (Kind.LIGHT, "run"),
 }
 """Request -> its kind, and the field that names what it is about."""
 STORED = {Kind.TRAINING, Kind.TRACKING}
 """Requests that the .blend file remembers; their folder is in that of the run or capture, others' are temporary."""
-TRANSIENT = {Kind.ANALYSIS, Kind.SELECTION}
+TRANSIENT = {Kind.ANALYSIS, Kind.SELECTION, Kind.LIGHT}
 """Requests that leave nothing but their result in the scene: killed when they are cancelled, gone when they ended."""
 DISMISSIBLE = {*STORED, Kind.VIDEO}
 SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
@@ -47,6 +61,7 @@ SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
     Kind.TRACKING: (WorkerState.FINISHED,),
     Kind.ANALYSIS: (WorkerState.FINISHED,),
     Kind.SELECTION: (WorkerState.FINISHED,),
+    Kind.LIGHT: (WorkerState.FINISHED,),
     Kind.VIDEO: (),
     Kind.ENVIRONMENT: (),
 }

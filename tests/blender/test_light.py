@@ -1,7 +1,6 @@
 """Blender's lights, worlds and objects as an avatar sees them, against Cycles; and its colors in the engine."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +21,14 @@ from stga_addon.light.shadows import LIFT_M  # noqa: E402
 from stga_addon.light.surface import vertex_normals  # noqa: E402
 from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.splat_object import hide_object, show_avatar, stored_avatar  # noqa: E402
-from stga_addon.scene.light import settings  # noqa: E402
+from stga_addon.scene.display.splat_object import hide_object, show_avatar  # noqa: E402
 from stga_addon.scene.layers import Relit  # noqa: E402
+from stga_addon.scene.light import settings  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
-PLACE = Matrix.LocRotScale(Vector((0.4, -0.2, 0.3)), Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized()), (1.3,) * 3)
+PLACE = Matrix.LocRotScale(
+    Vector((0.4, -0.2, 0.3)), Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized()), (1.3,) * 3
+)
 """Of the head in the world."""
 BALL = 642
 """Vertices of the ball; after them come those of the plate above, at whose sharp edges normals are not the surface's."""
@@ -85,7 +86,9 @@ def light_irradiance(found: Relit) -> np.ndarray:
     """(BALL, 3) that arrives at the ball's vertices."""
     normals = vertex_normals(found.mesh, found.relighter.avatar.faces)
     lamps = Lamps(found.lighting, found.mesh, found.relighter.avatar.faces, found.casters)
-    world = np.maximum(found.relighter.light.transfer @ found.relighter.world_in_head(found.mesh, found.lighting.world), 0)
+    world = np.maximum(
+        found.relighter.light.transfer @ found.relighter.world_in_head(found.mesh, found.lighting.world), 0
+    )
     return (lamps.irradiance(found.mesh + LIFT_M * normals, normals) + world)[:BALL]
 
 

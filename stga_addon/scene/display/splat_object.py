@@ -1,6 +1,7 @@
 """Splat objects: the Blender objects that display avatars and world-space splats."""
 
 from typing import Any
+from uuid import uuid4
 
 import bpy
 import numpy as np
@@ -88,6 +89,18 @@ def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
     """
     _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared)
     write_splats(splat_object.data, prepared.splats)
+
+
+def store_light(splat_object: Any, avatar: Avatar) -> bool:
+    """Give the object the light of the same avatar; False where it shows another one."""
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    if neutral is None or not has_triangles(neutral.data, avatar.faces):
+        return False
+    if len(splat_object.data.vertices) != len(avatar.splats):
+        return False
+    write_light(neutral.data, avatar.light)
+    splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
+    return True
 
 
 def build_next_node_group(avatar: Avatar) -> bool:

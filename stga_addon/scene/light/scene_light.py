@@ -16,7 +16,6 @@ from .lights import in_avatar_space, is_linked, light_of
 from .settings import lighting_settings
 from .world import WorldLight, split_world, world_light
 
-
 MAX_KEPT = 64
 
 
@@ -43,7 +42,10 @@ class SceneLight:
         lighting = self.lighting(settings, (splat_object, head), to_world, visible, depsgraph)
         casters = self.casters.of(head, to_world, visible, depsgraph) if lighting.shadows else ()
         relighter = self._relighter(splat_object.session_uid, avatar)
-        key, place = (_key(lighting), id(relighter), id(vertices), id(casters)), (splat_object.session_uid, to_world.tobytes())
+        key, place = (
+            (_key(lighting), id(relighter), id(vertices), id(casters)),
+            (splat_object.session_uid, to_world.tobytes()),
+        )
         known = self._relit.get(place)
         if known is None or known[0] != key:
             if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
