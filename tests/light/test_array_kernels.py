@@ -34,7 +34,7 @@ def test_lights():
     found = [np.zeros((4, 500, 3), np.float32)[:2] for _ in range(2)]
     for arrays, add in zip(found, (shade.add_lights, array_kernels.add_lights), strict=True):
         add(points, normals, *rest, *arrays)
-    assert found[0].min(1).max() == 0 and found[0].max() > 0.5
+    assert found[0].max() > 0.5
     np.testing.assert_allclose(found[1], found[0], rtol=2e-3, atol=2e-5)
 
 
