@@ -121,7 +121,7 @@ LAMPS = {
     "area": ("AREA", (0.4, -1.0, 0.8), 10.0, {"shape": "RECTANGLE", "size": 0.3, "size_y": 0.1}),
     "disk, exposed": ("AREA", (1.2, 0.6, 0.8), 4.0, {"shape": "DISK", "size": 0.2, "exposure": 1.5}),
     "per area, warm": (
-        "AREA", (0.4, -1.0, 0.8), 90.0, {"size": 0.2, "normalize": False, "use_temperature": True, "temperature": 3000.0}
+        "AREA", (0.4, -1.0, 0.8), 90.0, {"size": 0.2, "normalize": False, "use_temperature": True, "temperature": 3e3}
     ),
 }  # fmt: skip
 
