@@ -22,6 +22,8 @@ MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
 LOSS_SCALE = 3.0
 """Residual at which an observation's weight has halved, in medians."""
 RIDGE = 1e-4
+MIN_ARRIVING, DARK = 0.02, 1e-5
+"""Least irradiance that a color is divided by, as a share of the mean; and what counts as no light or albedo."""
 TYPICAL_ALBEDO = 0.36
 """Of skin (green), which sets the level of an estimated light; exposure and the eyedropper correct it."""
 HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
@@ -60,7 +62,7 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
         assert known.toward is not None
         radiance, source = _level_with(radiance, known.card, known.toward), "gray_card"
     mean = np.mean([transfer @ rotated(radiance, rotation) for rotation in observed.rotation], axis=0)
-    mean = np.maximum(mean, 0)
+    mean = np.maximum(mean, DARK)
     irradiance = mean + Bounce(capture.neutral, capture.faces, occlusion).light(mean)
     damping = MAX_DAMPING * float(np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1))
     return AvatarLight(
@@ -94,8 +96,9 @@ def fit_light(observed: Observed, transfer: np.ndarray, given: np.ndarray | None
     radiance = uniform(np.ones(3) / np.pi) if given is None else given
     weight = np.ones_like(color)
     for _ in range(ITERATIONS):
-        arriving = np.maximum(received @ radiance, 0.02 * (received @ radiance).mean(0))
-        typical = np.median(color / arriving, axis=0)
+        arriving = received @ radiance
+        arriving = np.maximum(arriving, np.maximum(MIN_ARRIVING * arriving.mean(0), DARK))
+        typical = np.maximum(np.median(color / arriving, axis=0), DARK)
         albedo = _albedo(color, arriving, weight, face, typical, len(transfer), len(turns))
         error = np.abs(color - albedo * arriving)
         weight = 1 / (1 + (error / (LOSS_SCALE * np.median(error, axis=0) + 1e-9)) ** 2)
@@ -104,7 +107,7 @@ def fit_light(observed: Observed, transfer: np.ndarray, given: np.ndarray | None
     residual = float(1.4826 * np.median(error / np.maximum(color, 1e-3)))
     if given is None:
         mean = (received @ radiance).mean(0)
-        radiance = radiance / mean * (typical * mean)[1] * np.pi / TYPICAL_ALBEDO
+        radiance = radiance / np.maximum(mean, DARK) * (typical * mean)[1] * np.pi / TYPICAL_ALBEDO
     return radiance, residual
 
 
@@ -129,6 +132,7 @@ def _solve(color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: 
         rows = received * (albedo[:, k] * np.sqrt(weight[:, k]))[:, None]
         matrix = rows.T @ rows
         ridge = RIDGE * np.trace(matrix) / COUNT * np.eye(COUNT)
+        ridge[np.diag_indices(COUNT)] += DARK**2  # a channel that shows nothing
         found[:, k] = np.linalg.solve(matrix + ridge, rows.T @ (color[:, k] * np.sqrt(weight[:, k])))
     return found
 

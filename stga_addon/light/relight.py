@@ -23,9 +23,9 @@ REFLECTANCE = 0.04
 """Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
 MIN_IRRADIANCE = 0.15
 """Least irradiance of the capture that color is divided by, as a share of its mean: what was darker is noise."""
-HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.1
-"""Part of what arrived in the capture that came back as highlights, which is taken from the recorded colors; at least
-MIN_DIFFUSE_SHARE of them remains."""
+HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.14, 0.1
+"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes, which mirror what is
+in front of them; it is taken from the recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
 VIEW_DIRECTIONS, MIN_VIEW_COSINE = 96, 0.3
 """Recorded colors are means over as many directions from which a splat's surface is seen."""
 
@@ -152,7 +152,8 @@ class Relighter:
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
         linear = srgb_to_linear(np.maximum(color, 0))
-        highlight = HIGHLIGHT_SHARE * self.irradiance / np.pi
+        share = np.where(self.roughness > 0, np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE))
+        highlight = share[:, None] * self.irradiance / np.pi
         albedo = np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
         damping = self.light.damping
         if damping:

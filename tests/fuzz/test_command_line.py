@@ -449,6 +449,11 @@ def extend(rng: random.Random, case: Path) -> list[str]:
     return [some_path(rng, case, "splats", "run"), *takes, *only, *([] if only else continuing(rng, case))]
 
 
+def relight(rng: random.Random, case: Path) -> list[str]:
+    light = option(rng, 0.3, "--light", some_path(rng, case, "mesh", "motion.npz"))
+    return [some_path(rng, case, "splats", "run"), *light, *option(rng, 0.3, "--gray-card", "0.5,0.5,0.4", *TEXTS)]
+
+
 def continuing(rng: random.Random, case: Path) -> list[str]:
     """Options that `refine` and `extend` share; each training has an iteration or two."""
     arguments = ["--iterations", rng.choice(["1", "1", "2", "0", "x"]), *output(rng, case, "new")]
@@ -530,6 +535,7 @@ COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = 
     "train": (1, train),
     "refine": (0.5, refine),
     "extend": (0.5, extend),
+    "relight": (0.5, relight),
     "track": (1, track),
     "avatar": (0.5, avatar),
     "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{name}" for name in REQUESTS))]),

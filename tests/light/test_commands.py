@@ -1,0 +1,118 @@
+"""The commands: a run's avatar learns its light, is rendered under others, and exported without."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture import factory
+from PIL import Image
+
+from stga_addon.avatar.file import read_avatar, write_avatar
+from stga_addon.capture.color import srgb_to_linear
+from stga_addon.cli.main import main
+from stga_addon.export.ply import read_ply
+from stga_addon.light.relight import Relighter, albedo_avatar
+
+LIGHTS = """
+world = [0.3, 0.3, 0.3]
+[[lights]]
+kind = "sun"
+strength = 4
+direction = [-1, 0, -0.5]
+"""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return factory.write_mesh_capture(tmp_path_factory.mktemp("light") / "ball", (0, 1), range(4))
+
+
+@pytest.fixture(scope="module")
+def run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["train", str(root), "--out", str(out), "--iterations", "10", "--schedule", "paper"]) == 0
+    return out
+
+
+def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
+    assert main(["render", str(run), "--cameras", str(root / "transforms_val.json"), "--out", str(out), *options]) == 0
+    with Image.open(sorted(out.iterdir())[0]) as image:
+        return np.asarray(image).astype(int)
+
+
+def test_a_run_ends_with_its_light(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a training that leaves the avatar without light, and an avatar file that loses it or grows by much."""
+    avatar = read_avatar(run / "avatar.npz")
+    assert avatar.light is not None
+    assert avatar.light.transfer.shape == (len(avatar.neutral), 9)
+    without = run.parent / "without.npz"
+    write_avatar(without, replace(avatar, light=None))
+    grown = (run / "avatar.npz").stat().st_size - without.stat().st_size
+    assert grown < 30 * len(avatar.neutral) + 2500
+    assert main(["info", str(run)]) == 0
+    assert "recorded colors differ" in capsys.readouterr().out
+    assert main(["info", str(without)]) == 0
+    assert "stga relight" in capsys.readouterr().out
+
+
+def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> None:
+    """Catches a card that is ignored: twice the light is half the albedo."""
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    found = []
+    for level in (0.5, 0.25):
+        value = str(1.055 * level ** (1 / 2.4) - 0.055)
+        assert main(["relight", str(copy), "--gray-card", f"{value},{value},{value}"]) == 0
+        light = read_avatar(copy / "avatar.npz").light
+        assert light is not None
+        assert light.source == "gray_card"
+        found.append(light.irradiance.mean(0))
+    np.testing.assert_allclose(found[0], 2 * found[1], rtol=2e-3)
+
+
+def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
+    """Catches lights that do not reach the picture, come from the other side, and pixels that change without any."""
+    lights = tmp_path / "lights.toml"
+    lights.write_text(LIGHTS)
+    plain = rendered(run, root, tmp_path / "plain")
+    stripped = tmp_path / "stripped"
+    shutil.copytree(run, stripped)
+    write_avatar(stripped / "avatar.npz", replace(read_avatar(run / "avatar.npz"), light=None))
+    np.testing.assert_array_equal(rendered(stripped, root, tmp_path / "same"), plain)
+    right = rendered(run, root, tmp_path / "right", "--light", str(lights))
+    assert np.abs(right - plain).max() > 20
+    lights.write_text(LIGHTS.replace("[-1, 0, -0.5]", "[1, 0, -0.5]"))
+    left = rendered(run, root, tmp_path / "left", "--light", str(lights))
+    brighter = (right - left)[20:40].sum((0, 2))  # rows of the ball
+    assert brighter[: len(brighter) // 2 - 5].sum() < 0 < brighter[len(brighter) // 2 + 5 :].sum()
+
+
+def test_render_refuses(run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a traceback for an avatar without light, and options without effect."""
+    plain = tmp_path / "plain.npz"
+    write_avatar(plain, replace(read_avatar(run / "avatar.npz"), light=None))
+    lights = tmp_path / "lights.toml"
+    lights.write_text(LIGHTS)
+    cameras = ["--cameras", str(root / "transforms_val.json"), "--out", str(tmp_path / "p")]
+    for arguments, message in (
+        ([str(plain), "--capture", str(root), *cameras, "--light", str(lights)], "stga relight RUN"),
+        ([str(run), *cameras, "--light-turn", "90"], "--light-turn: has no effect"),
+        ([str(run), *cameras, "--light", str(tmp_path / "none.hdr")], "none.hdr"),
+    ):
+        capsys.readouterr()
+        assert main(["render", *arguments]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_albedo_as_ply(run: Path, tmp_path: Path) -> None:
+    """Catches an export that keeps the recorded light, or loses splats."""
+    out = tmp_path / "albedo.ply"
+    assert main(["export", str(run), "--format", "ply", "--albedo", "--out", str(out)]) == 0
+    avatar = read_avatar(run / "avatar.npz")
+    splats = read_ply(out)
+    assert not splats.sh[:, 1:].any()
+    shown = srgb_to_linear(np.maximum(0.5 + 0.28209479 * splats.sh[:, 0], 0))
+    np.testing.assert_allclose(shown, np.clip(Relighter(avatar).albedo, 0, 1), atol=2e-3)
+    assert albedo_avatar(avatar).light is None
