@@ -32,7 +32,7 @@ from .gpu_context import run_with_gpu
 
 MIN_PSNR_DB = 60.0
 MIN_COMPACT_PSNR_DB = 45.0
-MIN_RELIT_PSNR_DB = 40.0
+MIN_RELIT_PSNR_DB = 55.0
 TURNED = np.array([[0.6, -0.8, 0, 0.02], [0.8, 0.6, 0, -0.01], [0, 0, 1, 0.03], [0, 0, 0, 1]]) @ np.diag(
     [1.3, 0.8, 1, 1]
 )

@@ -13,7 +13,7 @@ from typing import Any
 import gpu
 from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
 
-from ...light.relight import HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, REFLECTANCE
+from ...light.relight import HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, REFLECTANCE, WET_HIGHLIGHT_SHARE
 from ...light.shadows import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
 from .relit_packing import LIGHT_TEXELS, MAP_TEXELS, RELIT_TEXELS, SURFACE_TEXELS, VERTEX_TEXELS
 
@@ -36,6 +36,7 @@ RELIT_DEFINES = f"""
 #define TAP_STEP {TAP_STEP!r}
 #define REFLECTANCE {REFLECTANCE!r}
 #define HIGHLIGHT_SHARE {HIGHLIGHT_SHARE!r}
+#define WET_HIGHLIGHT_SHARE {WET_HIGHLIGHT_SHARE!r}
 #define MIN_DIFFUSE_SHARE {MIN_DIFFUSE_SHARE!r}
 #define PI 3.14159265358979
 """
@@ -173,7 +174,8 @@ vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
   vec3 sky_view = normalize(eye.xyz - means[0]);
   highlight += sky_highlight(row, normal, sky_view, roughness, old.a);
   vec3 base = srgb_to_linear(max(color.rgb + strain_color, vec3(0.0)));
-  vec3 albedo = PI * max(base - HIGHLIGHT_SHARE / PI * old.rgb, MIN_DIFFUSE_SHARE * base) / max(old.rgb, vec3(1e-6));
+  vec3 glossy = (color.a > 0.0 ? WET_HIGHLIGHT_SHARE : HIGHLIGHT_SHARE) / PI * old.rgb;
+  vec3 albedo = PI * max(base - glossy, MIN_DIFFUSE_SHARE * base) / max(old.rgb, vec3(1e-6));
   if (eye.w > 0.0) {
     albedo = pow(max(albedo, vec3(1e-4)), vec3(1.0 - eye.w)) * pow(typical.rgb, vec3(eye.w));
   }
