@@ -135,7 +135,7 @@ def test_irradiance_is_that_of_cycles(name):
     kind, location, energy, properties = LAMPS[name]
     lamp(kind, location, energy, **properties)
     if kind != "AREA":  # whose shadows are harder than they should be
-        bpy.ops.mesh.primitive_cube_add(size=0.08, location=PLACE.translation.lerp(Vector(location), 0.4))
+        bpy.ops.mesh.primitive_cube_add(size=0.05, location=PLACE.translation.lerp(Vector(location), 0.4))
     found = relit()
     expected = baked_irradiance(shown, head)
     arriving = light_irradiance(found)
