@@ -20,7 +20,7 @@ from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
-from .light import EstimateLight, HeadShadow
+from .light import EstimateLight, HeadShadow, RelightFrame
 from .pose import PoseHead
 from .preview_images import PreviewImages
 from .render_video import RenderVideo
@@ -61,6 +61,7 @@ CLASSES = (
     MoreBounces,
     EstimateLight,
     HeadShadow,
+    RelightFrame,
     PreviewImages,
     RenderVideo,
     ApplyMotion,

@@ -10,6 +10,7 @@ from ..stga_addon.requests.values import Relight
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
+from ..stga_addon.scene.light.frame_colors import forget_frame, relight_frame
 from ..stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow
 from . import ids
 from .common import file_path, flame_model_path, reporting, scene_settings
@@ -47,6 +48,31 @@ class EstimateLight(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         run = file_path(self.directory or scene_settings(context).run_folder, "run folder")
         start(context.scene, Relight(run, flame=flame_model_path(context)), training_python(context))
+        return {"FINISHED"}
+
+
+class RelightFrame(bpy.types.Operator):
+    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other frames show the same"""
+
+    bl_idname = ids.RELIGHT_FRAME
+    bl_label = "Relight Frame for EEVEE and Cycles"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    clear: bpy.props.BoolProperty(
+        name="Clear", description="Show recorded colors again", default=False, options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return _needs_splats(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        splats = scene_settings(context).splats
+        if self.clear:
+            forget_frame(splats)
+        else:
+            relight_frame(splats, context.scene)
         return {"FINISHED"}
 
 

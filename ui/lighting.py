@@ -43,6 +43,9 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
             draw_text(
                 layout, context, f"The capture's light was hard: albedo is evened out by {light.damping:.0%}", "INFO"
             )
+        row = layout.row(align=True)
+        row.operator(ids.RELIGHT_FRAME, text="Relight Frame (EEVEE, Cycles)")
+        row.operator(ids.RELIGHT_FRAME, text="", icon="X").clear = True
         layout.operator(ids.HEAD_SHADOW)
 
     def _draw_settings(self, layout: Any, context: Any, settings: Any) -> None:

@@ -22,6 +22,7 @@ ROTATION = "stga_rotation"
 SCALE = "stga_scale"  # standard deviations, linear
 OPACITY = "stga_opacity"  # 0 to 1
 COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
+RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame (`light.frame_colors`): where it is there, it counts
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"

@@ -13,7 +13,7 @@ from ...light.values import Light, Lighting, no_world
 from ..layers import Relit
 from .casters import Casters
 from .lights import in_avatar_space, is_linked, light_of
-from .settings import lighting_settings
+from .settings import current_settings, lighting_settings
 from .world import WorldLight, split_world, world_light
 
 MAX_KEPT = 64
@@ -36,7 +36,7 @@ class SceneLight:
 
         The same object as long as all is the same, `vertices` by identity. to_world (4, 4): from the avatar's space.
         """
-        settings = lighting_settings(depsgraph.scene_eval)
+        settings = current_settings(depsgraph)
         if avatar.light is None or settings is None or settings.mode == "recorded":
             return None
         lighting = self.lighting(settings, (splat_object, head), to_world, visible, depsgraph)

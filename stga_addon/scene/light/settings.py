@@ -63,6 +63,23 @@ def lighting_settings(scene: Any) -> Any:
     return getattr(scene, PROPERTY, None)
 
 
+def current_settings(depsgraph: Any) -> Any:
+    """The `LightingSettings` at the depsgraph's frame; None where the add-on is not registered.
+
+    Those of a viewport are in the scene itself: a change of them does not evaluate it anew.
+    """
+    return lighting_settings(depsgraph.scene if depsgraph.mode == "VIEWPORT" else depsgraph.scene_eval)
+
+
+def settings_values(scene: Any) -> tuple[Any, ...]:
+    """The values of the scene's `LightingSettings`, to compare."""
+    settings = lighting_settings(scene)
+    if settings is None:
+        return ()
+    names = LightingSettings.__annotations__
+    return tuple(tuple(value) if name == "white" else value for name in names for value in [getattr(settings, name)])
+
+
 def register() -> None:
     bpy.utils.register_class(LightingSettings)
     setattr(bpy.types.Scene, PROPERTY, bpy.props.PointerProperty(type=LightingSettings))

@@ -15,6 +15,7 @@ from ...render.client import RenderClient
 from ..gpu.renderer import SplatRenderer
 from ..gpu.viewport_display import is_drawn_by_engine, region_view
 from ..layers import SceneLayer
+from ..light.settings import settings_values
 from .camera import viewport_camera
 from .composite import combined, scene_background, srgb_background
 from .rasterizer import Rasterizer
@@ -39,6 +40,7 @@ class EngineViewport:
         self._layers: list[SceneLayer] | None = None
         self._posed: list[PosedSplats] = []
         self._posed_for: bytes = b""
+        self._lighting: tuple[Any, ...] = ()
 
     def update(self, depsgraph: Any) -> None:
         """The scene has changed: pose the splats again, and read meshes again that were edited themselves."""
@@ -73,7 +75,9 @@ class EngineViewport:
 
     def _update_layers(self, context: Any, depsgraph: Any) -> bool:
         """Read the scene if it has changed; returns False, and sets `error`, where that fails."""
-        if self._layers is None:
+        lighting = settings_values(depsgraph.scene)
+        if self._layers is None or lighting != self._lighting:
+            self._lighting = lighting
             try:
                 self._layers = visible_layers(depsgraph, self._cache, context.space_data)
             except StgaError as error:
