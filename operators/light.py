@@ -52,7 +52,7 @@ class EstimateLight(bpy.types.Operator):
 
 
 class RelightFrame(bpy.types.Operator):
-    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other frames show the same"""
+    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other frames keep them"""
 
     bl_idname = ids.RELIGHT_FRAME
     bl_label = "Relight Frame for EEVEE and Cycles"

@@ -185,3 +185,101 @@ def test_world_is_that_of_cycles(case):
     print(f"{case}: {arriving.mean() / expected.mean() - 1:.1%}, each vertex {error:.1%}")
     assert arriving.mean(0) == pytest.approx(expected.mean(0), rel=0.05)
     assert error < 0.05
+
+
+def test_lights_that_do_not_count():
+    """Catches light linking, hidden lights, a chosen collection, or a switched-off world that is ignored."""
+    shown, _ = shown_head()
+    lighting = bpy.context.scene.stga_lighting
+    kinds = [lamp(kind, (1.0, -0.5, 2.0), 3.0) for kind in ("SUN", "POINT", "SPOT")]
+    background(bpy.context.scene.world)["Strength"].default_value = 1.0
+
+    def found() -> list[str]:
+        return [light.kind for light in relit().lighting.lights]
+
+    assert found() == ["sun", "point", "spot"]
+    kinds[0].hide_render = True
+    assert found() == ["point", "spot"]
+    cases = (shown, "EXCLUDE", ["spot"]), (kinds[0], "INCLUDE", ["spot"]), (shown, "INCLUDE", ["point", "spot"])
+    for receivers, state, expected in cases:
+        collection = bpy.data.collections.new("receivers")
+        collection.objects.link(receivers)
+        collection.collection_objects[0].light_linking.link_state = state
+        kinds[1].light_linking.receiver_collection = collection
+        assert found() == expected
+    chosen = bpy.data.collections.new("chosen")
+    chosen.objects.link(kinds[2])
+    lighting.lights = chosen
+    assert found() == ["spot"]
+    assert relit().lighting.world.any()
+    lighting.world = False
+    assert not relit().lighting.world.any()
+    lighting.mode = "recorded"
+    assert relit() is None
+
+
+def test_nothing_is_made_anew_while_nothing_moves():
+    """Catches a redraw that relights what it has, and one that keeps an earlier light, pose or caster."""
+    _, head = shown_head()
+    light = lamp("POINT", (1.0, -0.5, 1.0), 30.0)
+    bpy.ops.mesh.primitive_cube_add(size=0.1, location=(1, 1, 1))
+    cube, cache = bpy.context.object, SplatCache()
+
+    def again() -> Relit:
+        bpy.context.view_layer.update()
+        (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+        return layer.relit
+
+    first = again()
+    assert again() is first
+    light.data.energy = 31
+    brighter = again()
+    assert brighter is not first
+    assert brighter.lighting.lights[0].color[0] == pytest.approx(31 / 1.3**2)
+    assert brighter.casters is first.casters
+    cube.location.x += 1
+    cache.light.casters.forget()
+    assert np.abs(again().casters[0].vertices - first.casters[0].vertices).max() > 0.5
+    head.data.vertices[0].co.x += 0.01
+    head.data.update()
+    assert again().mesh is not brighter.mesh
+
+
+def test_light_is_kept_in_the_file():
+    """Catches an avatar's light that Blender's meshes hold otherwise than the avatar file."""
+    shown, _ = shown_head()
+    expected, found = lit_avatar().light, stored_avatar(shown).light
+    for name in ("radiance", "transfer", "occlusion", "irradiance", "roughness"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
+    assert (found.residual, found.damping, found.source) == (expected.residual, expected.damping, expected.source)
+
+
+def test_shadow_onto_the_scene(tmp_path):
+    """Catches a head that is seen in Cycles where it should only throw its shadow, and a shadow that is missing."""
+    shown, head = shown_head()
+    lamp("SUN", (0.4, -0.2, 2.0), 3.0)
+    bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))
+    scene = bpy.context.scene
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.camera.location = (0.4, -0.2, 3.0)
+    scene.collection.objects.link(scene.camera)
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 4, False
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    scene.view_settings.view_transform = "Raw"
+    set_input(shown, PERCENTAGE, 0.0)
+
+    def middle() -> float:
+        scene.render.filepath = str(tmp_path / "image.png")
+        bpy.ops.render.render(write_still=True)
+        image = bpy.data.images.load(str(tmp_path / "image.png"))
+        value = np.array(image.pixels[:]).reshape(32, 32, 4)[14:18, 14:18, :3].mean()
+        bpy.data.images.remove(image)
+        return float(value)
+
+    open_ground = middle()
+    throw_shadow(shown, True)
+    assert throws_shadow(shown)
+    assert middle() < 0.2 * open_ground
+    throw_shadow(shown, False)
+    assert middle() == pytest.approx(open_ground, rel=0.05)
+    assert head.hide_render
