@@ -58,8 +58,9 @@ def light_from(path: Path, arrays: Mapping[str, np.ndarray], rest: object, verti
         found[name] = array.astype(np.float32)
     if not isinstance(rest, dict) or rest.get("source") not in SOURCES:
         raise StgaError(f"{path}: header field 'light' is {shorten(rest)}, expected residual, damping and source")
-    numbers = {name: rest.get(name) for name in ("residual", "damping")}
-    for name, value in numbers.items():
+    for name in ("residual", "damping"):
+        value = rest.get(name)
         if not isinstance(value, (int, float)) or not 0 <= value <= 1e6:
             raise StgaError(f"{path}: header field 'light.{name}' is {shorten(value)}, expected a number from 0 on")
-    return AvatarLight(**found, source=rest["source"], **numbers)
+    values: dict[str, Any] = {**found, **{name: rest[name] for name in ("residual", "damping", "source")}}
+    return AvatarLight(**values)

@@ -109,7 +109,7 @@ def split_environment(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> tupl
     vectors = vectors @ rotation.T
     rest, level = image.copy(), image.sum(2)
     limit = SUN_CONTRAST * (level * angle).sum() / (angle.sum() * image.shape[1])
-    suns = []
+    suns: list[Light] = []
     while len(suns) < MAX_SUNS and level.max() > limit:
         brightest = vectors.reshape(-1, 3)[level.argmax()]
         near = (vectors @ brightest > np.cos(SUN_RADIUS)) & (level > limit)

@@ -36,7 +36,7 @@ def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
             np.minimum.at(part, corner, least)
         part = part[part]
         if np.array_equal(part, before):
-            return part
+            return np.asarray(part)
 
 
 def _is_eyeball(points: np.ndarray) -> bool:

@@ -118,4 +118,4 @@ class ShadowMap:
             cosine = (normals * away).sum(1) / np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         cosine = np.clip(cosine, 0.05, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
-        return np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)).astype(np.float32)
+        return np.asarray(np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32)

@@ -21,9 +21,11 @@ from stga_addon.light.shadows import LIFT_M  # noqa: E402
 from stga_addon.light.surface import vertex_normals  # noqa: E402
 from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.splat_object import hide_object, show_avatar  # noqa: E402
+from stga_addon.scene.display.splat_nodes import PERCENTAGE  # noqa: E402
+from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar  # noqa: E402
 from stga_addon.scene.layers import Relit  # noqa: E402
 from stga_addon.scene.light import settings  # noqa: E402
+from stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 TURN = Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized())

@@ -69,7 +69,7 @@ def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> No
         assert light is not None
         assert light.source == "gray_card"
         found.append(light.irradiance.mean(0))
-    np.testing.assert_allclose(found[0], 2 * found[1], rtol=2e-3)
+    np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)  # the ball of this capture has no red
 
 
 def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
