@@ -35,13 +35,30 @@ class LightView:
     size: int
 
 
-def light_view(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> LightView:
-    """The view of a light around the head (V, 3).
+@dataclass(frozen=True)
+class HeadBounds:
+    """Middle (3,) of a posed head's box, the box's diagonal, and the radius around its middle in which the head lies."""
+
+    center: np.ndarray
+    diagonal: float
+    radius: float
+
+
+def head_bounds(vertices: np.ndarray) -> HeadBounds:
+    """Those of vertices (V, 3)."""
+    rows = np.ascontiguousarray(vertices.T)  # numpy is slow where the last axis is short
+    low, high = rows.min(1), rows.max(1)
+    center = (low + high) / 2
+    radius = float(np.sqrt(((rows - center[:, None]) ** 2).sum(0).max()))
+    return HeadBounds(center, float(np.linalg.norm(high - low)), radius)
+
+
+def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
+    """The view of a light around a head.
 
     A light inside the sphere around the head sees it under a wide angle, and loses what lies behind it.
     """
-    center = (vertices.max(0) + vertices.min(0)) / 2
-    radius = float(np.linalg.norm(vertices - center, axis=1).max()) * 1.01 + 4 * LIFT_M
+    center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
         forward, distance, scale = light.direction, np.inf, size / 2 / radius
     else:
@@ -58,7 +75,7 @@ def light_view(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Ligh
 
 def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
     """What `light_view` sees, as a function of points."""
-    view = light_view(vertices, light, size)
+    view = light_view(head_bounds(vertices), light, size)
 
     def project(points: np.ndarray) -> np.ndarray:
         local = (points - view.origin) @ view.axes
@@ -71,9 +88,9 @@ def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -
     return project
 
 
-def texel_meters(vertices: np.ndarray, size: int = MAP_SIZE) -> float:
-    """About how wide a texel of a shadow map is on the head (V, 3)."""
-    return float(np.linalg.norm(np.ptp(vertices, axis=0))) / size
+def texel_meters(bounds: HeadBounds, size: int = MAP_SIZE) -> float:
+    """About how wide a texel of a shadow map is on the head."""
+    return bounds.diagonal / size
 
 
 class ShadowMap:
@@ -89,7 +106,7 @@ class ShadowMap:
     ) -> None:
         add_depths = shadow_kernels().add_depths
         self._project = light_projection(vertices, light, size)
-        self._light, self._texel_m = light, texel_meters(vertices, size)
+        self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
         self.depth = np.full((size, size), np.inf, np.float32)
         add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
         for caster in casters:

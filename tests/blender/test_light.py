@@ -274,7 +274,7 @@ def test_shadow_onto_the_scene(tmp_path):
         scene.render.filepath = str(tmp_path / "image.png")
         bpy.ops.render.render(write_still=True)
         image = bpy.data.images.load(str(tmp_path / "image.png"))
-        value = np.array(image.pixels[:]).reshape(32, 32, 4)[14:18, 14:18, :3].mean()
+        value = np.array(image.pixels[:]).reshape(32, 32, 4)[15:17, 15:17, :3].mean()
         bpy.data.images.remove(image)
         return float(value)
 

@@ -174,7 +174,8 @@ class SplatRenderer:
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0
-        shader, names, relit = self._projection_shader, PACKED_TEXTURES, dict[str, Any]()
+        shader, relit = self._projection_shader, dict[str, Any]()
+        names: tuple[str, ...] = PACKED_TEXTURES
         if any(layer.relit is not None for layer in layers):
             self._relit = self._relit or (RelitTextures(), projection_shader(relit=True))
             relit, shader = self._relit[0].update(layers, view.camera.position), self._relit[1]

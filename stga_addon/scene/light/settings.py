@@ -1,4 +1,5 @@
 """How a scene lights its avatars: properties of a scene, saved with the .blend file."""
+# mypy: disable-error-code="valid-type"
 
 from typing import Any
 
