@@ -37,7 +37,7 @@ class LightView:
 
 @dataclass(frozen=True)
 class HeadBounds:
-    """Middle (3,) of a posed head's box, the box's diagonal, and the radius around its middle in which the head lies."""
+    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle of the head."""
 
     center: np.ndarray
     diagonal: float
