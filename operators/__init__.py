@@ -24,6 +24,7 @@ from .import_capture import ImportCapture
 from .import_meshes import ImportMeshes
 from .import_motion import ImportMotion
 from .import_ply import ImportPly
+from .light import EstimateLight, HeadShadow, RelightFrame
 from .open_demo import OpenDemo
 from .pose import PoseHead
 from .preview_images import PreviewImages
@@ -70,6 +71,9 @@ CLASSES = (
     ShowAvatar,
     StandardView,
     MoreBounces,
+    EstimateLight,
+    HeadShadow,
+    RelightFrame,
     PreviewImages,
     RenderVideo,
     ApplyMotion,

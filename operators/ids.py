@@ -43,6 +43,9 @@ EXPORT_PERFORMANCE = "stga.export_performance"
 EXPORT_CAMERAS = "stga.export_cameras"
 STANDARD_VIEW = "stga.standard_view"
 MORE_BOUNCES = "stga.more_bounces"
+ESTIMATE_LIGHT = "stga.estimate_light"
+HEAD_SHADOW = "stga.head_shadow"
+RELIGHT_FRAME = "stga.relight_frame"
 PREVIEW_IMAGES = "stga.preview_images"
 
 TAB = "STGA"  # of the 3D viewport's sidebar

@@ -3,6 +3,7 @@
 import bpy
 
 from ..stga_addon.scene.gpu import viewport_display
+from ..stga_addon.scene.light import settings as lighting
 from ..stga_addon.scene.render import engine
 from .common import preferences
 from .training_python import training_python
@@ -15,6 +16,7 @@ def render_device() -> str:
 
 
 def register() -> None:
+    lighting.register()
     engine.register(lambda: training_python(bpy.context), render_device)
     viewport_display.register()
 
@@ -22,3 +24,4 @@ def register() -> None:
 def unregister() -> None:
     viewport_display.unregister()
     engine.unregister()
+    lighting.unregister()

@@ -211,10 +211,12 @@ class _Recording:
         with bpy.context.temp_override(scene=self._scene, view_layer=self._view_layer):
             if frame != self._posed[0]:
                 self._scene.frame_set(frame)
+                self._cache.light.casters.forget()
                 self._layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
-                self._posed = frame, [layer.posed() for layer in self._layers]
             given = None if self._cameras is None else self._cameras[self._recorded]
             camera = given or scene_camera(bpy.context.evaluated_depsgraph_get())
+        if frame != self._posed[0] or any(layer.relit for layer in self._layers):
+            self._posed = frame, [layer.posed(camera.position) for layer in self._layers]
         if self._drawn is None:
             self._recorder.add(self._posed[1], camera)
         else:

@@ -16,9 +16,16 @@ from ..stga_addon.requests.folder import read_request, read_result
 from ..stga_addon.requests.monitor_state import Kind, RequestState, Shown, SliceBuilt
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
-from ..stga_addon.scene.display.splat_object import build_next_node_group, can_update, check_head, update_splats
+from ..stga_addon.scene.display.splat_object import (
+    build_next_node_group,
+    can_update,
+    check_head,
+    store_light,
+    update_splats,
+)
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
+from ..stga_addon.training.run.folder import AVATAR
 from . import ids
 from .common import is_head
 from .select import count_selected
@@ -180,6 +187,16 @@ def _apply_performance(scene: Any, state: RequestState) -> Answer:
     return Shown()
 
 
+def _store_light(scene: Any, state: RequestState) -> Answer:
+    """Give the scene's splats the light that is now in the avatar of the run."""
+    assert state.subject is not None
+    shown = getattr(scene, ids.SETTINGS).splats
+    avatar = read_avatar(state.subject / AVATAR)
+    if shown is None or not store_light(shown, avatar):
+        raise StgaError(f"{state.subject}: its avatar is not the one that the scene shows; show it again")
+    return Shown(undoable=True)
+
+
 KINDS = {
     Kind.TRAINING: RequestKind(
         "Training",
@@ -205,6 +222,7 @@ KINDS = {
         show=_apply_performance,
         changed=_head,
     ),
+    Kind.LIGHT: RequestKind("The estimate of light", "Stop; the avatar stays as it is", show=_store_light),
     Kind.VIDEO: RequestKind(
         "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay"
     ),

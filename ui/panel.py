@@ -18,6 +18,7 @@ from ..stga_addon.scene.objects import layers_of
 from .continue_panel import ContinuePanel
 from .drive import DrivePanel
 from .effects import EffectsPanel
+from .lighting import LightingPanel
 from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel, TrainedPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
@@ -124,6 +125,7 @@ CLASSES = (
     ContinuePanel,
     EffectsPanel,
     ShowPanel,
+    LightingPanel,
     MotionPanel,
     DrivePanel,
     TrainedPanel,

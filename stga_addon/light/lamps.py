@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .kernels import shade_kernels
 from .shadows import ShadowMap
 from .values import Caster, Light, Lighting
 
@@ -37,12 +38,10 @@ class Lamps:
         found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
         if not len(self._table):
             return found
-        from ..raster.cpu.shade import add_lights
-
         lit = np.ones((max(1, len(self._maps)), len(points)), np.float32)
         for row, shadow in zip(lit, self._maps, strict=False):
             row[:] = shadow.lit(points, normals=normals)
-        add_lights(
+        shade_kernels().add_lights(
             np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32),
             np.asarray(eye, np.float32), np.asarray(roughness, np.float32),
             np.full(len(points), reflectance, np.float32), self._table, lit, *found,

@@ -1,9 +1,11 @@
 """Shadow maps: what a light sees of a head and of other objects."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from .kernels import shadow_kernels
 from .values import Caster, Light
 
 MAP_SIZE = 512
@@ -19,13 +21,44 @@ Projection = Callable[[np.ndarray], np.ndarray]
 """Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light cannot see them."""
 
 
-def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
-    """How a light sees space: parallel for a sun, else in perspective from its position, around the head.
+@dataclass(frozen=True)
+class LightView:
+    """How a light sees space: parallel for a sun, else in perspective from its position.
+
+    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit of slope.
+    """
+
+    axes: np.ndarray
+    origin: np.ndarray
+    scale: float
+    is_parallel: bool
+    size: int
+
+
+@dataclass(frozen=True)
+class HeadBounds:
+    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle of the head."""
+
+    center: np.ndarray
+    diagonal: float
+    radius: float
+
+
+def head_bounds(vertices: np.ndarray) -> HeadBounds:
+    """Those of vertices (V, 3)."""
+    rows = np.ascontiguousarray(vertices.T)  # numpy is slow where the last axis is short
+    low, high = rows.min(1), rows.max(1)
+    center = (low + high) / 2
+    radius = float(np.sqrt(((rows - center[:, None]) ** 2).sum(0).max()))
+    return HeadBounds(center, float(np.linalg.norm(high - low)), radius)
+
+
+def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
+    """The view of a light around a head.
 
     A light inside the sphere around the head sees it under a wide angle, and loses what lies behind it.
     """
-    center = (vertices.max(0) + vertices.min(0)) / 2
-    radius = float(np.linalg.norm(vertices - center, axis=1).max()) * 1.01 + 4 * LIFT_M
+    center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
         forward, distance, scale = light.direction, np.inf, size / 2 / radius
     else:
@@ -37,17 +70,27 @@ def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -
     across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
-    origin = center if light.kind == "sun" else light.position
+    return LightView(axes, center if light.kind == "sun" else light.position, scale, light.kind == "sun", size)
+
+
+def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
+    """What `light_view` sees, as a function of points."""
+    view = light_view(head_bounds(vertices), light, size)
 
     def project(points: np.ndarray) -> np.ndarray:
-        local = (points - origin) @ axes
-        if light.kind != "sun":
+        local = (points - view.origin) @ view.axes
+        if not view.is_parallel:
             depth = local[:, 2:]
             local[:, :2] /= np.where(depth > 1e-4, depth, np.nan)
-        local[:, :2] = local[:, :2] * scale + size / 2
+        local[:, :2] = local[:, :2] * view.scale + size / 2
         return np.asarray(local, np.float32)
 
     return project
+
+
+def texel_meters(bounds: HeadBounds, size: int = MAP_SIZE) -> float:
+    """About how wide a texel of a shadow map is on the head."""
+    return bounds.diagonal / size
 
 
 class ShadowMap:
@@ -61,10 +104,9 @@ class ShadowMap:
         casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
     ) -> None:
-        from ..raster.cpu.shadow import add_depths
-
+        add_depths = shadow_kernels().add_depths
         self._project = light_projection(vertices, light, size)
-        self._light, self._texel_m = light, float(np.linalg.norm(np.ptp(vertices, axis=0))) / size
+        self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
         self.depth = np.full((size, size), np.inf, np.float32)
         add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
         for caster in casters:
@@ -77,13 +119,11 @@ class ShadowMap:
 
         normals (N, 3): of the surface there, which make `bias` larger on slopes.
         """
-        from ..raster.cpu.shadow import lit_shares
-
         found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
         if normals is not None:
             biases = self._slope_bias(points, normals, bias, step)
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
-        lit_shares(self.depth, places, biases, np.float32(step), found)
+        shadow_kernels().lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
 
     def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from .values import (
     ConvertMotion,
     Extend,
     Refine,
+    Relight,
     RenderRecording,
     Request,
     Resume,
@@ -34,6 +35,7 @@ class Kind(StrEnum):
     ANALYSIS = "analysis"
     SELECTION = "selection"
     PERFORMANCE = "performance"
+    LIGHT = "light"
     VIDEO = "video"
     ENVIRONMENT = "environment"
 
@@ -49,11 +51,12 @@ SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
     SelectForTake: (Kind.SELECTION, "capture"),
     ConvertMotion: (Kind.PERFORMANCE, "output"),
     RenderRecording: (Kind.VIDEO, "output"),
+    Relight: (Kind.LIGHT, "run"),
 }
 """Request -> its kind, and the field that names what it is about."""
 STORED = {Kind.TRAINING, Kind.TRACKING}
 """Requests that the .blend file remembers; their folder is in that of the run or capture, others' are temporary."""
-TRANSIENT = {Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE}
+TRANSIENT = {Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT}
 """Requests that leave nothing but their result in the scene: killed when they are cancelled, gone when they ended."""
 DISMISSIBLE = {*STORED, Kind.VIDEO}
 SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
@@ -62,6 +65,7 @@ SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
     Kind.ANALYSIS: (WorkerState.FINISHED,),
     Kind.SELECTION: (WorkerState.FINISHED,),
     Kind.PERFORMANCE: (WorkerState.FINISHED,),
+    Kind.LIGHT: (WorkerState.FINISHED,),
     Kind.VIDEO: (),
     Kind.ENVIRONMENT: (),
 }

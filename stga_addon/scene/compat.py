@@ -174,3 +174,19 @@ def sequencer_strips(scene: Any) -> Any:
     """The strips of a scene's video sequencer, which is made; `sequences` before Blender 4.4."""
     editor = scene.sequence_editor_create()
     return editor.strips if hasattr(editor, "strips") else editor.sequences
+
+
+def light_strength(light: Any) -> np.ndarray:
+    """(3,) linear: a light's color times its energy, exposure (from 4.5 on) and color temperature (from 4.5 on)."""
+    color = np.array(light.color, np.float64) * light.energy * 2.0 ** getattr(light, "exposure", 0.0)
+    return color * np.array(light.temperature_color) if getattr(light, "use_temperature", False) else color
+
+
+def is_normalized(light: Any) -> bool:
+    """Whether a light's energy is that of its whole area, as always before 4.5; else it is per square meter."""
+    return bool(getattr(light, "normalize", True))
+
+
+def light_nodes(light: Any) -> Any:
+    """The node tree that a light uses, None where it uses none."""
+    return light.node_tree if light.use_nodes else None

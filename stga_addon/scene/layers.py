@@ -7,6 +7,8 @@ import numpy as np
 from ..avatar.embedding import FaceFrames
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import linear_to_srgb
+from ..light.relight import Relighter
+from ..light.values import Caster, Lighting
 from ..raster.posed_splats import PosedSplats
 
 FROZEN_COLOR = (0.25, 0.25, 0.25, 1.0)  # linear; splats that the current frame does not train
@@ -25,12 +27,30 @@ class DisplaySettings:
     selected_only: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class Relit:
+    """How a scene lights an avatar: its mesh (V, 3) as posed, light and casters, all in the avatar's space."""
+
+    relighter: Relighter
+    mesh: np.ndarray
+    lighting: Lighting
+    casters: tuple[Caster, ...] = ()
+
+    def splats(self, eye: np.ndarray) -> Splats:
+        """The avatar's splats in the colors of this light, seen from eye (3,) in the avatar's space."""
+        splats = self.relighter.avatar.splats
+        color = self.relighter.colors(self.mesh, eye, self.lighting, self.casters)
+        sh = ((color - np.float32(0.5)) / np.float32(SH_C0))[:, None]
+        return replace(splats, sh=sh, strain_color=splats.strain_color[:, :0])
+
+
 @dataclass(frozen=True)
 class SceneLayer:
     """One visible splat object: its splats as stored, and how they are posed and displayed.
 
     frames, to_world, antialiased: as in `PosedSplats`. frozen (F,) bool: triangles that the current frame does not
-    train; None where the settings do not ask for it, or where the frame has no selection.
+    train; None where the settings do not ask for it, or where the frame has no selection. relit: None where colors are
+    as recorded.
     """
 
     splats: Splats
@@ -39,10 +59,15 @@ class SceneLayer:
     antialiased: bool = False
     settings: DisplaySettings = DisplaySettings()
     frozen: np.ndarray | None = None
+    relit: Relit | None = None
 
-    def posed(self) -> PosedSplats:
-        """The same with the settings applied to the splats."""
+    def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
+        """The same with the settings applied to the splats; eye (3,): the camera in the scene, which relit splats
+        need."""
         splats, settings = self.splats, self.settings
+        if self.relit is not None:
+            assert eye is not None
+            splats = self.relit.splats(self.eye_in_avatar(eye))
         visible = 1 / (1 + np.exp(-splats.opacity)) >= settings.opacity_threshold
         visible &= random_percentage(len(splats)) < settings.percentage
         if self.frozen is not None:
@@ -56,6 +81,10 @@ class SceneLayer:
             splats = replace(splats, log_scale=splats.log_scale + np.float32(np.log(max(settings.size, 1e-6))))
         splats = splats if visible.all() else splats.rows(visible)
         return PosedSplats(splats, self.frames, self.to_world, self.antialiased)
+
+    def eye_in_avatar(self, eye: np.ndarray) -> np.ndarray:
+        """(3,) of a position (3,) in the scene."""
+        return np.asarray((np.linalg.inv(self.to_world) @ [*eye, 1.0])[:3])
 
 
 def random_percentage(count: int) -> np.ndarray:

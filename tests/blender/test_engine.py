@@ -14,8 +14,14 @@ from mathutils import Matrix  # noqa: E402
 
 from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar  # noqa: E402
+from stga_addon.avatar.light import AvatarLight  # noqa: E402
+from stga_addon.avatar.splats import SH_C0  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import DeviceError, StgaError  # noqa: E402
+from stga_addon.light.harmonics import uniform  # noqa: E402
+from stga_addon.light.relight import Relighter  # noqa: E402
+from stga_addon.light.transfer import transfer_of  # noqa: E402
+from stga_addon.light.values import Light, Lighting  # noqa: E402
 from stga_addon.raster.cpu.project import _basis  # noqa: E402
 from stga_addon.render.render import render as render_splats  # noqa: E402
 from stga_addon.render.render import render_avatar  # noqa: E402
@@ -23,6 +29,7 @@ from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.compat import choose_image_file, enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
+from stga_addon.scene.light import settings as light_settings  # noqa: E402
 from stga_addon.scene.render import engine, rasterizer, view_transform  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
@@ -146,6 +153,59 @@ def test_rasterizer_renders_without_a_gpu(monkeypatch, tmp_path):
     camera = expected_camera(camera_at(), shown)
     expected = render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
     assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
+
+
+def with_light(avatar: Avatar) -> Avatar:
+    transfer, occlusion = transfer_of(avatar.neutral, avatar.faces, 32)
+    radiance = uniform(np.full(3, 0.3)).astype(np.float32)
+    roughness = np.zeros(len(occlusion), np.float32)
+    return replace(avatar, light=AvatarLight(radiance, transfer, occlusion, transfer @ radiance, roughness, 0.05))
+
+
+@pytest.fixture
+def lighting():
+    """The scene's settings of light, whether or not the extension is registered, too."""
+    registered = light_settings.lighting_settings(bpy.context.scene) is not None
+    if not registered:
+        light_settings.register()
+    yield light_settings.lighting_settings(bpy.context.scene)
+    if not registered:
+        light_settings.unregister()
+
+
+@pytest.mark.parametrize("device", ["GPU", "CPU"])
+def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
+    """Catches an avatar that is not lit by the scene, from another side, or in another mode than the panel's; and one
+    as recorded of which a single bit changes because it could be lit."""
+    if device == "CPU":
+        monkeypatch.setattr(engine, "has_gpu_context", lambda: False)
+    avatar = textured(avatar_of("stga"))
+    shown, head = show(avatar)
+    camera_object = camera_at()
+    without = render(tmp_path)
+    for old in (shown, head):
+        bpy.data.objects.remove(old)
+    avatar = with_light(avatar)
+    shown, head = show(avatar)
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun.data.energy, sun.rotation_euler = 4.0, (1.2, 0.0, 0.4)
+    bpy.context.scene.collection.objects.link(sun)
+    recorded = render(tmp_path)
+    assert without["A"].max() > 0.5
+    for name, values in without.items():
+        assert np.array_equal(recorded[name], values), name
+    lighting.mode, lighting.exposure = "scene", 0.5
+    camera, mesh = expected_camera(camera_object, shown), evaluated_vertices(head)
+    shines = np.linalg.inv(np.array(shown.matrix_world))[:3, :3] @ np.array(sun.matrix_world)[:3, :3] @ [0, 0, -1]
+    light = Lighting(lights=(Light("sun", np.full(3, 4.0), direction=shines, angle=sun.data.angle),), exposure=0.5)
+    colors = Relighter(avatar).colors(mesh.astype(np.float64), camera.position, light)
+    splats = replace(avatar.splats, sh=((colors - 0.5) / SH_C0)[:, None].astype(np.float32))
+    expected = render_avatar(replace(avatar, splats=splats), mesh, camera, (0.0,) * 3)
+    found = displayed(render(tmp_path), 0.0)
+    error = np.abs(found - np.clip(expected, 0, 1))
+    assert error.mean() < TOLERANCE / 4
+    assert error.max() < (0.1 if device == "GPU" else 2 * TOLERANCE)  # edges of shadows
+    assert np.abs(displayed(recorded, 0.0) - expected).mean() > 0.05
 
 
 @pytest.mark.parametrize(

@@ -10,24 +10,29 @@ pytest.importorskip("bpy")
 
 import torch
 from capture.factory import ball
+from light.scenes import lit_avatar
 
 from stga_addon.avatar.embedding import WORLD, to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import Splats, no_strain_color
 from stga_addon.capture.camera import Camera, look_at
+from stga_addon.light.harmonics import uniform
+from stga_addon.light.relight import Relighter
+from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster import reference
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
 from stga_addon.scene.gpu.context import has_gpu_context
 from stga_addon.scene.gpu.packing import View
 from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer
-from stga_addon.scene.layers import DisplaySettings, SceneLayer
+from stga_addon.scene.layers import DisplaySettings, Relit, SceneLayer
 
 from .gpu_context import run_with_gpu
 
 MIN_PSNR_DB = 60.0
 MIN_COMPACT_PSNR_DB = 45.0
+MIN_RELIT_PSNR_DB = 55.0
 TURNED = np.array([[0.6, -0.8, 0, 0.02], [0.8, 0.6, 0, -0.01], [0, 0, 1, 0.03], [0, 0, 0, 1]]) @ np.diag(
     [1.3, 0.8, 1, 1]
 )
@@ -171,3 +176,46 @@ def test_other_splats_in_the_compact_format() -> None:
     run_with_gpu(draw)
     for image, (layers, camera) in zip(found, pictures, strict=True):
         assert psnr_db(image.rgb, compose([one.posed() for one in layers], camera).rgb) >= MIN_COMPACT_PSNR_DB
+
+
+def relit_layers(mode: str) -> list[SceneLayer]:
+    """A ball and a plate under four kinds of light and a world, with an object that throws a shadow; beside it one as
+    recorded."""
+    avatar = lit_avatar(degree=1)
+    mesh = avatar.neutral.astype(np.float64) * [1.05, 0.97, 1.0]
+    eye = np.ones(3)
+    lights = (
+        Light("sun", eye * [1.5, 1.0, 0.5], direction=(-0.3, -1, 0.1), angle=0.1),
+        Light("point", eye * 3, (0.3, 0.4, 0.5), radius=0.02),
+        Light("spot", eye * 9, (0.4, 0.1, 0.4), direction=(-0.4, -0.1, -0.4), cone=0.5, blend=0.5),
+        Light("area", eye * 2, (-0.5, 0.3, 0.4), direction=(0.5, -0.3, -0.4), size=(0.3, 0.4), shape="ellipse"),
+    )
+    wall = Caster(np.array([[0.1, 0.1, 0.2], [0.2, 0.1, 0.2], [0.15, 0.3, 0.2]]), np.array([[0, 1, 2]]))
+    world = np.random.default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
+    light = Lighting(world, lights, mode=mode, mix=0.6, exposure=0.3, white=(1.1, 1.0, 0.9))
+    relit = Relit(Relighter(avatar), mesh, light, (wall,))
+    shown = SceneLayer(avatar.splats, avatar.frames(mesh), TURNED, relit=relit)
+    recorded = SceneLayer(avatar.splats, avatar.frames(mesh), np.diag([0.5, 0.5, 0.5, 1]) + np.eye(4, k=3) * 0.2)
+    return [recorded, shown]
+
+
+@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+@pytest.mark.parametrize("mode", ["scene", "mix"])
+def test_light_of_the_scene(mode):
+    """Catches a light, shadow, highlight or bounce that the GPU computes otherwise than `Relighter`, and a layer as
+    recorded that is lit, too."""
+    layers, camera = relit_layers(mode), look_at((0.3, 0.2, 0.7), (0, 0, 0), 160, 200, 300)
+    found: list[ComposedImage] = []
+
+    def draw() -> None:
+        renderer = SplatRenderer()
+        renderer.draw(layers, View(camera))
+        found.append(renderer.read())
+
+    run_with_gpu(draw)
+    image = found[0]
+    expected = compose([one.posed(camera.position) for one in layers], camera)
+    print(f"{psnr_db(image.rgb, expected.rgb):.1f} dB")
+    assert psnr_db(image.rgb, expected.rgb) >= MIN_RELIT_PSNR_DB
+    plain = compose([replace(one, relit=None).posed() for one in layers], camera)
+    assert psnr_db(image.rgb, plain.rgb) < 25, "nothing is lit"

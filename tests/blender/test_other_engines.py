@@ -13,6 +13,7 @@ from stga_addon.avatar.embedding import WORLD  # noqa: E402
 from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear  # noqa: E402
+from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.raster.cpu.compose import compose  # noqa: E402
 from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
@@ -22,6 +23,7 @@ from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
 from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
 from stga_addon.scene.render.camera import render_camera  # noqa: E402
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 SIZE_PX = 64
 SAMPLES = 4
@@ -94,3 +96,48 @@ def test_images_without_noise(engine: str, display: str, tmp_path: Path) -> None
     print(f"{engine}, {display}: {psnr_db:.1f} dB")
     assert expected.mean() > 0.1, "nothing to compare"
     assert psnr_db >= MIN_PSNR_DB
+
+
+def test_relit_color_of_a_frame(tmp_path: Path) -> None:
+    """Catches relit colors that do not reach the nodes, in another color space, or stay when they are taken back."""
+    from stga_addon.light.relight import Relighter
+    from stga_addon.scene.display.materials import DISPLAY_COLOR
+    from stga_addon.scene.light import settings
+    from stga_addon.scene.light.frame_colors import forget_frame, relight_frame
+
+    from .test_engine import camera_at, show, textured, with_light
+    from .test_splat_object import avatar_of
+
+    def node_colors() -> np.ndarray:
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        (cloud,) = [each.object for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"]
+        colors = np.empty(4 * len(avatar.splats), np.float32)
+        cloud.data.attributes[DISPLAY_COLOR].data.foreach_get("color", colors)
+        return colors.reshape(-1, 4)[:, :3]
+
+    registered = settings.lighting_settings(bpy.context.scene) is not None
+    if not registered:
+        settings.register()
+    try:
+        avatar = with_light(textured(avatar_of("stga")))
+        shown, _ = show(avatar)
+        camera = camera_at()
+        set_input(shown, DISPLAY, "Points")
+        before = node_colors()
+        sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+        sun.data.energy, sun.rotation_euler = 3.0, (1.2, 0.0, 0.4)
+        bpy.context.scene.collection.objects.link(sun)
+        with pytest.raises(StgaError, match="as recorded"):
+            relight_frame(shown, bpy.context.scene)
+        settings.lighting_settings(bpy.context.scene).mode = "scene"
+        relight_frame(shown, bpy.context.scene)
+        (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+        eye = layer.eye_in_avatar(np.array(camera.matrix_world)[:3, 3])
+        relit = Relighter(avatar).radiance(layer.relit.mesh, eye, layer.relit.lighting)
+        np.testing.assert_allclose(node_colors(), np.maximum(relit, 0), atol=2e-3)
+        assert np.abs(node_colors() - before).mean() > 0.05
+        assert forget_frame(shown)
+        np.testing.assert_array_equal(node_colors(), before)
+    finally:
+        if not registered:
+            settings.unregister()

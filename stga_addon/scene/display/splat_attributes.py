@@ -9,6 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar
+from ...avatar.light import AvatarLight
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
@@ -22,6 +23,7 @@ ROTATION = "stga_rotation"
 SCALE = "stga_scale"  # standard deviations, linear
 OPACITY = "stga_opacity"  # 0 to 1
 COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
+RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame (`light.frame_colors`): where it is there, it counts
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
@@ -39,10 +41,11 @@ Attributes = dict[str, tuple[str, str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SplatAttributes:
-    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh."""
+    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh; light of the avatar."""
 
     splats: Attributes
     neutral: Attributes
+    light: AvatarLight | None = None
 
 
 def avatar_attributes(avatar: Avatar) -> SplatAttributes:
@@ -53,7 +56,7 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
         FACE: ("INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)),
         NEUTRAL_AREA: ("FLOAT", "value", flat_floats(areas[avatar.splats.face])),
     }
-    return SplatAttributes(splats, _neutral_attributes(avatar, areas))
+    return SplatAttributes(splats, _neutral_attributes(avatar, areas), avatar.light)
 
 
 def _neutral_attributes(avatar: Avatar, areas: np.ndarray) -> Attributes:

@@ -16,7 +16,7 @@ from .frame_nodes import FRAMES, PLACED
 from .materials import DISPLAY_COLOR
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
 from .offset_nodes import SIGNALS, shifted
-from .splat_attributes import COLOR, FACE, OPACITY
+from .splat_attributes import COLOR, FACE, OPACITY, RELIT_COLOR
 from .strain_nodes import DEFORMED, SAMPLED_STRAIN, STRAIN
 
 # Inputs of the modifier, by their displayed names.
@@ -147,7 +147,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         frozen = nodes.attribute(_FROZEN, "BOOLEAN")
         color = nodes.switch("RGBA", nodes.logic("AND", frozen, inputs[SHOW_SELECTION]), color, FROZEN_COLOR)
         visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
-    splats = nodes.store(splats, DISPLAY_COLOR, color, "FLOAT_COLOR")
+    splats = nodes.store(splats, DISPLAY_COLOR, _relit_or(nodes, color), "FLOAT_COLOR")
     nodes.finish("NodeGroupOutput", {"Geometry": displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE])})
     display = next(item for item in nodes.tree.interface.items_tree if item.name == DISPLAY)
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
@@ -182,6 +182,13 @@ def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
     direction, has_camera = view_direction(nodes, nodes.out("GeometryNodeInputPosition"))
     from_camera = nodes.group(SRGB_TO_LINEAR, view_color(nodes, srgb, degree, direction))
     return nodes.switch("RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, from_camera)
+
+
+def _relit_or(nodes: Nodes, color: Any) -> Any:
+    """The relit color where the splats have one, else `color`."""
+    stored = nodes.add("GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR")
+    relit, exists = (socket for socket in stored.outputs if socket.enabled)
+    return nodes.switch("RGBA", exists, color, relit)
 
 
 def _visible(nodes: Nodes, inputs: Any) -> bpy.types.NodeSocket:

@@ -1,6 +1,7 @@
 """Splat objects: the Blender objects that display avatars and world-space splats."""
 
 from typing import Any
+from uuid import uuid4
 
 import bpy
 import numpy as np
@@ -12,6 +13,7 @@ from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
 from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
+from ..light.stored import read_light, write_light
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
 from .node_builder import is_splat_tree
@@ -54,7 +56,7 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
     _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
-    neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared.neutral)
+    neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared)
     set_input(splat_object, splat_nodes.NEUTRAL, neutral)
     # A sibling of the head: both have the same object space.
     splat_object.parent = head.parent
@@ -86,8 +88,20 @@ def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
 
     prepared: `avatar_attributes` of an avatar for which `can_update` is true.
     """
-    _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared.neutral)
+    _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared)
     write_splats(splat_object.data, prepared.splats)
+
+
+def store_light(splat_object: Any, avatar: Avatar) -> bool:
+    """Give the object the light of the same avatar; False where it shows another one."""
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    if neutral is None or not has_triangles(neutral.data, avatar.faces):
+        return False
+    if len(splat_object.data.vertices) != len(avatar.splats):
+        return False
+    write_light(neutral.data, avatar.light)
+    splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
+    return True
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
@@ -178,6 +192,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         antialiased=bool(splat_object[tags.ANTIALIASED]),
         strain_range=read_strain_range(neutral.data),
         driven_offsets=read_driven_offsets(neutral.data),
+        light=read_light(neutral.data),
     )
 
 
@@ -216,14 +231,15 @@ def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
     return splat_object
 
 
-def _neutral_object(name: str, avatar: Avatar, attributes: Attributes) -> Any:
+def _neutral_object(name: str, avatar: Avatar, prepared: SplatAttributes) -> Any:
     mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
-    _write_neutral(mesh, attributes)
+    _write_neutral(mesh, prepared)
     return bpy.data.objects.new(name, mesh)
 
 
-def _write_neutral(mesh: Any, attributes: Attributes) -> None:
-    write_attributes(mesh, attributes, "FACE")
+def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
+    write_attributes(mesh, prepared.neutral, "FACE")
+    write_light(mesh, prepared.light)
     mesh.update()
 
 

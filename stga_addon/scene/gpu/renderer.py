@@ -17,21 +17,23 @@ from ..layers import SceneLayer
 from . import packing
 from .front_bones import NO_BONES
 from .packing import StaticSplats, View
+from .relit_renderer import RelitTextures
+from .relit_shaders import RELIT_TEXTURES
 from .shaders import (
     BLOCK_SPLATS,
     PACKED_TEXTURES,
     PROJECTED_TEXTURES,
-    TEXTURE_WIDTH,
     composite_shader,
     projection_shader,
     splat_shader,
 )  # fmt: skip
+from .textures import EXACT, TEXTURE_WIDTH, texture, texture_rows
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
 OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
 """Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
-EXACT, COMPACT = "RGBA32F", "RGBA16F"
-"""Formats of the color target."""
+COMPACT = "RGBA16F"
+"""Format of the color target, beside EXACT."""
 DEPTH_FORMAT = "RG32F"
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
 """Parts of the names, in lower case, of OpenGL and Vulkan drivers that compute on the CPU."""
@@ -52,6 +54,7 @@ class SplatRenderer:
     def __init__(self, color_format: str = EXACT, short_keys: bool = False) -> None:
         self._projection_shader, self._splat_shader = projection_shader(), splat_shader()
         self._composite_shader = composite_shader()
+        self._relit: tuple[RelitTextures, Any] | None = None
         self._screen, self._splat_rectangles = _rectangles(1), _rectangles(BLOCK_SPLATS)
         self._color_format, self._short_keys = color_format, short_keys
         self._static: StaticSplats | None = None
@@ -141,8 +144,8 @@ class SplatRenderer:
     def _update_static(self, layers: Sequence[SceneLayer]) -> StaticSplats:
         if self._static is None or self._static.key != packing.static_key(layers):
             self._static = StaticSplats(layers)
-            self._static_textures = {name: _texture(texels) for name, texels in self._static.texels.items()}
-            size = TEXTURE_WIDTH, _rows(len(self._static))
+            self._static_textures = {name: texture(texels) for name, texels in self._static.texels.items()}
+            size = TEXTURE_WIDTH, texture_rows(len(self._static))
             self._projected = {name: GPUTexture(size, format=EXACT) for name in PROJECTED_TEXTURES}
             self._projected_target = GPUFrameBuffer(color_slots=tuple(self._projected.values()))
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
@@ -171,15 +174,20 @@ class SplatRenderer:
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0
-        textures = self._static_textures | {
-            "orders": _texture(order[:, None], "R32F"), "frames": _texture(frames.texels.reshape(-1, 4)),
-            "table": _texture(packing.table(static, layers, view)),
+        shader, relit = self._projection_shader, dict[str, Any]()
+        names: tuple[str, ...] = PACKED_TEXTURES
+        if any(layer.relit is not None for layer in layers):
+            self._relit = self._relit or (RelitTextures(), projection_shader(relit=True))
+            relit, shader = self._relit[0].update(layers, view.camera.position), self._relit[1]
+            names = PACKED_TEXTURES + RELIT_TEXTURES
+        textures = self._static_textures | relit | {
+            "orders": texture(order[:, None], "R32F"), "frames": texture(frames.texels.reshape(-1, 4)),
+            "table": texture(packing.table(static, layers, view)),
         }  # fmt: skip
-        shader = self._projection_shader
         with self._projected_target.bind():
             gpu.state.blend_set("NONE")
             shader.bind()
-            for name in PACKED_TEXTURES:
+            for name in names:
                 shader.uniform_sampler(name, textures[name])
             shader.uniform_int("faces", frames.texels.shape[1])
             shader.uniform_int("count", len(order))
@@ -207,20 +215,6 @@ def _rectangles(count: int) -> Any:
     triangles = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [2, 1, 3]])
     indices = GPUIndexBuf(type="TRIS", seq=triangles.reshape(-1, 3).astype(np.uint32))
     return GPUBatch(type="TRIS", buf=vertices, elem=indices)
-
-
-def _rows(count: int) -> int:
-    """Rows of a texture TEXTURE_WIDTH wide for `count` texels."""
-    return max(1, -(-count // TEXTURE_WIDTH))
-
-
-def _texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
-    """Texels (M, C) as a texture TEXTURE_WIDTH wide, its last row filled with zeros."""
-    rows = _rows(len(texels))
-    padded = np.zeros((rows * TEXTURE_WIDTH, texels.shape[1]), np.float32)
-    padded[: len(texels)] = texels
-    pixels = Buffer("FLOAT", padded.size, padded.reshape(-1))
-    return GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
 
 
 def _image(texels: np.ndarray) -> Any:

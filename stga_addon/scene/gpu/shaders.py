@@ -26,10 +26,11 @@ from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
 from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
 from .packing import CLIP_PLANES, LAYER_TEXELS, VIEW_TEXELS
+from .relit_shaders import RELIT_DEFINES, RELIT_FUNCTIONS, RELIT_TEXTURES
+from .textures import TEXTURE_WIDTH
 
 MIN_ALPHA = 1 / 255
 """A splat adds nothing to a pixel where its alpha is less, as in the rasterizer; a pixel with less shows nothing."""
-TEXTURE_WIDTH = 2048
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
 BLOCK_SPLATS = 128
@@ -47,10 +48,12 @@ _DEFINES = f"""
 #define FROZEN_COLOR vec3({", ".join(f"{channel:.6f}" for channel in FROZEN_COLOR_SRGB)})
 """
 
+_TEXEL_FUNCTION = """
+ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
+"""
+
 _PROJECTION_FRAGMENT = """
 const float LOW_PASS_PX2 = 0.3;
-
-ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
 
 vec3 spherical_harmonics(int first, int degree, vec3 d)
 {
@@ -132,11 +135,16 @@ void main()
   vec3 direction = vec3(dot(turn0.xyz, toward), dot(turn1.xyz, toward), dot(turn2.xyz, toward));
   int first = int(color_rows.x) + (splat - int(color_rows.y)) * int(color_rows.z);
   vec3 color = spherical_harmonics(first, int(color_rows.w), direction);
+  vec3 by_strain = vec3(0.0);
   if (display.y > 0.5) {
     int last = first + int(color_rows.z); /* the strain colors are the last three */
-    color += strain.x * texelFetch(colors, at(last - 3), 0).rgb + strain.y * texelFetch(colors, at(last - 2), 0).rgb
-           + strain.z * texelFetch(colors, at(last - 1), 0).rgb;
+    by_strain = strain.x * texelFetch(colors, at(last - 3), 0).rgb + strain.y * texelFetch(colors, at(last - 2), 0).rgb
+              + strain.z * texelFetch(colors, at(last - 1), 0).rgb;
+    color += by_strain;
   }
+#ifdef RELIT
+  color = relit(splat, int(axis2.w), color, by_strain);
+#endif
   if (!(abs(color.r) + abs(color.g) + abs(color.b) < 1e30)) {
     return;
   }
@@ -234,19 +242,22 @@ void main()
 """
 
 
-def projection_shader() -> Any:
-    """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`; others become 0."""
+def projection_shader(relit: bool = False) -> Any:
+    """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`; others become 0.
+
+    relit: for layers of which at least one is lit by the scene, with RELIT_TEXTURES.
+    """
     info = GPUShaderCreateInfo()
-    info.typedef_source(_DEFINES)
+    info.typedef_source(_DEFINES + ("#define RELIT\n" + RELIT_DEFINES if relit else ""))
     info.vertex_in(0, "VEC2", "corner")
     for slot, name in enumerate(("place_out", "sides_out", "shade_out")):
         info.fragment_out(slot, "VEC4", name)
-    for slot, name in enumerate(PACKED_TEXTURES):
+    for slot, name in enumerate(PACKED_TEXTURES + (RELIT_TEXTURES if relit else ())):
         info.sampler(slot, "FLOAT_2D", name)
     for name in ("faces", "count"):
         info.push_constant("INT", name)
     info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(_PROJECTION_FRAGMENT)
+    info.fragment_source(_TEXEL_FUNCTION + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT)
     return gpu.shader.create_from_info(info)
 
 

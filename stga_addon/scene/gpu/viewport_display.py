@@ -67,6 +67,10 @@ class GpuDisplay:
         self._renderer, self._scene_target, self._cache = None, None, SplatCache()
         self.problem = self.problem if self.failed else ""
 
+    def forget_casters(self) -> None:
+        """Read what throws shadows onto heads again: the scene has changed."""
+        self._cache.light.casters.forget()
+
     def _before(self) -> None:
         """Keep the framebuffer of the scene's colors: after it, Blender binds that of the overlays, which lie above."""
         self._scene_target = gpu.state.active_framebuffer_get()
@@ -223,12 +227,21 @@ def _forget_file(*_: Any) -> None:
     display.forget()
 
 
+@persistent
+def _scene_changed(*_: Any) -> None:
+    display.forget_casters()
+
+
 def register() -> None:
     bpy.app.handlers.load_pre.append(_forget_file)
+    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
+        handlers.append(_scene_changed)
     display.start()
 
 
 def unregister() -> None:
     bpy.app.handlers.load_pre.remove(_forget_file)
+    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
+        handlers.remove(_scene_changed)
     display.failed = False
     display.stop()

@@ -78,7 +78,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         image = draw_image(layers, camera)
         if image is None:
             _rasterizer.update()
-            image = _rasterizer.client.compose([layer.posed() for layer in layers], camera, with_depth=True)
+            image = _rasterizer.client.compose(
+                [layer.posed(camera.position) for layer in layers], camera, with_depth=True
+            )
             if _rasterizer.client.failure:
                 self.report({"WARNING"}, _rasterizer.client.failure)
         view = inverse_view(scene)

@@ -8,12 +8,14 @@ import bpy
 import gpu
 import numpy as np
 
+from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import PosedSplats
 from ...render.client import RenderClient
 from ..gpu.renderer import SplatRenderer
 from ..gpu.viewport_display import is_drawn_by_engine, region_view
 from ..layers import SceneLayer
+from ..light.settings import settings_values
 from .camera import viewport_camera
 from .composite import combined, scene_background, srgb_background
 from .rasterizer import Rasterizer
@@ -37,10 +39,13 @@ class EngineViewport:
         self._cache = SplatCache()
         self._layers: list[SceneLayer] | None = None
         self._posed: list[PosedSplats] = []
+        self._posed_for: bytes = b""
+        self._lighting: tuple[Any, ...] = ()
 
     def update(self, depsgraph: Any) -> None:
         """The scene has changed: pose the splats again, and read meshes again that were edited themselves."""
         self._layers = None
+        self._cache.light.casters.forget()
         self._cache.discard(
             {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Mesh)}
         )
@@ -63,21 +68,30 @@ class EngineViewport:
             self.renderer.error, self.renderer.image = self.error, None
             return False
         camera = viewport_camera(context.region_data, region.width, region.height)
+        self._pose(camera)
         if not self.renderer.is_busy():
             self._rasterizer.update()
         return self.renderer.request(RenderRequest(self._posed, camera, scene_background(depsgraph.scene)))
 
     def _update_layers(self, context: Any, depsgraph: Any) -> bool:
         """Read the scene if it has changed; returns False, and sets `error`, where that fails."""
-        if self._layers is None:
+        lighting = settings_values(depsgraph.scene)
+        if self._layers is None or lighting != self._lighting:
+            self._lighting = lighting
             try:
                 self._layers = visible_layers(depsgraph, self._cache, context.space_data)
             except StgaError as error:
                 self.error = str(error)
                 return False
-            self._posed = [layer.posed() for layer in self._layers] if self._gpu_failed else []
-            self.error = ""
+            self._posed, self._posed_for, self.error = [], b"", ""
         return True
+
+    def _pose(self, camera: Camera) -> None:
+        """Pose the layers for the rasterizer; again for another camera where highlights depend on it."""
+        assert self._layers is not None
+        seen_from = camera.position.tobytes() if any(layer.relit for layer in self._layers) else b"anywhere"
+        if seen_from != self._posed_for:
+            self._posed, self._posed_for = [layer.posed(camera.position) for layer in self._layers], seen_from
 
     def _draw(self, context: Any, depsgraph: Any) -> None:
         color = scene_background(depsgraph.scene)

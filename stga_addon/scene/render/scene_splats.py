@@ -1,6 +1,6 @@
 """The splats of a scene's visible objects, posed at its frame: what the GPU display and the render engine draw."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
@@ -17,7 +17,9 @@ from ..display import splat_nodes
 from ..display.splat_attributes import read_splats
 from ..display.splat_object import display_settings, get_input, splat_modifier, stored_avatar
 from ..layers import SceneLayer
+from ..light.scene_light import SceneLight
 from ..vertex_groups import frame_selection
+from ..visible import visible_objects
 
 
 class SplatCache:
@@ -25,11 +27,14 @@ class SplatCache:
 
     Reading attributes takes longer than posing splats, and an animated head does not change them. `write_splats` gives
     a mesh a new revision, so that neither undo nor a loaded file brings up what another state of the mesh held.
+
+    light  of the scene, as last read
     """
 
     def __init__(self) -> None:
         self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
         self._frames: dict[tuple[Any, ...], tuple[np.ndarray, FaceFrames]] = {}
+        self.light = SceneLight()
 
     def discard(self, meshes: set[Any]) -> None:
         """Forget meshes that were edited."""
@@ -46,13 +51,13 @@ class SplatCache:
             self._stored[key] = stored
         return self._stored[key]
 
-    def frames(self, splat_object: Any, avatar: Avatar, vertices: np.ndarray) -> FaceFrames:
-        """The avatar's frames on a head of this shape (V, 3)."""
+    def frames(self, splat_object: Any, avatar: Avatar, vertices: np.ndarray) -> tuple[np.ndarray, FaceFrames]:
+        """The avatar's frames on a head of this shape (V, 3), and the shape as first given."""
         key = (*_key(splat_object.data), splat_object.session_uid)
         known = self._frames.get(key)
         if known is None or not np.array_equal(known[0], vertices):
             known = self._frames[key] = vertices, avatar.frames(vertices)
-        return known[1]
+        return known
 
     def _keep(self, is_kept: Callable[[tuple[Any, ...]], bool]) -> None:
         self._stored = {key: stored for key, stored in self._stored.items() if is_kept(key)}
@@ -71,43 +76,17 @@ def visible_layers(
     view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects.
     Raises StgaError where the head of an object is gone or has other triangles than its splats.
     """
+    shown = list(visible_objects(depsgraph, view))
     return [
-        _layer(visible, matrix, depsgraph, cache)
-        for visible, matrix in _visible_objects(depsgraph, view)
+        _layer(visible, matrix, depsgraph, cache, shown)
+        for visible, matrix in shown
         if visible.get(tags.KIND) == tags.SPLATS and is_wanted(visible)
     ]
 
 
-def _visible_objects(depsgraph: Any, view: Any) -> Iterator[tuple[Any, Matrix]]:
-    """Objects and their world matrices; members of an instanced collection once per instance."""
-    if view is None:
-        visible = _rendered_objects(depsgraph.view_layer.layer_collection)
-    else:
-        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
-    for each in visible:
-        yield from _with_instances(each, depsgraph, Matrix())
-
-
-def _rendered_objects(layer: Any) -> list[Any]:
-    """The objects of a layer collection and its children that final images show, each once."""
-    if layer.exclude or layer.collection.hide_render:
-        return []
-    shown = [candidate for candidate in layer.collection.objects if not candidate.hide_render]
-    return list(dict.fromkeys([*shown, *(each for child in layer.children for each in _rendered_objects(child))]))
-
-
-def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:
-    matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
-    yield visible, matrix
-    collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None
-    if collection is not None:
-        inside = matrix @ Matrix.Translation(-collection.instance_offset)
-        for member in collection.all_objects:
-            if not member.hide_render:
-                yield from _with_instances(member, depsgraph, inside)
-
-
-def _layer(splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache) -> SceneLayer:
+def _layer(
+    splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache, shown: Sequence[tuple[Any, Matrix]]
+) -> SceneLayer:
     stored = cache.get(splat_object)
     to_world = np.array(matrix, np.float64)
     # From the evaluated object: its settings may be animated.
@@ -118,12 +97,13 @@ def _layer(splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache)
     if head is None:
         raise StgaError(f"{splat_object.name}: has no head to follow; choose one in its modifier")
     vertices = _head_vertices(splat_object, head, len(stored.faces), depsgraph)
-    frames = cache.frames(splat_object, stored, vertices)
+    vertices, frames = cache.frames(splat_object, stored, vertices)
+    relit = cache.light.relit(splat_object, head, stored, vertices, to_world, shown, depsgraph)
     selected = None
     if settings.show_selection or settings.selected_only:
         selected = frame_selection(head, depsgraph.scene.frame_current)
     frozen = None if selected is None else ~selected
-    return SceneLayer(stored.splats, frames, to_world, stored.antialiased, settings, frozen)
+    return SceneLayer(stored.splats, frames, to_world, stored.antialiased, settings, frozen, relit)
 
 
 def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -> np.ndarray:

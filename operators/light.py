@@ -1,0 +1,95 @@
+"""The light of avatars: estimated from the capture, and their shadows onto the scene."""
+
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.requests.values import Relight
+from ..stga_addon.scene.compat import PATH_OPTIONS
+from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display.splat_object import get_input
+from ..stga_addon.scene.light.frame_colors import forget_frame, relight_frame
+from ..stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow
+from . import ids
+from .common import file_path, flame_model_path, reporting, scene_settings
+from .request import needs_idle, start
+from .training_python import training_python
+
+
+def _needs_splats(operator: Any, context: Any) -> bool:
+    splats = scene_settings(context).splats
+    try:
+        if splats is not None and get_input(splats, splat_nodes.HEAD) is not None:
+            return True
+    except StgaError:
+        pass
+    operator.poll_message_set("Show an avatar first")
+    return False
+
+
+class EstimateLight(bpy.types.Operator):
+    """Find out the light of the capture that the avatar was trained on, so that the scene can light the avatar"""
+
+    bl_idname = ids.ESTIMATE_LIGHT
+    bl_label = "Estimate Light"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    directory: bpy.props.StringProperty(
+        name="Run Folder", description="Folder of the avatar's run", subtype="DIR_PATH", options=PATH_OPTIONS
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_idle(cls, context, Kind.LIGHT) and _needs_splats(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        run = file_path(self.directory or scene_settings(context).run_folder, "run folder")
+        start(context.scene, Relight(run, flame=flame_model_path(context)), training_python(context))
+        return {"FINISHED"}
+
+
+class RelightFrame(bpy.types.Operator):
+    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other frames keep them"""
+
+    bl_idname = ids.RELIGHT_FRAME
+    bl_label = "Relight Frame for EEVEE and Cycles"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    clear: bpy.props.BoolProperty(
+        name="Clear", description="Show recorded colors again", default=False, options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return _needs_splats(cls, context)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        splats = scene_settings(context).splats
+        if self.clear:
+            forget_frame(splats)
+        else:
+            relight_frame(splats, context.scene)
+        return {"FINISHED"}
+
+
+class HeadShadow(bpy.types.Operator):
+    """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen; again: hide it"""
+
+    bl_idname = ids.HEAD_SHADOW
+    bl_label = "Shadow onto the Scene"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return _needs_splats(cls, context)
+
+    def execute(self, context: Any) -> set[str]:
+        splats = scene_settings(context).splats
+        is_on = not throws_shadow(splats)
+        throw_shadow(splats, is_on)
+        self.report({"INFO"}, "The head throws shadows" if is_on else "The head throws no shadows")
+        return {"FINISHED"}

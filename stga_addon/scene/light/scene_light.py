@@ -1,0 +1,115 @@
+"""The light of a Blender scene for each of its avatars."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from ...avatar.file import Avatar
+from ...light.harmonics import rotated
+from ...light.relight import Relighter
+from ...light.values import Light, Lighting, no_world
+from ..layers import Relit
+from .casters import Casters
+from .lights import in_avatar_space, is_linked, light_of
+from .settings import current_settings, lighting_settings
+from .world import WorldLight, split_world, world_light
+
+MAX_KEPT = 64
+
+
+class SceneLight:
+    """What is kept between redraws, so that nothing is computed while nothing moves."""
+
+    def __init__(self) -> None:
+        self.casters = Casters()
+        self._relighters: dict[int, Relighter] = {}
+        self._relit: dict[tuple[int, bytes], tuple[Any, Relit]] = {}
+        self._worlds: dict[WorldLight, tuple[np.ndarray, tuple[Light, ...]]] = {}
+
+    def relit(
+        self, splat_object: Any, head: Any, avatar: Avatar, vertices: np.ndarray, to_world: np.ndarray,
+        visible: Sequence[tuple[Any, Any]], depsgraph: Any,
+    ) -> Relit | None:  # fmt: skip
+        """How the scene lights an avatar whose head has vertices (V, 3); None where its colors are as recorded.
+
+        The same object as long as all is the same, `vertices` by identity. to_world (4, 4): from the avatar's space.
+        """
+        settings = current_settings(depsgraph)
+        if avatar.light is None or settings is None or settings.mode == "recorded":
+            return None
+        lighting = self.lighting(settings, (splat_object, head), to_world, visible, depsgraph)
+        casters = self.casters.of(head, to_world, visible, depsgraph) if lighting.shadows else ()
+        relighter = self._relighter(splat_object.session_uid, avatar)
+        key, place = (
+            (_key(lighting), id(relighter), id(vertices), id(casters)),
+            (splat_object.session_uid, to_world.tobytes()),
+        )
+        known = self._relit.get(place)
+        if known is None or known[0] != key:
+            if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
+                self._relit.clear()
+            known = self._relit[place] = key, Relit(relighter, vertices, lighting, casters)
+        return known[1]
+
+    def lighting(
+        self, settings: Any, receivers: tuple[Any, ...], to_world: np.ndarray, visible: Sequence[tuple[Any, Any]],
+        depsgraph: Any,
+    ) -> Lighting:  # fmt: skip
+        """The scene's light in the space that `to_world` (4, 4) takes to the world, for objects `receivers`."""
+        chosen = lighting_settings(depsgraph.scene).lights
+        lights = []
+        for each, matrix in visible:
+            if each.type != "LIGHT" or (chosen is not None and each.name not in chosen.all_objects):
+                continue
+            light = light_of(each.evaluated_get(depsgraph).data, matrix) if is_linked(each, receivers) else None
+            if light is not None:
+                lights.append(in_avatar_space(light, to_world))
+        white = np.maximum(np.array(settings.white, np.float64), 1e-3)
+        red, green, blue = (white / white.mean()).tolist()
+        world, suns = self._world(depsgraph, to_world) if settings.world else (no_world(), ())
+        return Lighting(
+            world=world,
+            lights=(*lights, *suns),
+            mode=settings.mode,
+            mix=settings.mix,
+            exposure=settings.exposure,
+            white=(red, green, blue),
+            roughness=settings.roughness,
+            specular=settings.specular,
+            shadows=settings.shadows,
+        )
+
+    def _world(self, depsgraph: Any, to_world: np.ndarray) -> tuple[np.ndarray, tuple[Light, ...]]:
+        """Harmonics (9, 3) and suns in the space that `to_world` takes to the world; black where the world's nodes are
+        not understood."""
+        light = world_light(depsgraph.scene_eval.world)
+        if light is None:
+            return no_world(), ()
+        if light.image is not None:
+            light = light._replace(image=light.image.original)
+        if light not in self._worlds:
+            self._worlds = {light: split_world(light)}
+        world, suns = self._worlds[light]
+        if light.image is None:
+            return world, suns
+        u, _, v = np.linalg.svd(to_world[:3, :3])
+        return rotated(world, (u @ v).T), tuple(in_avatar_space(sun, to_world) for sun in suns)
+
+    def _relighter(self, uid: int, avatar: Avatar) -> Relighter:
+        if uid not in self._relighters or self._relighters[uid].avatar is not avatar:
+            self._relighters[uid] = Relighter(avatar)
+        return self._relighters[uid]
+
+
+def _key(lighting: Lighting) -> tuple[Any, ...]:
+    """Equal for lightings of the same values."""
+    return (
+        *(_value(getattr(lighting, field.name)) for field in fields(lighting) if field.name != "lights"),
+        *(_value(getattr(light, field.name)) for light in lighting.lights for field in fields(light)),
+    )
+
+
+def _value(value: Any) -> Any:
+    return value.tobytes() if isinstance(value, np.ndarray) else value
