@@ -23,8 +23,8 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.flame_capture import with_sequence
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.rigid import Similarity, similarity
 from stga_addon.flame.forward import FlameFrame
-from stga_addon.tracking.fit import Similarity, similarity
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.rules import tracking

@@ -1,10 +1,33 @@
-"""Removal of rigid head motion from a tracked mesh."""
+"""Rotations, shifts and scales that lay one set of points onto another; removal of rigid head motion from a mesh."""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from .camera import Camera
 
 MAX_ITERATIONS = 100
 MIN_RESIDUAL = 1e-7
 """Share of the mesh's size below which residuals are rounding."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x ↦ scale · rotation x + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera in the world that `apply` leads to."""
+        pose = np.eye(4)
+        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
+        pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - pose[:3, :3] @ self.translation
+        return replace(camera, world_to_camera=pose)
 
 
 def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
@@ -36,3 +59,14 @@ def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndar
     u, _, vt = np.linalg.svd((target - target_center).T @ (share * (source - source_center)))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation, target_center - rotation @ source_center
+
+
+def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> Similarity:
+    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama).
+
+    metric: of those with a scale of 1.
+    """
+    rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
+    a, b = source - source.mean(0), target - target.mean(0)
+    scale = 1.0 if metric else float((b * (a @ rotation.T)).sum() / (a**2).sum())
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.model import evenly_spread
-from ..capture.rigid import weighted_procrustes
+from ..capture.rigid import Similarity, similarity, weighted_procrustes
 from .head_model import HeadModel
 from .mesh_image import vertex_normals
 from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
@@ -30,25 +30,6 @@ MIN_LANDMARKS = 4
 MIN_FACE_PIXELS, MIN_FACE_M = 1.0, 0.01
 """Extents of the landmarks in an image and on the head, below which they are no face but a point."""
 POSIT_ITERATIONS = 20
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """x ↦ scale · rotation x + translation: from the world of the cameras to the capture's, in meters, y up."""
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def camera(self, camera: Camera) -> Camera:
-        """The camera in the capture's world."""
-        pose = np.eye(4)
-        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
-        pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - pose[:3, :3] @ self.translation
-        return replace(camera, world_to_camera=pose)
 
 
 @dataclass(frozen=True)
@@ -177,17 +158,6 @@ def is_metric(
         for t in evenly_spread(several, IDENTITY_TIMESTEPS)
     ]
     return not scales or 1 / MAX_HEAD_SCALE <= float(np.median(scales)) <= MAX_HEAD_SCALE
-
-
-def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> Similarity:
-    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama).
-
-    metric: of those with a scale of 1.
-    """
-    rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
-    a, b = source - source.mean(0), target - target.mean(0)
-    scale = 1.0 if metric else float((b * (a @ rotation.T)).sum() / (a**2).sum())
-    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
 def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -9,9 +9,10 @@ from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.capture.rigid import Similarity
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import flame_forward
-from stga_addon.tracking.fit import HeadFit, Similarity
+from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.outline import outline_offsets
 from stga_addon.tracking.posed_points import parameters_of

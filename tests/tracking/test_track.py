@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.rigid import Similarity
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
@@ -19,7 +20,6 @@ from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import nearest_points
-from stga_addon.tracking.fit import Similarity
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
