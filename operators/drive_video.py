@@ -5,11 +5,10 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.driving.face_video import is_video
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import ConvertMotion
-from ..stga_addon.tracking.footage.video import SUFFIXES
+from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES, is_video
 from . import ids
 from .common import FileImport, file_path, needs_rig_or_shapes, reporting, scene_settings
 from .drive import takes_folder
@@ -25,7 +24,9 @@ class DriveVideo(bpy.types.Operator, FileImport):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filename_ext = ".mp4"
-    filter_glob: bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{suffix}" for suffix in VIDEO_SUFFIXES), options={"HIDDEN"}
+    )
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -35,7 +36,7 @@ class DriveVideo(bpy.types.Operator, FileImport):
     def execute(self, context: Any) -> set[str]:
         video = file_path(self.filepath, "video")
         if not is_video(video):
-            raise StgaError(f"{video}: is no video; expected {', '.join(SUFFIXES)}")
+            raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
         task = scene_settings(context).drive.detector
         if not task:
             raise StgaError(

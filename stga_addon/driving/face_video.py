@@ -9,15 +9,10 @@ from ..errors import StgaError
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..progress import Cancelled, Progress, Report
 from ..tracking.detectors import FaceLandmarker
-from ..tracking.footage.video import SUFFIXES, VideoFrames, read_video
+from ..tracking.footage.video import VideoFrames, read_video
 from .inverse import head_angles
 from .names import COLUMN, COUNT, arkit_name
 from .performance import Performance
-
-
-def is_video(path: Path) -> bool:
-    """Whether a path has the name of a video file."""
-    return path.suffix.lower() in SUFFIXES
 
 
 def watched_performance(path: Path, scorer: FaceLandmarker, report: Report) -> Performance:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..capture.flame_capture import flame_model
 from ..capture.open import open_capture
-from ..driving.face_video import is_video, watched_performance
+from ..driving.face_video import watched_performance
 from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, write_performance
 from ..driving.open_motion import NEEDS_FLAME, MotionOptions, adapted, performed, prepared_performance
@@ -21,6 +21,7 @@ from ..progress import Progress, Report, Say
 from ..requests.results import Written
 from ..requests.values import SHAPES_SUFFIX, ConvertMotion
 from ..tracking.detectors import make_face_scorer
+from ..tracking.footage.file_types import is_video
 from .motion import findings
 
 

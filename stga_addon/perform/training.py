@@ -72,14 +72,19 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
         say(f"warning: {warning}")
     for line in _table(describe_effects(prepared.run.effect_plan)):
         say(line)
-    draw = CurveUpdater(prepared.folder)
+    draw, latest = CurveUpdater(prepared.folder), Progress()
 
     def report_training(progress: TrainingProgress) -> bool:
+        nonlocal latest
         draw()
-        return report(_as_progress(progress))
+        latest = _as_progress(progress)
+        return report(latest)
+
+    def report_light(progress: Progress) -> bool:
+        return report(replace(latest, stage=progress.stage, preview=None))  # with the figures of the training
 
     avatar = prepared.train(report_training)
-    lines = [*report_run(prepared.folder), f"avatar: {avatar}", *_light_of(prepared, avatar, report)]
+    lines = [*report_run(prepared.folder), f"avatar: {avatar}", *_light_of(prepared, avatar, report_light)]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
     return Written(avatar, tuple(lines))

@@ -89,7 +89,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
 def _node_groups(options: TreeOptions) -> list[NodeGroup]:
     """The groups that `_build` uses, each after those that it uses itself."""
     convention, degree, strain_color, offsets = options
-    groups = [PLACED[convention], *MODES.values(), *SH_BANDS[:degree]]
+    groups = [PLACED[convention], _RELIT, *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS]
     if strain_color or offsets:
@@ -147,7 +147,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         frozen = nodes.attribute(_FROZEN, "BOOLEAN")
         color = nodes.switch("RGBA", nodes.logic("AND", frozen, inputs[SHOW_SELECTION]), color, FROZEN_COLOR)
         visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
-    splats = nodes.store(splats, DISPLAY_COLOR, _relit_or(nodes, color), "FLOAT_COLOR")
+    splats = nodes.store(splats, DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
     nodes.finish("NodeGroupOutput", {"Geometry": displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE])})
     display = next(item for item in nodes.tree.interface.items_tree if item.name == DISPLAY)
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
@@ -184,13 +184,6 @@ def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
     return nodes.switch("RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, from_camera)
 
 
-def _relit_or(nodes: Nodes, color: Any) -> Any:
-    """The relit color where the splats have one, else `color`."""
-    stored = nodes.add("GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR")
-    relit, exists = (socket for socket in stored.outputs if socket.enabled)
-    return nodes.switch("RGBA", exists, color, relit)
-
-
 def _visible(nodes: Nodes, inputs: Any) -> bpy.types.NodeSocket:
     """Field: splats of sufficient opacity that are in the random part."""
     opaque = nodes.compare("GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD])
@@ -212,3 +205,13 @@ def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
 
 
 _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _frozen_splats)
+
+
+def _relit_color(nodes: Nodes, color: Any) -> bpy.types.NodeSocket:
+    """Field: the relit color of a frame where the splats have one, else `color`."""
+    stored = nodes.add("GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR")
+    relit, exists = (socket for socket in stored.outputs if socket.enabled)
+    return nodes.switch("RGBA", exists, color, relit)
+
+
+_RELIT = NodeGroup("STGA Relit Color", {"Color": "Color"}, "Color", _relit_color)

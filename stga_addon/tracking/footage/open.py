@@ -15,6 +15,7 @@ from ...errors import StgaError
 from . import video
 from .calibrations import EXPECTED, find_calibration, read_calibration
 from .clocks import clock_offsets
+from .file_types import is_video
 from .given_masks import with_masks
 from .image_frames import ImageFrames
 from .lens import Lens
@@ -97,7 +98,7 @@ def _sources(path: Path) -> tuple[Sources, Path]:
     root = Path(realpath(path))  # Path.resolve raises RuntimeError for a loop of links
     if isdir(path):
         return find_sources(root), root
-    if isfile(path) and path.suffix.lower() in video.SUFFIXES:
+    if isfile(path) and is_video(path):
         return Sources(root.parent, videos={root.stem: [root]}), root.parent
     raise StgaError(f"{path}: is neither a folder nor a video; expected footage")
 

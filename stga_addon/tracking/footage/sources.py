@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from ...errors import StgaError, shorten
-from . import video
+from .file_types import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's."""
 MASK_FOLDERS = ("masks", "fg_masks")
@@ -65,7 +64,7 @@ def _enter(sources: Sources, path: Path) -> None:
     key, suffix = _key(sources.root, path), path.suffix.lower()
     if path.name.startswith("."):
         return
-    if suffix in video.SUFFIXES:
+    if suffix in VIDEO_SUFFIXES:
         sources.videos.setdefault(key, []).append(path)
     elif suffix in IMAGE_SUFFIXES:
         first, _, rest = path.relative_to(sources.root).as_posix().partition("/")
@@ -142,7 +141,7 @@ def _without_container(path: str) -> str:
 def _stem(label: str) -> str:
     """The label without the suffix of an image or video, with forward slashes."""
     path = PurePosixPath(label.replace("\\", "/"))
-    known = path.suffix.lower() in (*IMAGE_SUFFIXES, *video.SUFFIXES)
+    known = path.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
     return (path.with_suffix("") if known else path).as_posix()
 
 

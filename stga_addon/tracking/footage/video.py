@@ -13,7 +13,6 @@ from ...capture.camera import is_image_size
 from ...capture.color import is_srgb, to_srgb
 from ...errors import StgaError
 
-SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf")
 MIN_HD_LINES = 720
 """From here on, videos without a stated color matrix are in that of HD (BT.709)."""
 
