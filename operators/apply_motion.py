@@ -65,6 +65,7 @@ def exchange_property(pair: str) -> Any:
     return bpy.props.BoolProperty(
         name=f"Exchange {pair.capitalize()} Sides",
         description=f"Of a face performance: exchange {pair}Left and {pair}Right, which some senders exchange",
+        options={"SKIP_SAVE"},
     )
 
 

@@ -33,14 +33,15 @@ class Edition:
 
 
 FILES_PERMISSION = "Read captures and FLAME models, write avatars and renderings"
-DOWNLOAD_PERMISSION = "Download PyTorch for training, only when asked to"
-DETECTOR_PERMISSION = "Download the face detector for tracking, only when asked to"
+LIVE_PERMISSION = "Receive faces live, only when asked to"
+DOWNLOAD_PERMISSION = "Receive faces live, download PyTorch; only when asked to"
+DETECTOR_PERMISSION = "Receive faces live, download a face detector; only when asked to"
 
 SMALL = Edition(permissions={"files": FILES_PERMISSION, "network": DOWNLOAD_PERMISSION})
 PLATFORM = Edition(
     suffix="-platform",
     left_out=(*INSTALLER_FILES, *DOWNLOADER_FILES),
-    permissions={"files": FILES_PERMISSION},
+    permissions={"files": FILES_PERMISSION, "network": LIVE_PERMISSION},
 )
 
 

@@ -64,7 +64,7 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
 def edition_wheels(folder: Path, edition: Edition) -> list[Path]:
     """The wheels of an edition in `folder`, downloaded where they are missing. Raises StgaError where pip fails."""
     if edition.target is not None:
-        return collect_wheels(folder / edition.target.name, edition.target)
+        return collect_wheels(ROOT / "build/wheels" / edition.target.name, edition.target)
     fetch_wheels(folder)
     return [folder / name for name in WHEELS]
 

@@ -84,7 +84,7 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
         return report(replace(latest, stage=progress.stage, preview=None))  # with the figures of the training
 
     avatar = prepared.train(report_training)
-    lines = [*report_run(prepared.folder), f"avatar: {avatar}", *_light_of(prepared, avatar, report_light)]
+    lines = [*report_run(prepared.folder), *_light_of(prepared, avatar, report_light), f"avatar: {avatar}"]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
     return Written(avatar, tuple(lines))

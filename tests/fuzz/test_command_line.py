@@ -42,6 +42,7 @@ from stga_addon.requests.values import (
     Extend,
     Played,
     Refine,
+    Relight,
     Render,
     RenderBlend,
     RenderRecording,
@@ -210,6 +211,7 @@ def requests_about(case: Path) -> dict[str, Request]:
         ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
         Select(capture),
         TimePresets(capture),
+        Relight(case / "run", flame=None),
         RenderBlend(case / "take.blend", case / "asked", (1, 2)),
         Benchmark(case / "asked", capture, 1.0, only=("draft",)),
     )

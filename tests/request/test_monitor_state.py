@@ -44,6 +44,8 @@ JOB = RUN / "job"
 PREVIEW = JOB / "preview.npz"
 AVATAR = RUN / "avatar.npz"
 START = Started(RUN, JOB)
+TRANSIENT = Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT
+"""What leaves nothing but its result in the scene."""
 ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerState.LOST)
 TRAINING = RequestState(Kind.TRAINING)
 
@@ -97,7 +99,7 @@ def test_any_end_of_any_kind_stops_the_timer(kind, end):
     assert (state.interval_s, state.is_running, state.loading) == (None, False, None)
     assert after(SceneFree(), state=state) == (state, [])
     assert state.can_be_dismissed == (kind in DISMISSIBLE)
-    transient = kind in (Kind.ANALYSIS, Kind.SELECTION, Kind.LIGHT)
+    transient = kind in TRANSIENT
     assert (state.error == "why") == (transient and end not in shown)
 
 
@@ -109,7 +111,7 @@ def test_cancel(kind):
     assert not {StopWorker(JOB), KillWorker(JOB), RemoveFiles(JOB)} & set(effects)
     running, _ = after(START, status(WorkerState.WORKING), state=RequestState(kind))
     state, effects = after(CancelAsked(), state=running)
-    if kind in (Kind.ANALYSIS, Kind.SELECTION, Kind.LIGHT):
+    if kind in TRANSIENT:
         assert state == idle
         assert effects == [KillWorker(JOB), RemoveFiles(JOB), Redraw()]
     else:
@@ -125,7 +127,7 @@ def test_dismiss(kind):
     assert effects == [RemoveFiles(JOB), *stored, Redraw()]
 
 
-@pytest.mark.parametrize("kind", [Kind.TRACKING, Kind.ANALYSIS, Kind.SELECTION, Kind.LIGHT])
+@pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
 def test_a_result_that_cannot_be_shown(kind):
     """Catches a failure that nobody sees, and one that is tried again for ever."""
     state, effects = after(START, status(WorkerState.FINISHED), Failed("no head"), state=RequestState(kind))
@@ -135,7 +137,7 @@ def test_a_result_that_cannot_be_shown(kind):
     assert done in effects
 
 
-@pytest.mark.parametrize("kind", [Kind.TRACKING, Kind.ANALYSIS, Kind.SELECTION, Kind.LIGHT])
+@pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
 def test_a_result_waits_until_the_scene_is_free(kind):
     """Catches a mesh that is changed in Edit Mode, and a cancel that cannot stop what waits for its end."""
     state, effects = after(START, status(WorkerState.FINISHED), state=RequestState(kind))

@@ -311,7 +311,7 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path
         ),
         "film.mp4": (
             ["render", *given, *turned, "--video"],
-            Render(avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture, device="cpu"),
+            Render(avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture=capture, device="cpu"),
         ),
         "plys": (
             ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],

@@ -135,7 +135,8 @@ def _limit() -> None:
     change_background(target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), np.empty_like(target))
     rows = np.arange(2, dtype=np.int32)
     face, unbound = state.face.numpy(), state.unbound.numpy()
-    limits, log_scale = np.ones((2, 1), np.float32), state.parameters.log_scale.numpy()
+    # Smaller than the splats: without an excess, its gradient is not computed.
+    limits, log_scale = np.full((2, 1), 0.01, np.float32), state.parameters.log_scale.numpy()
     scale_limit(rows, log_scale, face, unbound, limits, 1.0, state.gradients.log_scale.numpy())
     opacity, share = state.parameters.opacity.numpy(), state.unseen_share.numpy()
     opacity_weight(rows, opacity, share, 1.0, state.gradients.opacity.numpy())

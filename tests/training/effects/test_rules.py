@@ -62,7 +62,7 @@ def test_color_that_follows_strain(painted):
 def test_few_frames_tell_nothing_of_unseen_ones(rule):
     """Catches a figure of 0 levels given as the reason, where no timestep could be left out with its neighbors."""
     verdict = rule(SimpleNamespace(strain=0.1, timesteps=3))
-    assert (verdict.on, verdict.only) == (False, False)
+    assert (verdict.on, verdict.fixed) == (False, False)
     assert verdict.reason.startswith("3 frames are too few to tell how")
 
 
@@ -245,7 +245,7 @@ def test_dynamic_offsets():
     """Catches offsets that are switched off although the tracked mesh is made with them, and the other way round."""
     assert looked(with_frames(frame()), "dynamic-offsets").on is False
     found = looked(with_frames(frame(), frame(dynamic_offset=np.ones((10, 3)))), "dynamic-offsets")
-    assert (found.on, found.only) == (True, True)
+    assert (found.on, found.fixed) == (True, True)
 
 
 def off_track(capture, meters, device="cpu"):
@@ -263,10 +263,10 @@ def test_mesh_and_mask_disagree(painted):
     assert found.on
     assert 0.5 < float(found.reason.split("%")[0]) < 5.0
     unknown = rules.tracking(off_track(painted(masks=False), 0.012))
-    assert (unknown.on, unknown.only) == (False, False)
+    assert (unknown.on, unknown.fixed) == (False, False)
     for impossible in (off_track(painted(timesteps=1), 0.012), off_track(painted(), 0.012, "cuda:0")):
         verdict = rules.tracking(impossible)
-        assert (verdict.on, verdict.only) == (False, True)
+        assert (verdict.on, verdict.fixed) == (False, True)
     assert "on the CPU only, not on cuda:0" in verdict.reason
 
 
@@ -412,5 +412,5 @@ def test_a_sample_without_motion_does_not_forbid_selection(painted):
     capture = painted()
     still = replace(capture, timesteps=tuple(range(500)), expression_mesh=lambda timestep, zero_pose: capture.neutral)
     verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
-    assert (verdict.on, verdict.only) == (False, False)
+    assert (verdict.on, verdict.fixed) == (False, False)
     assert "any of 64 frames" in verdict.reason
