@@ -72,19 +72,22 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
         say(f"warning: {warning}")
     for line in _table(describe_effects(prepared.run.effect_plan)):
         say(line)
-    draw, latest = CurveUpdater(prepared.folder), Progress()
+    draw, latest, is_stopped = CurveUpdater(prepared.folder), Progress(), False
 
     def report_training(progress: TrainingProgress) -> bool:
-        nonlocal latest
+        nonlocal latest, is_stopped
         draw()
         latest = _as_progress(progress)
-        return report(latest)
+        is_stopped = report(latest)
+        return is_stopped
 
     def report_light(progress: Progress) -> bool:
         return report(replace(latest, stage=progress.stage, preview=None))  # with the figures of the training
 
     avatar = prepared.train(report_training)
-    lines = [*report_run(prepared.folder), *_light_of(prepared, avatar, report_light), f"avatar: {avatar}"]
+    # Whoever stops a training does not wait for the light; `stga relight` finds it out later.
+    light = () if is_stopped else _light_of(prepared, avatar, report_light)
+    lines = [*report_run(prepared.folder), *light, f"avatar: {avatar}"]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
     return Written(avatar, tuple(lines))
