@@ -61,10 +61,15 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     archive.writestr(entry, data)
 
 
+def wheel_folder(target: Target) -> Path:
+    """Where the wheels of a complete edition lie: not in `wheels`, all of which Blender's own build takes."""
+    return ROOT / "build/wheels" / target.name
+
+
 def edition_wheels(folder: Path, edition: Edition) -> list[Path]:
     """The wheels of an edition in `folder`, downloaded where they are missing. Raises StgaError where pip fails."""
     if edition.target is not None:
-        return collect_wheels(ROOT / "build/wheels" / edition.target.name, edition.target)
+        return collect_wheels(wheel_folder(edition.target), edition.target)
     fetch_wheels(folder)
     return [folder / name for name in WHEELS]
 

@@ -16,7 +16,7 @@ from capture.factory import write_flame_capture
 
 from stga_addon.capture.flame_capture import OWN_MODELS
 from stga_addon.development.editions import complete
-from stga_addon.development.package import ROOT, build_zip
+from stga_addon.development.package import build_zip, wheel_folder
 from stga_addon.development.wheels import Target, check_wheels, collect_wheels, this_platform
 from stga_addon.errors import StgaError
 from stga_addon.perform.perform import perform
@@ -88,9 +88,8 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def archive(target: Target, demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = ROOT / "wheels" / target.name
     try:
-        check_wheels(collect_wheels(folder, target), target)
+        check_wheels(collect_wheels(wheel_folder(target), target), target)
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
     return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo)
@@ -136,7 +135,7 @@ def test_bundled_wheels_are_unmodified(archive: Path, target: Target) -> None:
     with zipfile.ZipFile(archive) as made:
         names = {name for name in made.namelist() if name.startswith("wheels/")}
         for name in names:
-            assert made.read(name) == (ROOT / "wheels" / target.name / Path(name).name).read_bytes()
+            assert made.read(name) == (wheel_folder(target) / Path(name).name).read_bytes()
         manifest = made.read("blender_manifest.toml").decode()
     assert names
     assert all(f'"./{name}"' in manifest for name in names)
