@@ -1,0 +1,87 @@
+"""How well a head looks that is driven by another person's motion, against images of that head in the same poses.
+
+    python benchmarks/driving_images.py RUN CAPTURE OTHER [--pictures FOLDER]
+
+CAPTURE and OTHER are two people tracked with FLAME who do the same, timestep by timestep: both rendered by a path
+tracer from the same weights of expressions, then tracked. RUN was trained on CAPTURE. Prints PSNR inside the head mask
+of CAPTURE's left-out timesteps (left-out views where it has none), mean over views: driven by its own parameters, and
+by OTHER's in several ways, each with CAPTURE's own head pose, and how much that is below its own.
+"""
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.driving.open_motion import MotionOptions, adapted
+from stga_addon.driving.transfer import PART_FIELDS, trained_range
+from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.sequence import sequence_mesh
+from stga_addon.render.render import render_avatar
+from stga_addon.training.evaluate.evaluation_views import read_evaluation_view
+from stga_addon.training.evaluate.metrics import psnr
+
+WAYS = {
+    "coefficients copied": MotionOptions(),
+    "relative to the first frame": MotionOptions(neutral="first"),
+    "relative to the quiet face": MotionOptions(neutral="quiet"),
+    "relative to the first frame, half led back": MotionOptions(neutral="first", stay_trained=0.5),
+}
+
+Frames = Mapping[int, FlameFrame]
+
+
+def driven(capture: Capture, other: Capture, options: MotionOptions) -> Frames:
+    """Timestep -> the capture's frame with the other's face, jaw and eyes."""
+    own, theirs = capture.flame, other.flame
+    seen = sorted({view.timestep for view in capture.views["train"]})
+    trained = trained_range([own.frame(timestep) for timestep in seen])
+    frames, _ = adapted([theirs.frame(timestep) for timestep in theirs.timesteps], options, trained)
+    return {
+        timestep: replace(own.frame(timestep), **{name: getattr(frame, name) for name in PART_FIELDS.values()})
+        for timestep, frame in zip(theirs.timesteps, frames, strict=True)
+        if timestep in own.timesteps
+    }
+
+
+def scores(capture: Capture, avatar: Avatar, frames: Frames, pictures: Path | None = None) -> list[float]:
+    """PSNR inside the head mask of each left-out view."""
+    sequence, found = replace(capture.flame, frame=frames.__getitem__), []
+    for view in capture.views.get("test") or capture.views["val"]:
+        truth = read_evaluation_view(capture, view)
+        image = render_avatar(avatar, sequence_mesh(sequence, view.timestep), view.camera)
+        found.append(psnr(image, truth.target, truth.regions["mask"]))
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            pair = np.concatenate([truth.target, np.rint(255 * image.transpose(1, 2, 0)).astype(np.uint8)], axis=1)
+            Image.fromarray(pair).save(pictures / f"{view.timestep}_{view.camera_index}.png")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("other", type=Path)
+    parser.add_argument("--flame", type=Path, help="FLAME file, where the captures hold none")
+    parser.add_argument("--pictures", type=Path)
+    options = parser.parse_args()
+    capture, other = open_capture(options.capture, options.flame), open_capture(options.other, options.flame)
+    avatar = read_avatar(options.run / "avatar.npz")
+    own = {timestep: capture.flame.frame(timestep) for timestep in capture.flame.timesteps}
+    best = np.mean(scores(capture, avatar, own))
+    print(f"| driven by | PSNR dB | below its own |\n|---|---|---|\n| own parameters | {best:.2f} | 0 |", flush=True)
+    for number, (name, motion) in enumerate(WAYS.items()):
+        pictures = None if options.pictures is None else options.pictures / f"way_{number}"
+        found = np.mean(scores(capture, avatar, driven(capture, other, motion), pictures))
+        print(f"| {name} | {found:.2f} | {best - found:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
