@@ -39,7 +39,8 @@ batch, _ = carry_out(tiny_plan(Path(sys.argv[2]), iterations=100), engine)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
 NODES = """
-import random, sys, threading
+import random, sys
+from concurrent.futures import ThreadPoolExecutor, wait
 sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tests"]
 from pathlib import Path
 from ray.cluster_utils import Cluster
@@ -53,24 +54,18 @@ kills, seeds, size = int(sys.argv[3]), int(sys.argv[4]), {"num_cpus": 1, "object
 cluster = Cluster(initialize_head=True, head_node_args={**size, "num_cpus": 0})
 nodes = [cluster.add_node(**size) for _ in range(2)]
 plan = tiny_plan(Path(sys.argv[2]), seeds, iterations=int(sys.argv[5]))
-chance, ended, killed = random.Random(5), threading.Event(), []
-
-def kill():
-    while len(killed) < kills and not ended.wait(chance.uniform(0.5, 2)):
+chance, killed, engine = random.Random(5), 0, make_engine("ray", cluster.address)
+with ThreadPoolExecutor(1) as pool:
+    running = pool.submit(carry_out, plan, engine)
+    # In this thread: a node sets a signal handler, which only the main thread can.
+    while killed < kills and not wait([running], chance.uniform(0.5, 2)).done:
         if any(is_locked(job.request_folder / LOCK_FILE) for job in plan.jobs):
-            node = nodes.pop(0)
-            cluster.remove_node(node, allow_graceful=False)
-            killed.append(node)
+            cluster.remove_node(nodes.pop(0), allow_graceful=False)
+            killed += 1
             nodes.append(cluster.add_node(**size))
-
-engine = make_engine("ray", cluster.address)
-thread = threading.Thread(target=kill)
-thread.start()
-batch, said = carry_out(plan, engine)
-ended.set()
-thread.join()
+    batch, said = running.result()
 cluster.shutdown()
-print(len(killed), "nodes killed", flush=True)
+print(killed, "nodes killed", flush=True)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
 KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
