@@ -20,8 +20,8 @@ from .conftest import Head, make_head, show
 from .test_page import SNAPSHOT, difference, picture
 from .web_data import read_web_data
 
-MIN_PSNR = 50.0
-"""Of relit pictures, quantized, against the renderer's."""
+MIN_PSNR = 55.0
+"""Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between skin and skin."""
 SUN = {"toward": [0.5, 0.6, 0.62], "color": [2.4, 2.1, 1.6]}
 COLORS = """(() => {
   const { gl, lightPass } = document.querySelector('stga-avatar').player;
@@ -84,11 +84,9 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
         shown = picture(browser, frame)
         found = np.reshape(browser.evaluate(COLORS), (-1, 4))[:, :3]
         error = np.abs(found - colors[order]).max(1)
-        print(frame, options, np.quantile(error, [0.5, 0.9, 0.99, 1]))
         assert np.quantile(error, 0.5) < (0.002 if exact else 0.006)
         assert np.quantile(error, 0.95) < (0.02 if exact else 0.03)
         expected = to_uint8(render_colors(head.avatar, head.meshes[frame], head.camera, colors))
-        print(difference(shown, expected))
         assert difference(shown, expected) >= MIN_PSNR
     assert browser.errors == []
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
@@ -156,9 +154,13 @@ def test_light_controls(browser, tmp_path):
         left, right = np.hsplit(np.where(covered, levels.mean(2), 0), 2)
         return float(right.sum() / np.hsplit(covered, 2)[1].sum() / (left.sum() / np.hsplit(covered, 2)[0].sum()))
 
-    box = browser.evaluate(
-        "(({ left, top, width }) => [left, top, width])(document.getElementById('light-pad').getBoundingClientRect())"
-    )
+    box = browser.evaluate("""(() => {
+      document.getElementById('panel').hidden = false;
+      const pad = document.getElementById('light-pad');
+      pad.scrollIntoView({ block: 'center' });
+      const { left, top, width } = pad.getBoundingClientRect();
+      return [left, top, width];
+    })()""")
     shares = []
     for x in (0.15, 0.85):
         at = {"x": box[0] + x * box[2], "y": box[1] + 0.5 * box[2], "button": "left", "clickCount": 1}
@@ -166,6 +168,7 @@ def test_light_controls(browser, tmp_path):
         browser.send("Input.dispatchMouseEvent", type="mouseReleased", **at)
         shares.append(side_of_light())
     assert shares[1] > 1.2 * shares[0]
+    browser.evaluate("document.getElementById('panel').hidden = true")
     before = browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()")
     for kind, x in (("mousePressed", 200), ("mouseMoved", 100), ("mouseReleased", 100)):
         browser.send(
