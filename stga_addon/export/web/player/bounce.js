@@ -22,6 +22,7 @@ export class Bounce {
       if (occlusion[faces[c]] > MIN_OPEN) this.weight[faces[c]] += areas[Math.floor(c / 3)];
     }
     this.cell = new Int32Array(occlusion.length);
+    this.cells = 0;
     /** Cells between neighbors along x, y and z; the outermost cells are empty. */
     this.strides = this.placeInCells(neutral);
     this.sumOfWeights = this.around(this.weight);
@@ -51,14 +52,17 @@ export class Bounce {
    * @param {ArrayLike<number>} values
    */
   around(values) {
-    let total = new Float64Array(this.cells ?? 0);
-    for (let v = 0; v < values.length; v++) total[this.cell[v]] += values[v];
+    const { cell } = this;
+    let total = new Float64Array(this.cells);
+    for (let v = 0; v < cell.length; v++) total[cell[v]] += values[v];
     for (const stride of this.strides) {
       const sum = new Float64Array(total.length);
       for (let k = stride; k < total.length - stride; k++) sum[k] = total[k - stride] + total[k] + total[k + stride];
       total = sum;
     }
-    return Float64Array.from(this.cell, (cell) => total[cell]);
+    const found = new Float64Array(cell.length);
+    for (let v = 0; v < cell.length; v++) found[v] = total[cell[v]];
+    return found;
   }
 
   /**

@@ -177,7 +177,6 @@ function checkData(header, arrays) {
     };
     for (const [name, shape] of Object.entries(shapesOfLight)) shapesOf[`light_${name}`] = shape;
     require(header.light.damping >= 0 && header.light.damping <= 1, 'light');
-    require(arrays.light_irradiance?.values.every((value) => value >= 0), 'light_irradiance');
   }
   if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
   for (const [name, shape] of Object.entries(shapesOf)) checkArray(arrays, name, shape);
