@@ -170,10 +170,10 @@ def seen_points(head) -> tuple[np.ndarray, np.ndarray]:
     view = bpy.context.scene.camera.matrix_world
     across, up, back = (view.to_3x3() @ Vector(axis) for axis in np.eye(3))
     points, normals = np.full((2, SIDE_PX, SIDE_PX, 3), np.nan)
-    offsets = ((np.arange(SIDE_PX) + 0.5) / SIDE_PX - 0.5) * WIDTH_M
-    for row, y in enumerate(-offsets):
+    offsets = (((np.arange(SIDE_PX) + 0.5) / SIDE_PX - 0.5) * WIDTH_M).tolist()
+    for row, y in enumerate(offsets):
         for column, x in enumerate(offsets):
-            place, normal, _, _ = tree.ray_cast(view.translation + x * across + y * up, -back)
+            place, normal, _, _ = tree.ray_cast(view.translation + x * across - y * up, -back)
             if place is not None:
                 points[row, column], normals[row, column] = place, normal
     return points, normals
