@@ -24,7 +24,7 @@ const RANGES = {
 
 export class LightControls {
   /**
-   * Fill `section` for an avatar that is loaded.
+   * Fill and show `section` for an avatar whose light is known.
    * @param {HTMLElement} section
    * @param {StgaAvatar} avatar
    */
@@ -38,7 +38,7 @@ export class LightControls {
     this.pad = /** @type {HTMLElement} */ (section.querySelector('#light-pad'));
     this.color = /** @type {HTMLInputElement} */ (section.querySelector('input[type="color"]'));
     this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
-    section.hidden = !avatar.hasLight;
+    section.hidden = false;
     this.addKinds();
     this.rows = Object.entries(RANGES).map(([name, range]) => this.addRange(section, name, range));
     this.color.addEventListener('input', () => this.apply());
@@ -72,7 +72,7 @@ export class LightControls {
    */
   addRange(section, name, { label, kinds, low, high, value, format }) {
     const row = document.createElement('label');
-    row.className = 'slider range';
+    row.className = 'range';
     row.innerHTML = '<span></span><output></output><input type="range" step="any">';
     const [text, output, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([...row.children]);
     text.textContent = label;

@@ -442,7 +442,7 @@ function start() {
   addTransport();
   addViews();
   addBackgrounds();
-  new LightControls(byId('light'), avatar);
+  if (avatar.hasLight) new LightControls(byId('light'), avatar);
   addFaceShapes();
   addExpressions();
   addPose();
