@@ -20,6 +20,7 @@ from ..report.preset_timing import time_presets
 from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
+from ..training.effects.catalog import RELIGHT
 from ..training.effects.decisions import TRACKING
 from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from ..training.optimize.flame_refinement import with_refined_tracking
@@ -95,6 +96,8 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
 
 def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
     """Write the light of the capture into the avatar; what there is to say about it, or why there is none."""
+    if any(decision.effect == RELIGHT and not decision.on for decision in prepared.run.effect_plan):
+        return ("light: not estimated (the effect relight is off); `stga relight RUN` estimates it",)
     try:
         return add_light(avatar, with_refined_tracking(prepared.capture, prepared.folder), report=report)
     except StgaError as error:  # an avatar without it is whole

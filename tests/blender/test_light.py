@@ -11,13 +11,14 @@ pytest.importorskip("numba")
 pytest.importorskip("trimesh")
 
 from mathutils import Matrix, Vector  # noqa: E402
+from mathutils.bvhtree import BVHTree  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from light.scenes import lit_avatar  # noqa: E402
 
 from stga_addon.light.lamps import Lamps  # noqa: E402
-from stga_addon.light.shadows import LIFT_M  # noqa: E402
+from stga_addon.light.shadows import LIFT_M, ShadowMap  # noqa: E402
 from stga_addon.light.surface import vertex_normals  # noqa: E402
 from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
@@ -27,6 +28,9 @@ from stga_addon.scene.layers import Relit  # noqa: E402
 from stga_addon.scene.light import settings  # noqa: E402
 from stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+
+from .exr import read_exr  # noqa: E402
+from .test_other_engines import EEVEE, EEVEE_MARKS  # noqa: E402
 
 TURN = Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized())
 PLACE = Matrix.LocRotScale(Vector((0.4, -0.2, 0.3)), TURN, (1.3,) * 3)
@@ -93,11 +97,8 @@ def light_irradiance(found: Relit) -> np.ndarray:
     return (lamps.irradiance(found.mesh + LIFT_M * normals, normals) + world)[:BALL]
 
 
-def baked_irradiance(shown, head) -> np.ndarray:
-    """(BALL, 3) by Cycles: direct light on white, diffuse vertices."""
-    shown.hide_render = True  # splats shine themselves
-    scene = bpy.context.scene
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
+def whiten(head) -> None:
+    """Let the head's mesh be seen in images, white and diffuse."""
     head.hide_set(False)
     head.hide_render = False
     material = bpy.data.materials.new("white")
@@ -107,6 +108,14 @@ def baked_irradiance(shown, head) -> np.ndarray:
     white.inputs[0].default_value = (1, 1, 1, 1)
     material.node_tree.links.new(white.outputs[0], out.inputs[0])
     head.data.materials.append(material)
+
+
+def baked_irradiance(shown, head) -> np.ndarray:
+    """(BALL, 3) by Cycles: direct light on white, diffuse vertices."""
+    shown.hide_render = True  # splats shine themselves
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
+    whiten(head)
     head.data.attributes.active_color = head.data.color_attributes.new("baked", "FLOAT_COLOR", "POINT")
     for each in bpy.context.selected_objects:
         each.select_set(False)
@@ -145,6 +154,93 @@ def test_irradiance_is_that_of_cycles(name):
     error = np.abs(arriving - expected).mean() / expected.mean()
     print(f"{name}: {arriving.mean() / expected.mean() - 1:.1%}, each vertex {error:.1%}")
     assert error < 0.1
+
+
+SIDE_PX, WIDTH_M = 512, 0.34
+MIN_FACING = 0.25
+"""Cosine towards the light of surface whose shadows count: beyond, it shades itself gradually."""
+
+
+def seen_points(head) -> tuple[np.ndarray, np.ndarray]:
+    """What the scene's orthographic camera sees of the head in each pixel: points (H, W, 3) and normals in the world;
+    NaN where there is none."""
+    mesh = head.data
+    corners = [PLACE @ vertex.co for vertex in mesh.vertices]
+    tree = BVHTree.FromPolygons(corners, [tuple(polygon.vertices) for polygon in mesh.polygons])
+    view = bpy.context.scene.camera.matrix_world
+    across, up, back = (view.to_3x3() @ Vector(axis) for axis in np.eye(3))
+    points, normals = np.full((2, SIDE_PX, SIDE_PX, 3), np.nan)
+    offsets = (((np.arange(SIDE_PX) + 0.5) / SIDE_PX - 0.5) * WIDTH_M).tolist()
+    for row, y in enumerate(offsets):
+        for column, x in enumerate(offsets):
+            place, normal, _, _ = tree.ray_cast(view.translation + x * across - y * up, -back)
+            if place is not None:
+                points[row, column], normals[row, column] = place, normal
+    return points, normals
+
+
+def edges(shadow: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(N, 2) pixels beside which lies one that is shadowed otherwise, where both count."""
+    across = (shadow[:, 1:] != shadow[:, :-1]) & counts[:, 1:] & counts[:, :-1]
+    down = (shadow[1:] != shadow[:-1]) & counts[1:] & counts[:-1]
+    return np.concatenate([np.argwhere(across) + np.array([0, 0.5]), np.argwhere(down) + np.array([0.5, 0])])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "location", "energy"), [("SUN", (1.0, -1.2, 1.4), 3.0), ("POINT", (0.9, -0.9, 0.9), 30.0)]
+)
+def test_edges_of_shadows_are_those_of_cycles(kind, location, energy, tmp_path):
+    """Catches shadows that are shifted or torn off by lift and bias: edges beyond 2 pixels of 512 from the path
+    tracer's."""
+    shown, head = shown_head()
+    lamp(kind, location, energy, **({"angle": 0.0} if kind == "SUN" else {"shadow_soft_size": 0.0}))
+    scene = bpy.context.scene
+    camera = bpy.data.cameras.new("camera")
+    camera.type, camera.ortho_scale = "ORTHO", WIDTH_M
+    scene.camera = bpy.data.objects.new("camera", camera)
+    scene.collection.objects.link(scene.camera)
+    scene.camera.location = PLACE.translation + Vector((0.6, -1.6, 0.6))
+    scene.camera.rotation_euler = (scene.camera.location - PLACE.translation).to_track_quat("Z", "Y").to_euler()
+    found = relit()
+    points, normals = seen_points(head)
+    toward = np.array(location) - (points if kind == "POINT" else np.array(PLACE.translation))
+    facing = (normals * toward).sum(2) / np.linalg.norm(toward, axis=-1)
+    counts = facing > MIN_FACING
+
+    into = np.linalg.inv(np.array(PLACE))
+    inside = points[counts] @ into[:3, :3].T + into[:3, 3]
+    turned = normals[counts] @ np.array(TURN)
+    lit = np.zeros(counts.shape)
+    depths = ShadowMap(found.mesh, found.relighter.avatar.faces, found.lighting.lights[0])
+    lit[counts] = depths.lit(inside + LIFT_M * turned, normals=turned)
+    expected = path_traced(shown, head, tmp_path / "image.exr") / np.maximum(facing, MIN_FACING)
+    ours, theirs = edges(lit < 0.5, counts), edges(expected < np.nanmax(expected[counts]) / 4, counts)
+    assert len(theirs) > 100
+    apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
+    one, other = apart.min(0), apart.min(1)
+    print(
+        f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f} and {other.mean():.2f} px, 95 % "
+        f"{np.quantile(one, 0.95):.2f} and {np.quantile(other, 0.95):.2f} px"
+    )
+    assert max(one.mean(), other.mean()) < 2
+
+
+def path_traced(shown, head, path: Path) -> np.ndarray:
+    """(H, W) green radiance of the head in white by Cycles, direct light without noise."""
+    shown.hide_render = True
+    whiten(head)
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+    scene.cycles.max_bounces, scene.cycles.pixel_filter_type = 0, "BOX"
+    scene.cycles.filter_width = 0.01
+    scene.render.resolution_x = scene.render.resolution_y = SIDE_PX
+    scene.render.image_settings.file_format, scene.render.image_settings.exr_codec = "OPEN_EXR", "NONE"
+    scene.render.image_settings.color_depth, scene.view_settings.view_transform = "32", "Raw"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    channels = read_exr(path)
+    return next(values for name, values in channels.items() if name.split(".")[-1] == "G")
 
 
 def sky(size: tuple[int, int] = (64, 32)):
@@ -256,8 +352,9 @@ def test_light_is_kept_in_the_file():
     assert (found.residual, found.damping, found.source) == (expected.residual, expected.damping, expected.source)
 
 
-def test_shadow_onto_the_scene(tmp_path):
-    """Catches a head that is seen in Cycles where it should only throw its shadow, and a shadow that is missing."""
+@pytest.mark.parametrize("engine", ["CYCLES", pytest.param(EEVEE, marks=EEVEE_MARKS)])
+def test_shadow_onto_the_scene(engine, tmp_path):
+    """Catches a head that is seen where it should only throw its shadow, and a shadow that is missing."""
     shown, head = shown_head()
     lamp("SUN", (0.4, -0.2, 2.0), 3.0)
     bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))
@@ -265,7 +362,8 @@ def test_shadow_onto_the_scene(tmp_path):
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.camera.location = (0.4, -0.2, 3.0)
     scene.collection.objects.link(scene.camera)
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 4, False
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = engine, 4, False
+    scene.eevee.taa_render_samples = 16
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.view_settings.view_transform = "Raw"
     set_input(shown, PERCENTAGE, 0.0)

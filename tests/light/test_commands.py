@@ -57,6 +57,17 @@ def test_a_run_ends_with_its_light(run: Path, capsys: pytest.CaptureFixture[str]
     assert "stga relight" in capsys.readouterr().out
 
 
+def test_a_training_that_is_to_leave_light_as_it_is(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches an effect that cannot be switched off, and a plan that does not name it."""
+    assert main(["info", str(root), "--effect", "relight=off"]) == 0
+    assert "lights of a scene" in capsys.readouterr().out
+    arguments = ["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2"]
+    assert main([*arguments, "--effect", "relight=off"]) == 0
+    assert read_avatar(tmp_path / "run/avatar.npz").light is None
+
+
 def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> None:
     """Catches a card that is ignored: twice the light is half the albedo."""
     copy = tmp_path / "run"

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...avatar.embedding import face_frames
 from ...avatar.file import Avatar
+from ...avatar.light import AvatarLight
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...flame.quaternions import normalized
@@ -34,6 +35,12 @@ OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
 
 Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
 along an axis at most, where half of POSITION_STEP_M is 2 µm."""
+TRANSFER_STEP = 2.0**-12
+"""Of irradiance over radiance, which is at most π."""
+SHARE_STEP = 1 / 255
+"""Of ambient occlusion and roughness."""
+IRRADIANCE_STEPS = 65535
+"""Steps to the largest irradiance of the capture, whose level is any."""
 VERTEX_STEP_M = 2.0**-24
 """Of base and neutral mesh: so fine that no thin triangle becomes a line, or the reverse."""
 BASIS_STEP_M = 2e-6
@@ -52,7 +59,7 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     splats = avatar.splats.rows(order)
     unit = _local_unit(avatar)
     arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
-    arrays |= _rig_arrays(rig)
+    arrays |= _rig_arrays(rig) | _light_arrays(avatar.light)
     controls = playback.controls if rig.expressions else None
     if controls is not None:
         arrays["shape_linear"] = controls.linear.astype(np.float32)
@@ -76,6 +83,7 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
         "parents": list(rig.parents),
         "sliders": _sliders(rig),
         **_shapes(playback.controls if rig.expressions else None),
+        **({} if avatar.light is None else {"light": {"damping": avatar.light.damping}}),
         "views": [_view(name, camera) for name, camera in playback.views.items()],
     }
 
@@ -148,6 +156,20 @@ def _driven_arrays(avatar: Avatar, local_unit: float) -> Arrays:
             raise ValueError(f"the web player has no driven offset {name}")
         arrays[name] = FixedPoint(coefficients.reshape(rows), OFFSET_STEPS_M[name] / local_unit)
     return arrays
+
+
+def _light_arrays(light: AvatarLight | None) -> Arrays:
+    """How the vertices receive light, and what the capture's light gave them: from that and the recorded colors, the
+    player finds out the albedo of the splats."""
+    if light is None:
+        return {}
+    largest = float(light.irradiance.max(initial=1e-6))
+    return {
+        "light_transfer": FixedPoint(light.transfer, TRANSFER_STEP),
+        "light_occlusion": FixedPoint(light.occlusion, SHARE_STEP),
+        "light_irradiance": FixedPoint(light.irradiance, largest / IRRADIANCE_STEPS),
+        "light_roughness": FixedPoint(light.roughness, SHARE_STEP),
+    }
 
 
 def _mesh_arrays(avatar: Avatar, splats: Splats) -> Arrays:

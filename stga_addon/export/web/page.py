@@ -19,14 +19,23 @@ MODULES = (
     "rig.js",
     "face_frames.js",
     "depth_sort.js",
+    "harmonics.js",
+    "lighting.js",
+    "bounce.js",
+    "surface.js",
     "shaders.js",
-    "renderer.js",
+    "light_shaders.js",
+    "gl.js",
     "camera.js",
+    "light_pass.js",
+    "renderer.js",
     "player.js",
     "controls.js",
     "stga-avatar.js",
 )
 """Modules of the custom element, each after those that it imports."""
+PAGE_MODULES = "light_controls.js", "page.js"
+"""Those of the page around it."""
 IMPORT = re.compile(r"^import\b[^;]*?'\./[\w-]+\.js';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
 TYPES = re.compile(
@@ -56,7 +65,7 @@ def page(title: str, notice: str, data: bytes) -> str:
         "title": html.escape(title),
         "notice": html.escape(notice),
         "style": (PLAYER / "page.css").read_text(encoding="utf-8"),
-        "script": element_script() + "\n" + _source("page.js"),
+        "script": "\n".join((element_script(), *map(_source, PAGE_MODULES))),
         "data": base64.b64encode(data).decode("ascii"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)

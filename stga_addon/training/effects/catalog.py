@@ -23,6 +23,8 @@ class Effect:
     added_later: bool = False
 
 
+RELIGHT = "relight"
+"""The light of the capture is estimated after training, so that the lights of a scene can take its place."""
 _EFFECTS = (
     Effect(
         "view-color",
@@ -68,6 +70,7 @@ _EFFECTS = (
         offset="strain_position",
         added_later=True,
     ),
+    Effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
     Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
     Effect("neck", "9 shape keys and drivers in Blender"),
     Effect("jaw", "9 shape keys and drivers in Blender"),

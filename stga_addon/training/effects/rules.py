@@ -188,6 +188,10 @@ def _dependent(what: str, unseen: Evidence, known: Evidence | None) -> Verdict:
     return Verdict(gain >= MIN_STRAIN_DEPENDENCE_LEVELS, reason)
 
 
+def relight(facts: CaptureFacts) -> Verdict:
+    return Verdict(True, "the lights of a scene that has any light the avatar; elsewhere colors stay as recorded")
+
+
 def teeth(facts: CaptureFacts) -> Verdict | None:
     if not facts.has_teeth:
         return None
@@ -241,7 +245,7 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
 
 _RULES: tuple[Rule, ...] = (
     view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection, strain_color,
-    strain_position, teeth, neck, jaw, eyes, dynamic_offsets, tracking,
+    strain_position, relight, teeth, neck, jaw, eyes, dynamic_offsets, tracking,
 )  # fmt: skip
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
 """Effect -> its rule, a function of that name."""

@@ -190,6 +190,10 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
     "other data": (lambda page: re.sub(DATA, "AAAA", page), "This is not an avatar data file."),
     "cut at the data": (lambda page: cut(page, 'id="data">'), "This page holds no avatar data."),
     "cut in the data": (lambda page: cut(page, 'id="data">', 40_000), "The avatar data is damaged."),
+    "light without its arrays": (
+        lambda page: with_header(page, "light", value={"damping": 0.5}),
+        "The avatar data is damaged: light_transfer is missing or malformed.",
+    ),
     "cut to odd base64": (lambda page: cut(page, 'id="data">', 40_001), "The avatar data is damaged."),
     **{
         f"{keys} {value}": (
@@ -209,6 +213,7 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
             (("fps",), 1e300),
             (("fps",), True),
             (("title",), 5),
+            (("light",), {"damping": 2}),
         ]
     },
 }

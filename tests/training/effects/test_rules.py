@@ -11,7 +11,7 @@ from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
 from stga_addon.training.effects import rules
-from stga_addon.training.effects.catalog import EFFECTS
+from stga_addon.training.effects.catalog import EFFECTS, RELIGHT
 from stga_addon.training.effects.decisions import parse_choices
 from stga_addon.training.effects.evidence import fit_cameras, stable_colors
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
@@ -31,7 +31,8 @@ def planned(capture, **choices):
 
 
 def on(plan):
-    return {name for name, decision in plan.items() if decision.on}
+    """Effects that this capture calls for; `relight` is left to the scene that shows the avatar."""
+    return {name for name, decision in plan.items() if decision.on and name != RELIGHT}
 
 
 def gains(decision):
@@ -45,6 +46,7 @@ def test_plain(painted):
     plan, settings = planned(painted())
     assert on(plan) == {"antialiasing", "background", "density"}
     assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
+    assert plan[RELIGHT].on
     assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}  # there is no FLAME
 
 

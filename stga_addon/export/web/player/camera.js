@@ -126,6 +126,18 @@ export function dollied(camera, pivot, factor) {
 }
 
 /**
+ * A direction turned with what faces the camera: `yaw` moves that to the right, `pitch` down (radians).
+ * @param {Camera} camera
+ * @param {Vector} direction
+ * @param {number} yaw
+ * @param {number} pitch
+ * @returns {Vector}
+ */
+export function turnedAsSeen(camera, direction, yaw, pitch) {
+  return rotatedAbout(rotatedAbout(direction, row(camera.matrix, 1), -yaw), row(camera.matrix, 0), pitch);
+}
+
+/**
  * Rotate about a world axis through `pivot`, which stays where it is in the picture.
  * @param {Camera} camera
  * @param {Vector} pivot

@@ -6,7 +6,7 @@
  * @typedef {[number, number]} Point pixels of the page
  */
 
-import { dollied, orbited, panned } from './camera.js';
+import { dollied, orbited, panned, turnedAsSeen } from './camera.js';
 
 const ORBIT_PER_PIXEL = 0.008; // radians
 const ZOOM_PER_WHEEL_PIXEL = 0.0012;
@@ -14,12 +14,14 @@ const WHEEL_LINE_PX = 16;
 const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 
 /**
- * Let pointers on `element` move the camera of the player that `player()` gives; `changed()` after each move.
+ * Let pointers on `element` move the camera of the player that `player()` gives, and with Alt its sun; `changed()` after
+ * each move of the camera, `lit()` after each of the sun.
  * @param {HTMLElement} element
  * @param {() => Player | null} player
  * @param {() => void} changed
+ * @param {() => void} lit
  */
-export function addControls(element, player, changed) {
+export function addControls(element, player, changed, lit) {
   /** @type {Map<number, Point>} */
   const pointers = new Map();
   element.addEventListener('contextmenu', (event) => event.preventDefault());
@@ -36,6 +38,11 @@ export function addControls(element, player, changed) {
     const before = [...pointers.values()];
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
     const after = [...pointers.values()];
+    if (event.altKey && after.length === 1 && shown.lighting?.sun) {
+      turnSun(shown, before[0], after[0]);
+      lit();
+      return;
+    }
     if (after.length === 1) drag(shown, element, before[0], after[0], event.shiftKey || event.buttons > 1);
     else pinch(shown, element, before, after);
     changed();
@@ -63,6 +70,20 @@ export function addControls(element, player, changed) {
 function orbitBy(player, dx, dy) {
   const { up } = player.data.header;
   player.camera = orbited(player.camera, player.pivot, up, -dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
+}
+
+/**
+ * Move the light over the head as the pointer goes.
+ * @param {Player} player
+ * @param {Point} before
+ * @param {Point} after
+ */
+function turnSun(player, before, after) {
+  const [yaw, pitch] = [after[0] - before[0], after[1] - before[1]].map((pixels) => pixels * ORBIT_PER_PIXEL);
+  const { lighting, camera } = player;
+  if (!lighting?.sun) return;
+  const toward = turnedAsSeen(camera, lighting.sun.toward, yaw, pitch);
+  player.lighting = { ...lighting, sun: { ...lighting.sun, toward } };
 }
 
 /**

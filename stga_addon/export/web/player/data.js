@@ -168,6 +168,16 @@ function checkData(header, arrays) {
     require(moved <= shapes, 'shape_products');
     Object.assign(shapesOf, { shape_linear: [controls, moved + 9], shape_products: [controls, moved] });
   }
+  if (header.light) {
+    const shapesOfLight = {
+      transfer: [vertices, 9],
+      occlusion: [vertices],
+      irradiance: [vertices, 3],
+      roughness: [vertices],
+    };
+    for (const [name, shape] of Object.entries(shapesOfLight)) shapesOf[`light_${name}`] = shape;
+    require(header.light.damping >= 0 && header.light.damping <= 1, 'light');
+  }
   if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
   for (const [name, shape] of Object.entries(shapesOf)) checkArray(arrays, name, shape);
   require(!arrays.sh || [9, 24, 45].includes(arrays.sh.shape[1]), 'sh');

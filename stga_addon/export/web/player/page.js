@@ -13,6 +13,7 @@
  */
 
 import { DataError } from './data.js';
+import { LightControls } from './light_controls.js';
 import { StgaAvatar } from './stga-avatar.js';
 
 const SLIDERS_SHOWN = 8;
@@ -441,6 +442,7 @@ function start() {
   addTransport();
   addViews();
   addBackgrounds();
+  if (avatar.hasLight) new LightControls(byId('light'), avatar);
   addFaceShapes();
   addExpressions();
   addPose();

@@ -1,13 +1,16 @@
 // @ts-check
 // One avatar on one canvas: follows motion and camera, and draws when something has changed.
 
-/** @import { Camera, Color, Data } from './types.js' */
+/** @import { Camera, Color, Data, Lighting } from './types.js' */
 
 import { cameraOfView, fitted, frontCamera, bounds } from './camera.js';
 import { DepthSort } from './depth_sort.js';
 import { FaceFrames } from './face_frames.js';
+import { RendererError } from './gl.js';
+import { LightPass } from './light_pass.js';
+import { litBy } from './lighting.js';
 import { Motion } from './motion.js';
-import { Renderer, RendererError } from './renderer.js';
+import { Renderer } from './renderer.js';
 import { Rig } from './rig.js';
 
 const TIMING_SHARE = 0.1; // of the newest frame in the running mean
@@ -34,6 +37,12 @@ export class Player {
     /** @type {Color} */
     this.background = [...header.background, 1];
     this.showSelection = false;
+    /** @type {Lighting | null} null: as recorded */
+    this.lighting = null;
+    /** @type {LightPass | null} */
+    this.lightPass = null;
+    /** @type {Lighting | null} that the light pass holds, for the pose that it holds */
+    this.lit = null;
     /** @type {number | null} */
     this.posed = null; // frame that faceFrames hold
     this.frame = 0;
@@ -84,6 +93,7 @@ export class Player {
     this.pose();
     const values = this.renderer.frameValues;
     this.faceFrames.compose(camera.matrix, values);
+    this.renderer.lightPass = this.lighting && this.litPass(this.lighting);
     return this.depthSort.sort(values);
   }
 
@@ -94,6 +104,18 @@ export class Player {
     this.faceFrames.update(this.rig.pose(coefficients, pose, translation));
     this.faceFrames.annotate(this.selectionBits(), this.renderer.frameValues);
     this.posed = this.frame;
+    this.lit = null;
+  }
+
+  /**
+   * The light pass for the current pose.
+   * @param {Lighting} lighting
+   */
+  litPass(lighting) {
+    this.lightPass ??= new LightPass(this.gl, this.data);
+    if (this.lit !== lighting) this.lightPass.update(this.rig.vertices, litBy(lighting, this.data.header.up));
+    this.lit = lighting;
+    return this.lightPass;
   }
 
   selectionBits() {
@@ -106,5 +128,6 @@ export class Player {
 
   dispose() {
     this.renderer.dispose();
+    this.lightPass?.dispose();
   }
 }

@@ -1,8 +1,12 @@
 // @ts-check
 // Splats on a WebGL2 canvas: blended back to front into a float target, then over the background.
 
-/** @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js' */
+/**
+ * @import { LightPass } from './light_pass.js'
+ * @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js'
+ */
 
+import { RendererError, bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength, program } from './gl.js';
 import {
   FACE_TEXELS,
   OVER_FRAGMENT_SHADER,
@@ -15,8 +19,6 @@ import {
 } from './shaders.js';
 
 const SH_C0 = 0.28209479177387814;
-
-export class RendererError extends Error {}
 
 export class Renderer {
   /**
@@ -36,11 +38,15 @@ export class Renderer {
     const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
     const strains = arrays.strain_color ? 3 : 0;
     this.splatProgram = program(gl, splatVertexShader(harmonics, strains), SPLAT_FRAGMENT_SHADER);
+    /** @type {Program | null} */
+    this.litProgram = null;
+    /** @type {LightPass | null} where the splats get their colors, if they are not as recorded */
+    this.lightPass = null;
     this.overProgram = program(gl, OVER_VERTEX_SHADER, OVER_FRAGMENT_SHADER);
-    this.splatTexture = texture(gl, gl.RGBA32F, splatTexels(arrays));
-    this.tailTexture = texture(gl, gl.RGBA16F, tailValues(arrays, tailTexels(harmonics, strains)));
+    this.splatTexture = floatTexture(gl, gl.RGBA32F, splatTexels(arrays));
+    this.tailTexture = floatTexture(gl, gl.RGBA16F, tailValues(arrays, tailTexels(harmonics, strains)));
     this.frameValues = new Float32Array(paddedLength(this.faces * FACE_TEXELS));
-    this.frameTexture = texture(gl, gl.RGBA32F, this.frameValues);
+    this.frameTexture = floatTexture(gl, gl.RGBA32F, this.frameValues);
     this.vertexArray = gl.createVertexArray();
     this.indexBuffer = gl.createBuffer();
     this.fillIndexArray();
@@ -75,11 +81,12 @@ export class Renderer {
     const [width, height] = camera.size;
     const target = this.resizedTarget(width, height, format);
     this.upload(order);
+    const colors = this.lightPass?.draw(camera.matrix, this.splatTexture, this.tailTexture, this.frameTexture);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    this.drawSplats(camera, showSelection);
+    this.drawSplats(camera, showSelection, colors);
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.useProgram(this.overProgram.program);
     bindTexture(gl, 0, target.texture, this.overProgram.uniforms.uPicture);
@@ -103,14 +110,16 @@ export class Renderer {
   /**
    * @param {Camera} camera
    * @param {boolean} showSelection
+   * @param {WebGLTexture} [colors] of the light pass; else as recorded
    */
-  drawSplats(camera, showSelection) {
+  drawSplats(camera, showSelection, colors) {
     const gl = this.gl;
-    const { program, uniforms } = this.splatProgram;
-    gl.useProgram(program);
+    if (colors) this.litProgram ??= program(gl, splatVertexShader(0, 0, true), SPLAT_FRAGMENT_SHADER);
+    const { program: used, uniforms } = (colors && this.litProgram) || this.splatProgram;
+    gl.useProgram(used);
     bindTexture(gl, 0, this.frameTexture, uniforms.uFaces);
     bindTexture(gl, 1, this.splatTexture, uniforms.uSplats);
-    bindTexture(gl, 2, this.tailTexture, uniforms.uTail);
+    bindTexture(gl, 2, colors ?? this.tailTexture, colors ? uniforms.uColors : uniforms.uTail);
     const m = camera.matrix;
     // Rows of world to camera are columns of its transpose, camera to world.
     gl.uniformMatrix3fv(uniforms.uToWorld, false, [m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]]);
@@ -167,7 +176,7 @@ export class Renderer {
     for (const item of [this.splatTexture, this.tailTexture, this.frameTexture]) gl.deleteTexture(item);
     gl.deleteBuffer(this.indexBuffer);
     gl.deleteVertexArray(this.vertexArray);
-    for (const item of [this.splatProgram, this.overProgram]) gl.deleteProgram(item.program);
+    for (const item of [this.splatProgram, this.overProgram, this.litProgram]) gl.deleteProgram(item?.program ?? null);
     if (this.target) deleteTarget(gl, this.target);
   }
 }
@@ -220,105 +229,4 @@ function tailValues({ xyz, sh, strain_color }, texels) {
     offset += size;
   }
   return values;
-}
-
-/** @param {number} texels */
-function paddedLength(texels) {
-  return 4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
-}
-
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {string} vertex
- * @param {string} fragment
- * @returns {Program}
- */
-function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
-  /** @type {[number, string][]} */
-  const stages = [
-    [gl.VERTEX_SHADER, vertex],
-    [gl.FRAGMENT_SHADER, fragment],
-  ];
-  for (const [kind, source] of stages) {
-    const shader = gl.createShader(kind);
-    if (!shader) continue; // the context is lost
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    gl.attachShader(made, shader);
-    gl.deleteShader(shader);
-  }
-  gl.bindAttribLocation(made, 0, 'splatIndex');
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
-    const logs = (gl.getAttachedShaders(made) ?? []).map((shader) => gl.getShaderInfoLog(shader));
-    throw new RendererError(`The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`);
-  }
-  /** @type {Program['uniforms']} */
-  const uniforms = {};
-  const count = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) ?? 0;
-  for (let k = 0; k < count; k++) {
-    const name = gl.getActiveUniform(made, k)?.name;
-    if (name) uniforms[name] = gl.getUniformLocation(made, name);
-  }
-  return { program: made, uniforms };
-}
-
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {number} format
- * @param {Float32Array} values
- */
-function texture(gl, format, values) {
-  const height = values.length / (4 * TEXTURE_WIDTH);
-  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-    throw new RendererError('The avatar has more splats than this graphics card can hold.');
-  }
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXTURE_WIDTH, height, 0, gl.RGBA, gl.FLOAT, values);
-  return made;
-}
-
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {number} unit
- * @param {WebGLTexture} bound
- * @param {WebGLUniformLocation | null} [uniform]
- */
-function bindTexture(gl, unit, bound, uniform) {
-  gl.activeTexture(gl.TEXTURE0 + unit);
-  gl.bindTexture(gl.TEXTURE_2D, bound);
-  gl.uniform1i(uniform ?? null, unit);
-}
-
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {number} format
- * @param {number} width
- * @param {number} height
- * @returns {Target}
- */
-function makeTarget(gl, format, width, height) {
-  const made = gl.createTexture();
-  gl.activeTexture(gl.TEXTURE0);
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  const framebuffer = gl.createFramebuffer();
-  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
-  return { texture: made, framebuffer, format, width, height };
-}
-
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {Target} target
- */
-function deleteTarget(gl, target) {
-  gl.deleteFramebuffer(target.framebuffer);
-  gl.deleteTexture(target.texture);
 }

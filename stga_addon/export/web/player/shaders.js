@@ -37,18 +37,19 @@ export function tailTexels(harmonics, strains) {
  * Sum of coefficients times basis functions, unrolled: dynamic indices are slow on many GPUs.
  * @param {number} harmonics
  * @param {number} strains
+ * @param {boolean} [fromView] whether to add what depends on the view
  */
-function tailColor(harmonics, strains) {
+export function tailColor(harmonics, strains, fromView = true) {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
   for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
   const part = (/** @type {number} */ k) => `t${k >> 2}.${'xyzw'[k & 3]}`;
   const triple = (/** @type {number} */ k) => `vec3(${part(3 * k)}, ${part(3 * k + 1)}, ${part(3 * k + 2)})`;
-  if (harmonics) {
+  if (harmonics && fromView) {
     lines.push('vec3 d = normalize(uToWorld * center);');
     lines.push('float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;');
   }
-  for (let k = 0; k < harmonics; k++) lines.push(`color += (${SH[k]}) * ${triple(k)};`);
+  for (let k = 0; k < harmonics && fromView; k++) lines.push(`color += (${SH[k]}) * ${triple(k)};`);
   for (let k = 0; k < strains; k++) lines.push(`color += face.${'xyz'[k]} * ${triple(harmonics + k)};`);
   return lines.join('\n  ');
 }
@@ -57,15 +58,16 @@ function tailColor(harmonics, strains) {
  * The limits and constants are those of the renderer that trained the splats (raster/reference.py).
  * @param {number} harmonics
  * @param {number} strains
+ * @param {boolean} [isLit] whether colors come from the light pass
  */
-export function splatVertexShader(harmonics, strains) {
+export function splatVertexShader(harmonics, strains, isLit = false) {
   return `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
 uniform sampler2D uFaces;
 uniform sampler2D uSplats;
-uniform sampler2D uTail;
+uniform sampler2D ${isLit ? 'uColors' : 'uTail'};
 uniform mat3 uToWorld;
 uniform vec2 uFocal, uCenter, uSize;
 uniform bool uAntialiased, uShowSelection;
@@ -136,7 +138,7 @@ void main() {
   if (uShowSelection && face.w < 0.5) {
     color = vec3(0.25 + 0.4 * dot(color, vec3(0.299, 0.587, 0.114)));
   } else {
-  ${tailColor(harmonics, strains)}
+  ${isLit ? 'color = texelFetch(uColors, texel(splat), 0).rgb;' : tailColor(harmonics, strains)}
   }
   vColor = vec4(max(color, 0.0), opacity);
   gl_Position = vec4(2.0 * pixel.x / uSize.x - 1.0, 1.0 - 2.0 * pixel.y / uSize.y, 0.0, 1.0);

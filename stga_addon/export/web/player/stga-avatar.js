@@ -1,14 +1,15 @@
 // @ts-check
 // <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element (docs/web.md).
 
-/** @import { Camera } from './types.js' */
+/** @import { Camera, Lighting } from './types.js' */
 
 import { cameraOfView } from './camera.js';
 import { addControls } from './controls.js';
 import { DataError, readData } from './data.js';
+import { RendererError } from './gl.js';
+import { litBy } from './lighting.js';
 import { readPerformance } from './performance.js';
 import { Player } from './player.js';
-import { RendererError } from './renderer.js';
 
 const MAX_PIXEL_RATIO = 2;
 const MAX_STEP_S = 0.25; // of playback time between two frames: a hidden tab resumes where it was
@@ -48,6 +49,7 @@ export class StgaAvatar extends HTMLElement {
       this.#canvas,
       () => this.#player,
       () => this.#changed('camerachange'),
+      () => this.#changed('lightchange'),
     );
     this.#canvas.addEventListener('webglcontextlost', (event) => this.#lose(event));
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
@@ -257,6 +259,27 @@ export class StgaAvatar extends HTMLElement {
     return Boolean(this.#player?.data.arrays.selection);
   }
 
+  /** Whether the file knows the light of the capture, so that `lighting` can replace it. */
+  get hasLight() {
+    return Boolean(this.#player?.data.header.light);
+  }
+
+  /**
+   * What lights the avatar (types.d.ts); null: the light that it was recorded in.
+   * @returns {Lighting | null}
+   */
+  get lighting() {
+    return this.#player?.lighting ?? null;
+  }
+
+  set lighting(value) {
+    const player = this.#loaded;
+    if (value && !this.hasLight) throw new RangeError('The light of this avatar is not known.');
+    if (value) litBy(value, player.data.header.up); // throws where it is none
+    player.lighting = value && structuredClone(value);
+    this.#changed('lightchange');
+  }
+
   get splatCount() {
     return this.#player?.data.arrays.xyz.shape[0] ?? 0;
   }
@@ -348,13 +371,14 @@ export class StgaAvatar extends HTMLElement {
   /** Upload everything again, and go on where it was. */
   #restore() {
     if (!this.#player) return;
-    const { camera, pivot, background, showSelection, data, motion } = this.#player;
+    const { camera, pivot, background, showSelection, lighting, data, motion } = this.#player;
     try {
       this.#player = Object.assign(new Player(this.#canvas, data), {
         camera,
         pivot,
         background,
         showSelection,
+        lighting,
         motion,
       });
     } catch (error) {

@@ -50,6 +50,8 @@ export interface Header {
   sliders: Slider[];
   /** Controls that move expressions, jaw and eyes together: one counts up to the weight of another only. */
   shapes?: { names: string[]; opens: string; limited: string };
+  /** How much albedo is drawn to its mean, 0 to 1; where the light of the capture is known. */
+  light?: { damping: number };
   views: View[];
 }
 
@@ -79,6 +81,10 @@ export interface Arrays {
   strain_range?: DataArray;
   shape_linear?: DataArray;
   shape_products?: DataArray;
+  light_transfer?: DataArray;
+  light_occlusion?: DataArray;
+  light_irradiance?: DataArray;
+  light_roughness?: DataArray;
   /** Coefficients of signals (signals.js). */
   [offset: string]: DataArray | undefined;
 }
@@ -94,6 +100,41 @@ export interface Camera {
   focal: [number, number];
   center: [number, number];
   matrix: Float64Array;
+}
+
+/** Unit vector towards a distant light, and what a surface that faces it gets: W/m², linear red, green, blue. */
+export interface Sun {
+  toward: Vector;
+  color: Vector;
+}
+
+/** What lights the avatar, in the axes of its meshes. Radiance 1 from everywhere shows albedo as it is. */
+export interface Lighting {
+  /** Radiance from everywhere, linear red, green, blue. */
+  even?: Vector;
+  /** A built-in environment, turned about the upward axis by `turn` radians. */
+  environment?: string;
+  turn?: number;
+  /** Nine spherical harmonics of radiance, red, green, blue of each (harmonics.js). */
+  harmonics?: number[];
+  /** Throws shadows; takes the place of the environment's sun. */
+  sun?: Sun;
+  /** Stops. */
+  exposure?: number;
+}
+
+export interface Environment {
+  label: string;
+  even: Vector;
+  lobes: Sun[];
+  sun?: Sun;
+}
+
+/** Lighting as the player computes with it. */
+export interface LitBy {
+  world: Float64Array;
+  sun: Sun | null;
+  factor: number;
 }
 
 /** Red, green, blue and alpha, 0 to 1. */

@@ -1,0 +1,185 @@
+"""The page's light in a real browser: colors and pictures against the Python renderer, and the controls."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.light import AvatarLight
+from stga_addon.development.browser import Browser
+from stga_addon.export.playback import Playback
+from stga_addon.export.web.data_file import data_file
+from stga_addon.light.bounce import Bounce
+from stga_addon.light.harmonics import rotated, uniform
+from stga_addon.light.relight import Relighter
+from stga_addon.light.transfer import transfer_of
+from stga_addon.light.values import Light, Lighting
+from stga_addon.render.render import render_colors, to_uint8
+
+from .conftest import Head, make_head, show
+from .test_page import SNAPSHOT, difference, picture
+from .web_data import read_web_data
+
+MIN_PSNR = 55.0
+"""Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between skin and skin."""
+SUN = {"toward": [0.5, 0.6, 0.62], "color": [2.4, 2.1, 1.6]}
+COLORS = """(() => {
+  const { gl, lightPass } = document.querySelector('stga-avatar').player;
+  const { framebuffer, width, height } = lightPass.colors;
+  const values = new Float32Array(4 * width * height);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  return Array.from(values.subarray(0, 4 * lightPass.surface.count));
+})()"""
+
+
+def lit_head(damping: float = 0.0, **options: object) -> Head:
+    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes."""
+    head = make_head(**options)  # type: ignore[arg-type]
+    neutral, faces = head.avatar.neutral.astype(np.float64), head.avatar.faces
+    transfer, occlusion = transfer_of(neutral, faces, 48)
+    radiance = uniform((0.5, 0.45, 0.4))
+    radiance[1] = 0.3
+    arriving = np.maximum(transfer @ radiance, 0.02)
+    arriving = arriving + Bounce(neutral, faces, occlusion).light(arriving)
+    wet = np.where(neutral[:, 0] > 0.05, 0.2, 0).astype(np.float32)
+    light = AvatarLight(
+        radiance.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), wet, 0.05, damping
+    )
+    return replace(head, avatar=replace(head.avatar, light=light))
+
+
+def harmonics() -> np.ndarray:
+    """(9, 3) of a world that is different in every direction."""
+    world = np.random.default_rng(7).normal(0, 0.12, (9, 3))
+    world[0] += 1.2
+    return world
+
+
+def set_lighting(browser: Browser, lighting: str) -> None:
+    browser.evaluate(f"(() => {{ document.querySelector('stga-avatar').lighting = {lighting}; }})()")
+
+
+@pytest.mark.parametrize(
+    ("options", "exact"),
+    [
+        ({}, True),
+        ({"damping": 0.3, "convention": "gaussian_avatars", "sh_degree": 0, "strain": False}, True),
+        ({"sh_degree": 2, "strain_position": True}, False),
+    ],
+)
+def test_colors_are_the_relighters(options, exact, browser, tmp_path):
+    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows or highlights that differ
+    from Python's, and a picture that shows other colors."""
+    head = lit_head(**options)
+    show(browser, tmp_path, head.data(exact=exact))
+    world = harmonics()
+    set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": SUN, "exposure": 0.5}))
+    order = np.argsort(head.avatar.splats.face, kind="stable")
+    relighter = Relighter(head.avatar)
+    sun = Light("sun", SUN["color"], direction=-np.array(SUN["toward"]))
+    for frame in (0, 2):
+        colors = relighter.colors(head.meshes[frame], head.camera.position, Lighting(world, (sun,), exposure=0.5))
+        shown = picture(browser, frame)
+        found = np.reshape(browser.evaluate(COLORS), (-1, 4))[:, :3]
+        error = np.abs(found - colors[order]).max(1)
+        assert np.quantile(error, 0.5) < (0.002 if exact else 0.006)
+        assert np.quantile(error, 0.95) < (0.02 if exact else 0.03)
+        expected = to_uint8(render_colors(head.avatar, head.meshes[frame], head.camera, colors))
+        assert difference(shown, expected) >= MIN_PSNR
+    assert browser.errors == []
+    assert browser.requests == [(tmp_path / "a.html").as_uri()]
+
+
+def test_as_recorded_is_what_a_page_without_light_shows(browser, tmp_path):
+    """Catches a pixel that changes because the light is known, or because it was on before; and data of light in a page
+    of an avatar that has none."""
+    head = lit_head()
+    dark = replace(head, avatar=replace(head.avatar, light=None))
+    show(browser, tmp_path, dark.data())
+    encoded = browser.evaluate(SNAPSHOT % 1)
+    assert browser.evaluate("document.getElementById('light').hidden")
+    assert not browser.evaluate("document.querySelector('stga-avatar').hasLight")
+    header, arrays = read_web_data(dark.data())
+    assert "light" not in header
+    assert not any(name.startswith("light") for name in arrays)
+    show(browser, tmp_path, head.data())
+    assert browser.evaluate(SNAPSHOT % 1) == encoded
+    set_lighting(browser, "{ environment: 'sky' }")
+    assert browser.evaluate(SNAPSHOT % 1) != encoded
+    set_lighting(browser, "null")
+    assert browser.evaluate(SNAPSHOT % 1) == encoded
+
+
+@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_environments_stand_upright_and_turn(up, browser, tmp_path):
+    """Catches an environment that lies on its side, or whose light and sun turn apart."""
+    head = lit_head()
+    playback = Playback(title="Zoë", fps=2.0, views={"front": head.camera}, up=up)
+    show(browser, tmp_path, data_file(head.avatar, head.rig, playback))
+    found = []
+    for turn in (0.0, np.pi / 2):
+        set_lighting(browser, f"{{ environment: 'sunset', turn: {turn} }}")
+        picture(browser, 0)
+        light = browser.evaluate(
+            "(({ world, sun }) => ({ world: [...world], sun }))"
+            "(document.querySelector('stga-avatar').player.lightPass.light)"
+        )
+        found.append((np.reshape(light["world"], (9, 3)), np.array(light["sun"]["toward"])))
+    (world, toward), (turned_world, turned_toward) = found
+    assert toward @ up == pytest.approx(0.28, abs=0.03)
+    quarter = np.cross(np.eye(3), up).T + np.outer(up, up)  # x ↦ up × x, and what lies along `up` stays
+    quarter = np.array([np.cross(up, axis) + np.array(up) * (np.array(up) @ axis) for axis in np.eye(3)]).T
+    np.testing.assert_allclose(turned_toward, quarter @ toward, atol=1e-9)
+    np.testing.assert_allclose(turned_world, rotated(world, quarter), atol=1e-9)
+
+
+def test_light_controls(browser, tmp_path):
+    """Catches a control of the section Light that does nothing, and a light that is dragged the wrong way."""
+    head = lit_head()
+    show(browser, tmp_path, head.data())
+    assert not browser.evaluate("document.getElementById('light').hidden")
+    choose = "(() => {{ const list = document.querySelector('#light select'); list.value = '{}';"
+    choose += " list.dispatchEvent(new Event('change')); return document.querySelector('stga-avatar').lighting; }})()"
+    assert browser.evaluate(choose.format("studio")) == {"environment": "studio", "turn": 0, "exposure": 0}
+    dragged = browser.evaluate(choose.format("dragged"))
+    assert set(dragged) == {"even", "sun", "exposure"}
+    assert browser.evaluate("document.querySelector('#light-dragged').hidden") is False
+
+    def side_of_light() -> float:
+        """Brightness of the right half of the picture over the left."""
+        levels = picture(browser, 0)
+        covered = levels.min(2) < 250
+        left, right = np.hsplit(np.where(covered, levels.mean(2), 0), 2)
+        return float(right.sum() / np.hsplit(covered, 2)[1].sum() / (left.sum() / np.hsplit(covered, 2)[0].sum()))
+
+    box = browser.evaluate("""(() => {
+      document.getElementById('panel').hidden = false;
+      const pad = document.getElementById('light-pad');
+      pad.scrollIntoView({ block: 'center' });
+      const { left, top, width } = pad.getBoundingClientRect();
+      return [left, top, width];
+    })()""")
+    shares = []
+    for x in (0.15, 0.85):
+        at = {"x": box[0] + x * box[2], "y": box[1] + 0.5 * box[2], "button": "left", "clickCount": 1}
+        browser.send("Input.dispatchMouseEvent", type="mousePressed", **at)
+        browser.send("Input.dispatchMouseEvent", type="mouseReleased", **at)
+        shares.append(side_of_light())
+    assert shares[1] > 1.2 * shares[0]
+    browser.evaluate("document.getElementById('panel').hidden = true")
+    before = browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()")
+    for kind, x in (("mousePressed", 200), ("mouseMoved", 100), ("mouseReleased", 100)):
+        browser.send(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=150, button="left", buttons=1, modifiers=1, clickCount=1
+        )
+    assert side_of_light() < shares[1]
+    assert browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()") == before
+    assert browser.evaluate("getComputedStyle(document.getElementById('light-pad')).getPropertyValue('--x')") != "85%"
+    refused = "(() => {{ try {{ document.querySelector('stga-avatar').lighting = {}; }}"
+    refused += " catch (error) {{ return error.message; }} }})()"
+    assert "no environment" in browser.evaluate(refused.format("{ environment: 'toString' }"))
+    assert "finite numbers" in browser.evaluate(refused.format("{ harmonics: [1, 2] }"))
+    assert browser.evaluate(choose.format("recorded")) is None
+    assert browser.errors == []
