@@ -256,16 +256,18 @@ def _seen_points(take: _Take, timestep: int) -> _SeenPoints:
     at, fitted, rows, count = [np.zeros((0, 3))], [np.zeros(0, bool)], {}, 0
     for number, view in shot.views.items():
         own, chosen = _below_head(take, timestep, mesh, number, view.camera)
+        if not len(own):
+            continue
         rows[number] = count + np.arange(len(own))
         at, fitted, count = [*at, own], [*fitted, chosen], count + len(own)
     every = np.concatenate(at)
     eyes = np.zeros_like(every)
-    for number, view in shot.views.items():
-        eyes[rows[number]] = view.camera.position
+    for number in rows:
+        eyes[rows[number]] = shot.views[number].camera.position
     away = every - eyes
     reference = []
     for level in range(len(OUTLIER_SQUARED)):
-        images = {number: view.levels[level] for number, view in shot.views.items()}
+        images = {number: shot.views[number].levels[level] for number in rows}
         values = [sampled(own.channels, own.camera.project(every[rows[number]])[0]) for number, own in images.items()]
         reference.append(np.concatenate(values) if values else np.zeros((0, 3)))
     ray = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
@@ -286,7 +288,7 @@ def _below_head(
     at = (np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5) * step
     x, y = at.astype(int).T
     _, nearest = cKDTree(pixels).query(at)
-    shown = _grown(mask > PLAIN_LEVEL, MASK_MARGIN) & ~take.head_pixels(mesh, camera)
+    shown = _grown(mask > 127, MASK_MARGIN) & ~take.head_pixels(mesh, camera)
     kept = np.flatnonzero(shown[y, x] & take.torso[nearest])
     kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
     block = (rows // BLOCK_POINTS + columns // BLOCK_POINTS).ravel()[kept]
@@ -455,12 +457,13 @@ class _Follower:
         return found
 
     def _visible(self, shot: _Shot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
-        """Number of a camera, and the rows of its points that are fitted and seen."""
-        return [
+        """Number of each camera that sees any of its points that are fitted, and the rows of these."""
+        chosen = [
             (number, rows[self._seen.fitted[rows] & shot.shows(number, at[rows])])
             for number, rows in self._seen.rows.items()
             if number in shot.views
         ]
+        return [(number, rows) for number, rows in chosen if len(rows)]
 
     def _posed(self, timestep: int, turn: np.ndarray) -> np.ndarray:
         return self._carrier.carried(self._take.with_torso(timestep, turn))(self._seen.at)

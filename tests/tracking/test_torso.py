@@ -8,19 +8,29 @@ import pytest
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.capture.open import open_capture
 from stga_addon.capture.rigid import Similarity, weighted_procrustes
-from stga_addon.development.demo.head import synthetic_head
+from stga_addon.development.demo.head import synthetic_head, write_flame
 from stga_addon.development.demo.paint import paint
+from stga_addon.files import write_npz
 from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, joint_positions
 from stga_addon.flame.masks import torso_faces
 from stga_addon.tracking.fit import HeadFit
+from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.model import Footage, FootageCamera
+from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.torso import NECK, ROOT, follow_torso, with_root
+from stga_addon.tracking.torso_motion import read_torso_motion
+from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import flame_frame, posed_mesh
+
+from .test_fit import places_on
+from .test_track import write_footage
 
 SIZE = 140, 190
 TIMESTEPS = 7
@@ -161,3 +171,32 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     apart = model.weights[:, ROOT] == 0
     np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
     np.testing.assert_allclose(axis_angle_matrices(flame_frame(changed).rotation[None])[0], rotation, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_track_writes_the_torso_as_flames_neck(tmp_path, head):
+    """Catches a torso that is followed and then not written, or not reported to those who train on the capture."""
+    fit, parameters, footage = take(head, SWING_DEG, 0 * SWING_DEG)
+    cameras = [own.camera for own in footage.cameras]
+    numbers = {camera.position.tobytes(): number for number, camera in enumerate(cameras)}
+
+    def picture(camera, timestep):
+        own = footage.cameras[numbers[camera.position.tobytes()]]
+        return np.dstack([own.image(timestep), own.mask(timestep)])
+
+    write_footage(tmp_path / "footage", cameras, TIMESTEPS, picture)
+    write_flame(head.model, tmp_path / "head.npz")
+    places = places_on(head, 200)
+    write_places(tmp_path / "points" / PLACES_FILE, places, np.ones(200, bool))
+    for number, camera in enumerate(cameras):
+        meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
+        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+        write_npz(tmp_path / f"points/cam{number}.npz", {"timesteps": np.arange(TIMESTEPS), "points": points})
+    out = tmp_path / "out"
+    result = track(open_footage(tmp_path / "footage"), tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
+    found = read_torso_motion(out)
+    assert found == result.torso
+    assert found.motion != "head"
+    sequence = open_capture(out, tmp_path / "head.npz").flame
+    necks = np.degrees([sequence.frame(timestep).neck_pose[1] for timestep in range(TIMESTEPS)])
+    assert np.ptp(necks) > 0.7 * np.ptp(SWING_DEG)
