@@ -35,7 +35,7 @@ from .dense_terms import (
 from .fit import HeadFit
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
-from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints, cross_matrices
 from .torso_motion import TorsoMotion
 from .write_capture import posed_mesh
 
@@ -61,7 +61,7 @@ COARSE_STEPS, FINE_STEPS = ((3, 3), (2, 3)), ((1, 4), (0, 2))
 """Levels and Gauss–Newton steps in each, for every start, and for the best one."""
 CHANGE_SIGMA_RAD = 0.1
 """Standard deviation of the torso's rotation from one timestep to the next."""
-MAX_STEP_RAD, CONVERGED_RAD, DIFFERENCE_RAD = 0.15, 1e-4, 1e-4
+MAX_STEP_RAD, CONVERGED_RAD = 0.15, 1e-4
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
 """Along a point's ray, from the depth of the mesh beside it, that are tried: a chest is before the neck."""
 DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
@@ -173,15 +173,24 @@ class _Take:
     ) -> None:
         self.model, self.parameters, self.cameras, self.torso = fit.head.model, parameters, cameras, torso
         self._fit = fit
-        joints = self.model.j_regressor[[ROOT, NECK]]
-        self._arm = np.diff(joints @ self.model.v_template, axis=0)[0]
-        self._arm_dirs = np.diff(np.einsum("jv,vak->jak", joints, self.model.shapedirs), axis=0)[0]
+        regressor = self.model.j_regressor[[ROOT, NECK]]
+        self._joints = regressor @ self.model.v_template
+        self._joint_dirs = np.einsum("jv,vak->jak", regressor, self.model.shapedirs)
         self._center = posed_mesh(fit, next(iter(parameters.values()))).mean(0)
 
     def with_torso(self, timestep: int, turn: np.ndarray) -> np.ndarray:
         """The timestep's parameters with the torso in an orientation (3, 3)."""
-        parameters = self.parameters[timestep]
-        return with_root(parameters, turn, self._arm + self._arm_dirs @ parameters[:-RIGID_SIZE])
+        root, neck = self._unposed_joints(timestep)
+        return with_root(self.parameters[timestep], turn, neck - root)
+
+    def pivot(self, timestep: int) -> np.ndarray:
+        """(3,) what the torso turns about: the joint of the neck."""
+        parameters, (root, neck) = self.parameters[timestep], self._unposed_joints(timestep)
+        turn = axis_angle_matrices(_joint(parameters, ROOT)[None])[0]
+        return np.asarray(root + turn @ (neck - root) + parameters[-3:])
+
+    def _unposed_joints(self, timestep: int) -> np.ndarray:
+        return np.asarray(self._joints + self._joint_dirs @ self.parameters[timestep][:-RIGID_SIZE])
 
     def mesh(self, parameters: np.ndarray) -> np.ndarray:
         return posed_mesh(self._fit, parameters)
@@ -251,6 +260,7 @@ class _SeenPoints:
 
 
 def _seen_points(take: _Take, timestep: int) -> _SeenPoints:
+    """What the cameras see below the head at a timestep."""
     shot, parameters = take.shot(timestep), take.parameters[timestep]
     mesh = take.mesh(parameters)
     at, fitted, rows, count = [np.zeros((0, 3))], [np.zeros(0, bool)], {}, 0
@@ -469,10 +479,10 @@ class _Follower:
         return self._carrier.carried(self._take.with_torso(timestep, turn))(self._seen.at)
 
     def _linearized(self, timestep: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3), and derivatives (N, 3, 3) by a small rotation in front of the orientation."""
+        """Positions (N, 3), and derivatives (N, 3, 3) by a small rotation in front of the orientation, as if they were
+        the root joint's alone."""
         at = self._posed(timestep, turn)
-        moved = [self._posed(timestep, small @ turn) for small in axis_angle_matrices(DIFFERENCE_RAD * np.eye(3))]
-        return at, np.stack([(own - at) / DIFFERENCE_RAD for own in moved], axis=2)
+        return at, -cross_matrices(at - self._take.pivot(timestep))
 
 
 def _prior(turn: np.ndarray, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
