@@ -9,8 +9,15 @@ from numpy.typing import DTypeLike
 
 from ..errors import StgaError
 from ..files import read_npz
-from .forward import FlameFrame, flame_forward, neutral_frame, shaped_vertices
-from .model import FlameModel
+from .forward import (
+    FlameFrame,
+    axis_angle_matrices,
+    flame_forward,
+    joint_positions,
+    neutral_frame,
+    shaped_vertices,
+)
+from .model import JOINTS, FlameModel
 from .teeth import TEETH_VERTICES
 
 ZERO_POSES = ("head", "all")
@@ -78,6 +85,15 @@ def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> n
 def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
     """The canonical mesh (V, 3): expression, pose and translation zero, with the person's shape and static offset."""
     return _mesh(sequence, neutral_frame(sequence.model))
+
+
+def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck, seen by the torso."""
+    model, frame = sequence.model, sequence.frame(timestep)
+    shaped = shaped_vertices(model, sequence.shape, frame.expr, sequence.static_offset)
+    root = joint_positions(model, shaped)[JOINTS.index("root")] + frame.translation
+    up = axis_angle_matrices(frame.rotation[None])[0][:, 1]
+    return np.asarray((points - root) @ up < 0)
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:

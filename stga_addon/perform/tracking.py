@@ -19,7 +19,8 @@ STAGES = {
     "Dense tracking": (0.65, 0.72),
     "Surface": (0.72, 0.79),
     "Refinement": (0.79, 0.85),
-    "Mattes": (0.85, 0.91),
+    "Mattes": (0.85, 0.89),
+    "Torso": (0.89, 0.91),
     "Contact sheet": (0.91, 0.92),
     "Images": (0.92, 0.97),
     "Heads": (0.97, 1.0),
@@ -44,6 +45,7 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     lines = [
         *(f"warning: {warning}" for warning in found.warnings),
         f"reprojection error: {found.median_px:.2f} px (median); by camera and timestep in tracking.json",
+        *([] if found.torso is None else [f"torso: {found.torso.description}"]),
         f"capture: {request.out}",
     ]
     return Written(request.out, tuple(lines))

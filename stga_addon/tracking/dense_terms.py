@@ -43,7 +43,7 @@ def samples(head: DenseHead, views: Sequence[PyramidView], values: np.ndarray, w
     found = []
     for view, own in zip(views, weight, strict=True):
         levels = [sampled(level.channels, level.camera.project(at)[0]).astype(np.float64) for level in view.levels]
-        found.append(Sample(view.key, levels, basis, own * _inside(view.levels[0].camera, at)))
+        found.append(Sample(view.key, levels, basis, own * inside(view.levels[0].camera, at)))
     return found
 
 
@@ -56,7 +56,7 @@ def photo_term(
     basis, rows = head.light_basis(values, level), head.rows[level]
     for view, seen in zip(views, visible, strict=True):
         own = view.levels[level]
-        weight = seen[rows] * texture.trust[rows] * _inside(own.camera, at)
+        weight = seen[rows] * texture.trust[rows] * inside(own.camera, at)
         near = np.flatnonzero(weight)
         if not len(near):
             continue
@@ -79,10 +79,10 @@ def misfit(
     total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
     for view, seen in zip(views, visible, strict=True):
         weight = seen[rows] * texture.trust[rows]
-        inside = _inside(view.levels[level].camera, at)
-        residual, _ = _residual(view, texture, at, basis, weight * inside, rows, level)
+        shown = inside(view.levels[level].camera, at)
+        residual, _ = _residual(view, texture, at, basis, weight * shown, rows, level)
         squared = residual**2 @ CHANNEL_WEIGHTS
-        share = np.where(inside, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
+        share = np.where(shown, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
         total += np.bincount(head.region[rows], weight * share, len(REGIONS))
         weights += np.bincount(head.region[rows], weight, len(REGIONS))
     return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), total / np.maximum(weights, 1e-9))
@@ -116,7 +116,7 @@ def flow_start(
 
     before, visible (C, N), values: of the other timestep.
     """
-    targets = list(_flow_targets(head.level_positions(values, FLOW_POINTS), before, now))
+    targets = list(flow_targets(head.level_positions(values, FLOW_POINTS), before, now))
     weights = {view.key: own[head.rows[FLOW_POINTS]] for view, own in zip(before, visible, strict=True)}
     moved = values
     for _ in range(FLOW_ITERATIONS):
@@ -131,7 +131,7 @@ def flow_start(
     return moved
 
 
-def _flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[PyramidView]) -> Any:
+def flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[PyramidView]) -> Any:
     """(key, camera, pixels (M, 2) that points at `at` have moved to) of each camera that saw both timesteps."""
     import cv2
 
@@ -151,7 +151,7 @@ MIN_FLOW_SIDE_PX = 32
 """Smaller images are too small for the patches of DIS."""
 
 
-def _inside(camera: Camera, at: np.ndarray) -> np.ndarray:
+def inside(camera: Camera, at: np.ndarray) -> np.ndarray:
     """(N,) bool: points whose pixels lie in the image, a pixel from its border."""
     pixels, depth = camera.project(at)
     return np.asarray((pixels > 1).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1) & (depth > 0))

@@ -98,7 +98,7 @@ class PosedPoints:
         """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root has none."""
         bent = np.zeros((self.posedirs.shape[2], POSE_SIZE))
         for joint in range(1, len(turns)):
-            changes = _cross_matrices(turns[joint].T) @ posed.local[joint]
+            changes = cross_matrices(turns[joint].T) @ posed.local[joint]
             bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.reshape(3, 9).T
         return np.asarray((self.posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
@@ -114,7 +114,7 @@ class PosedPoints:
         arms = (turned @ posed.corrected[..., None])[..., 0]
         arms += share @ (posed.moved[carried] - posed.places[joint])
         world = turn if parent < 0 else posed.rotations[parent] @ turn
-        return np.asarray(-_cross_matrices(self._weighted(arms).sum(1)) @ world)
+        return np.asarray(-cross_matrices(self._weighted(arms).sum(1)) @ world)
 
     def _is_below(self, joint: int, above: int) -> bool:
         """Whether `above` is the joint or one that carries it."""
@@ -158,7 +158,7 @@ def _moves(rotations: np.ndarray, places: np.ndarray, joints: np.ndarray) -> np.
     return np.asarray(places - rotations @ joints)
 
 
-def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
+def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
@@ -168,7 +168,7 @@ def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
 def _left_jacobian(angles: np.ndarray) -> np.ndarray:
     """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of it amounts to."""
     angle = float(np.linalg.norm(angles))
-    cross = _cross_matrices(angles[None])[0]
+    cross = cross_matrices(angles[None])[0]
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
     third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
     return np.asarray(np.eye(3) + second * cross + third * cross @ cross)

@@ -14,6 +14,7 @@ from ..capture.camera import Camera
 from ..capture.mesh_raster import silhouette
 from ..errors import StgaError
 from ..files import read_json, write_json
+from ..schema import to_json
 from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
@@ -48,6 +49,8 @@ from .mattes import with_mattes
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
+from .torso import follow_torso
+from .torso_motion import TORSO_KEY, TorsoMotion
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
@@ -68,6 +71,7 @@ class TrackingReport:
     warnings         one sentence each
     image_misfit     region of the face -> timestep -> share of the images' points that are not explained, from 0 to 1;
                      empty for takes too short for dense tracking
+    torso            how the torso moves; None where that cannot be told
     """
 
     reprojection_px: Mapping[str, Mapping[int, float]]
@@ -75,6 +79,7 @@ class TrackingReport:
     scale: float
     warnings: tuple[str, ...]
     image_misfit: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    torso: TorsoMotion | None = None
 
     @property
     def median_px(self) -> float:
@@ -148,6 +153,7 @@ def track(
 
         source = _source(footage, head_file, task if landmarks is None else landmarks)
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
+    parameters, torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
@@ -156,6 +162,7 @@ def track(
         + scale_warnings(fit, places, reliable, footage, found)
         + matte_warnings,
         misfits,
+        torso,
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -342,6 +349,7 @@ def _as_json(result: TrackingReport) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "reprojection_px": _rounded(result.reprojection_px),
         "image_misfit": _rounded(result.image_misfit),
+        TORSO_KEY: None if result.torso is None else to_json(result.torso),
     }
 
 

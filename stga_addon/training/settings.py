@@ -95,6 +95,7 @@ class TrainingSettings:
     driven_offsets  names of `avatar.offsets.table`: splats move with signals of the pose
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
+    torso          hull points below the neck follow FLAME's root joint, not the head's nearest triangle
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
                    images, which are corrected when they are read
     tracking       refine FLAME's expression, joints and translation of each training timestep (`tracking`)
@@ -145,6 +146,7 @@ class TrainingSettings:
     driven_offsets: tuple[str, ...] = ()
     antialiased: bool = False
     teeth: bool = True
+    torso: bool = False
     exposure: tuple[tuple[float, ...], ...] = ()
     tracking: bool = False
     effects: Mapping[str, str] | None = None

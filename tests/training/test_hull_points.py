@@ -12,6 +12,10 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.flame.forward import neutral_frame
+from stga_addon.flame.masks import torso_faces
+from stga_addon.flame.sequence import FlameSequence, sequence_mesh
 from stga_addon.training.optimize.hull_points import MIN_MESH_DISTANCE_M, VOXEL_SIZE_M, flat_points, hull_points
 
 SIZE, FOCAL, FAR = 120, 300.0, 1.0
@@ -146,6 +150,33 @@ def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> Non
     Image.fromarray(np.zeros((SIZE, SIZE), np.uint8)).save(black)
     views[7] = replace(views[7], mask=black)
     assert len(hull_points(beside, views, "stga", 0)) == 0
+
+
+@pytest.mark.parametrize("one", [False, True])
+def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -> None:
+    """Catches a collar that turns with the chin it lies under, and hair beside the neck that does not."""
+    model = synthetic_flame(0)
+    frame = replace(neutral_frame(model), rotation=np.array([0.0, 0.4, 0.0]), neck_pose=np.array([0.0, -0.4, 0.0]))
+    head = FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame)
+    mesh = sequence_mesh(head, TIMESTEP)
+    for centre, carried in (([0.0, -0.175, 0.115], True), ([0.0, -0.135, 0.115], False)):
+        views = scene(tmp_path, np.array(centre), 0.015).views
+        side = max(views["train"], key=lambda view: float(view.camera.position[0]))
+        capture = Capture(
+            tmp_path, "flame", model.faces, model.v_template, views, (TIMESTEP,), {},
+            lambda timestep: mesh, lambda timestep, pose: mesh, head,
+        )  # fmt: skip
+        before, after = (
+            flat_points(capture, side, "stga", 0, torso)
+            if one
+            else hull_points(capture, views["train"], "stga", 0, torso)
+            for torso in (False, True)
+        )
+        assert len(before) == len(after) > 20
+        assert not torso_faces(model)[before.face].all()
+        assert torso_faces(model)[after.face].all() if carried else (after.face == before.face).all()
+        world = [in_world(capture, points).xyz for points in (before, after)]
+        np.testing.assert_allclose(world[0], world[1], atol=1e-6)
 
 
 def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None:

@@ -72,6 +72,7 @@ _EFFECTS = (
     ),
     Effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
     Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
+    Effect("torso", "none: splats below the neck follow other triangles", on={"torso": True}, off={"torso": False}),
     Effect("neck", "9 shape keys and drivers in Blender"),
     Effect("jaw", "9 shape keys and drivers in Blender"),
     Effect("eyes", "18 shape keys and drivers in Blender"),

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
 from ...tracking.folder import is_tracked
+from ...tracking.torso_motion import read_torso_motion
 from .evidence import Evidence
 from .facts import CaptureFacts
 
@@ -200,6 +201,15 @@ def teeth(facts: CaptureFacts) -> Verdict | None:
     return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
 
 
+def torso(facts: CaptureFacts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    found = read_torso_motion(facts.capture.root)
+    if found is None:
+        return Verdict(False, "the torso was not followed in the images, as `stga track` does where they have masks")
+    return Verdict(found.motion != "head", found.description)
+
+
 def neck(facts: CaptureFacts) -> Verdict | None:
     return _turning(facts, 1)
 
@@ -245,7 +255,7 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
 
 _RULES: tuple[Rule, ...] = (
     view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection, strain_color,
-    strain_position, relight, teeth, neck, jaw, eyes, dynamic_offsets, tracking,
+    strain_position, relight, teeth, torso, neck, jaw, eyes, dynamic_offsets, tracking,
 )  # fmt: skip
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
 """Effect -> its rule, a function of that name."""

@@ -13,6 +13,8 @@ from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
 from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
 from ...capture.model import Capture, View
+from ...flame.masks import torso_faces
+from ...flame.sequence import below_neck
 
 VOXEL_SIZE_M = 0.004
 """Distance between hull points, on a mesh of a head's size."""
@@ -31,29 +33,33 @@ SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
 
 
-def hull_points(capture: Capture, views: Sequence[View], convention: str, sh_degree: int) -> Splats:
+def hull_points(
+    capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
+) -> Splats:
     """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
 
     views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger mesh) from the masks
     or, without masks, from pixels that differ from white. Each splat is embedded in the nearest triangle and follows
-    it.
+    it; torso: below the base of FLAME's neck, in the nearest one of the torso.
     """
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
     points = _hull_surface(mesh, capture.faces, views, voxel)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
+    if torso:
+        face = _carried(capture, views[0].timestep, points, face)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(world, frames, face[outside])
 
 
-def flat_points(capture: Capture, view: View, convention: str, sh_degree: int) -> Splats:
+def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False) -> Splats:
     """Unbound splats for what a single camera shows beside the mesh: one layer at the depth of the mesh's outline.
 
     A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of its pixel, as deep
-    as the part of the mesh that is nearest in the image, follows the nearest triangle, and has the size and distance
-    of hull points.
+    as the part of the mesh that is nearest in the image, follows the same triangle as a hull point there, and has its
+    size and distance.
     """
     mesh, camera = capture.mesh(view.timestep), view.camera
     voxel = voxel_size(mesh)
@@ -69,6 +75,8 @@ def flat_points(capture: Capture, view: View, convention: str, sh_degree: int) -
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
     points = camera.unproject(centers, depth[cKDTree(pixels).query(centers)[1]])
     _, face = _nearest_triangle(points, mesh, capture.faces)
+    if torso:
+        face = _carried(capture, view.timestep, points, face)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(_new_splats(points, voxel, sh_degree), frames, face)
 
@@ -83,6 +91,20 @@ def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -
     samples = _mesh_samples(mesh, faces)
     distance, nearest = cKDTree(samples).query(points)
     return distance, nearest // (len(samples) // len(faces))
+
+
+def _carried(capture: Capture, timestep: int, points: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+    """Triangle (N,) of each point: for those below the base of the neck, the nearest of the torso instead of all."""
+    if capture.flame is None:
+        return nearest
+    torso = np.flatnonzero(torso_faces(capture.flame.model))
+    below = below_neck(capture.flame, timestep, points)
+    if not len(torso) or not below.any():
+        return nearest
+    _, among = _nearest_triangle(points[below], capture.mesh(timestep), capture.faces[torso])
+    found = nearest.copy()
+    found[below] = torso[among]
+    return found
 
 
 def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -27,9 +27,9 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     parts = [lattice]
     if settings.hull_points:
         if len(views) == 1:
-            parts.append(flat_points(capture, views[0], settings.convention, settings.sh_degree))
+            parts.append(flat_points(capture, views[0], settings.convention, settings.sh_degree, settings.torso))
         else:
-            parts.append(hull_points(capture, views, settings.convention, settings.sh_degree))
+            parts.append(hull_points(capture, views, settings.convention, settings.sh_degree, settings.torso))
     splats = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
     added = {name: np.zeros((len(splats), ADDED[name], 3), np.float32) for name in settings.added}
     return replace(splats, **added)

@@ -26,7 +26,7 @@ from ..effects.decisions import EffectDecision
 from ..settings import TrainingSettings
 from .identity import RunIdentity
 
-FORMAT, VERSION = "stga-run", 4
+FORMAT, VERSION = "stga-run", 5
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
 
 

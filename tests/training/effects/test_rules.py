@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.files import write_json
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
@@ -301,6 +302,32 @@ def test_overrides(painted):
     assert plan["strain-color"].choice == "on"
     assert "as asked" in str(plan["strain-color"])
     assert "0.0 of 255 levels" in plan["strain-color"].reason
+
+
+def tracked(root, report):
+    """Facts of a FLAME capture with this tracking.json."""
+    write_json(root / REPORT_FILE, report)
+    return SimpleNamespace(frames=[None], capture=SimpleNamespace(root=root))
+
+
+def test_torso(tmp_path):
+    """Catches shoulders that are taken off the head without evidence, and evidence that is not shown."""
+    misfit = {"head": 0.4, "still": 0.2, "own": 0.1}
+    verdict = rules.torso(tracked(tmp_path, {"torso": {"motion": "own", "misfit": misfit, "turn_deg": 17.3}}))
+    assert verdict.on
+    assert all(figure in verdict.reason for figure in ("17°", "40%", "20%", "10%"))
+    assert not rules.torso(tracked(tmp_path, {"torso": {"motion": "head", "misfit": misfit, "turn_deg": 0.0}})).on
+    assert not rules.torso(tracked(tmp_path, {"torso": None})).on
+    assert not rules.torso(tracked(tmp_path, {})).on
+    assert rules.torso(SimpleNamespace(frames=[])) is None
+
+
+@pytest.mark.parametrize("change", [{"motion": "falls"}, {"misfit": {"head": 2.0}}, {"turn_deg": None}, {"more": 1}])
+def test_a_report_that_does_not_tell_how_the_torso_moves(tmp_path, change):
+    """Catches a traceback on a damaged tracking.json."""
+    torso = {"motion": "own", "misfit": {"head": 0.4, "still": 0.2, "own": 0.1}, "turn_deg": 17.3, **change}
+    with pytest.raises(StgaError, match=r"tracking\.json: torso"):
+        rules.torso(tracked(tmp_path, {"torso": torso}))
 
 
 def test_names():

@@ -1,0 +1,202 @@
+"""The torso's motion against generated takes in which shoulders are a body of their own, that moves as told."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.capture.open import open_capture
+from stga_addon.capture.rigid import Similarity, weighted_procrustes
+from stga_addon.development.demo.head import synthetic_head, write_flame
+from stga_addon.development.demo.paint import paint
+from stga_addon.files import write_npz
+from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, joint_positions
+from stga_addon.flame.masks import torso_faces
+from stga_addon.tracking.fit import HeadFit
+from stga_addon.tracking.folder import PLACES_FILE
+from stga_addon.tracking.footage.model import Footage, FootageCamera
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.landmarks import write_places
+from stga_addon.tracking.mesh_image import shaded_image
+from stga_addon.tracking.posed_points import parameters_of
+from stga_addon.tracking.solve import person
+from stga_addon.tracking.torso import NECK, ROOT, follow_torso, with_root
+from stga_addon.tracking.torso_motion import read_torso_motion
+from stga_addon.tracking.track import track
+from stga_addon.tracking.write_capture import flame_frame, posed_mesh
+
+from .test_fit import places_on
+from .test_track import write_footage
+
+SIZE = 140, 190
+TIMESTEPS = 7
+SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)
+"""Of what turns, at each timestep."""
+BACKDROP = 115
+
+
+def quiet(stage, done, total):
+    pass
+
+
+def ellipsoid():
+    """Shoulders (V, 3), faces (F, 3) and colors (V, 3) of patterned cloth, below the demo's head."""
+    around, down = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45), indexing="ij")
+    unit = np.stack([np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)], -1).reshape(-1, 3)
+    vertices = unit * [0.17, 0.08, 0.085] + [0, -0.215, -0.04]
+    grid = np.arange(90 * 45).reshape(90, 45)
+    a, b, c, d = (own.ravel() for own in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    waves = np.sin(vertices @ np.random.default_rng(1).normal(0, 160, (3, 5)))
+    return vertices, faces, np.clip(0.5 + 0.12 * waves @ np.random.default_rng(2).normal(0, 1, (5, 3)), 0.05, 0.95)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Pictures and masks by timestep."""
+
+    images: list = field(default_factory=list)
+    masks: list = field(default_factory=list)
+
+    @property
+    def timesteps(self):
+        return tuple(range(len(self.images)))
+
+    def image(self, timestep):
+        return self.images[timestep]
+
+    def mask(self, timestep):
+        return self.masks[timestep]
+
+
+@pytest.fixture(scope="module")
+def head():
+    return HeadModel(synthetic_head(0, 1).model, "flame")
+
+
+def take(head, heads, torsos, size=SIZE):
+    """Fit, parameters of a head tracked as one, and footage; heads, torsos (T,): degrees about the vertical axis."""
+    pictured = synthetic_head(0, 2)
+    colors = np.clip(paint(pictured, 0)[0] ** (1 / 1.8), 0, 1)
+    cloth, cloth_faces, cloth_colors = ellipsoid()
+    faces = np.concatenate([pictured.model.faces, cloth_faces + len(pictured.model.v_template)])
+    cameras = [look_at((np.sin(a), 0.0, np.cos(a)), (0, -0.07, 0), *size, 2.6 * size[0]) for a in (-0.6, 0.0, 0.6)]
+    frames, shape = [Frames() for _ in cameras], np.zeros(pictured.model.n_identity)
+    one = person(head, np.zeros(head.model.n_identity))
+    joints = joint_positions(one.model, one.model.v_template)
+    parameters = {}
+    for timestep, (turned, carried) in enumerate(zip(np.radians(heads), np.radians(torsos), strict=True)):
+        zero = np.zeros(3)
+        frame = FlameFrame(
+            np.zeros(one.model.n_expression), np.array([0, carried, 0]), np.array([0, turned - carried, 0]),
+            zero, np.array([0.002 * timestep, 0, 0]), np.zeros(6),
+        )  # fmt: skip
+        turn = axis_angle_matrices(frame.rotation[None])[0]
+        shoulders = (cloth - joints[ROOT]) @ turn.T + joints[ROOT] + frame.translation
+        mesh = np.concatenate([flame_forward(pictured.model, shape, frame), shoulders])
+        for camera, own in zip(cameras, frames, strict=True):
+            own.images.append(shaded_image(mesh, faces, camera, np.concatenate([colors, cloth_colors])))
+            own.masks.append(np.where(rasterize(mesh, faces, camera)[0] >= 0, 255, 0).astype(np.uint8))
+        arm = joints[NECK] - joints[ROOT]
+        parameters[timestep] = with_root(parameters_of(frame), axis_angle_matrices(np.array([[0, turned, 0]]))[0], arm)
+    fit = HeadFit(one, np.zeros(0), parameters, Similarity(1.0, np.eye(3), np.zeros(3)))
+    filmed = [FootageCamera(str(n), camera, own) for n, (camera, own) in enumerate(zip(cameras, frames, strict=True))]
+    return fit, parameters, Footage(Path("take"), tuple(filmed), tuple(range(len(heads))))
+
+
+def torso_angles(fit, parameters):
+    """(T,) degrees by which the end of the neck, which carries the shoulders, is turned about the vertical axis."""
+    model = fit.head.model
+    used = np.unique(model.faces[torso_faces(model)])
+    turns = [
+        weighted_procrustes(model.v_template[used], posed_mesh(fit, values)[used], np.ones(len(used)))[0]
+        for values in parameters.values()
+    ]
+    return np.degrees([np.arctan2(turn[0, 2], turn[2, 2]) for turn in turns])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("heads", "torsos", "motions"), [(1, 0, ("still", "own")), (0, 1, ("own",)), (1, 0.5, ("own",))]
+)
+def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, motions):
+    """Catches shoulders that ride on the head, and a head that is moved to turn them."""
+    fit, parameters, footage = take(head, heads * SWING_DEG, torsos * SWING_DEG)
+    found, torso = follow_torso(fit, parameters, footage, quiet)
+    assert torso.motion in motions
+    wrong = torso_angles(fit, found) - torsos * SWING_DEG
+    assert np.abs(wrong - wrong.mean()).max() < 3.0
+    assert torso.misfit[torso.motion] < 0.5 * torso.misfit["head"]
+    apart = head.model.weights[:, ROOT] == 0
+    for timestep, values in parameters.items():
+        before, after = (posed_mesh(fit, own)[apart] for own in (values, found[timestep]))
+        assert np.abs(before - after).max() < 2e-3
+
+
+@pytest.mark.slow
+def test_a_torso_that_rides_on_the_head_changes_nothing(head):
+    """Catches a torso that noise turns: a bust on a turntable, or a studio capture, keeps its parameters bit for
+    bit."""
+    fit, parameters, footage = take(head, SWING_DEG, SWING_DEG)
+    found, torso = follow_torso(fit, parameters, footage, quiet)
+    assert torso.motion == "head"
+    assert torso.turn_deg < 1e-3
+    assert all(found[timestep] is parameters[timestep] for timestep in parameters)
+
+
+def test_without_masks_the_torso_is_not_told_from_the_wall(head):
+    """Catches shoulders that follow the backdrop."""
+    fit, parameters, footage = take(head, [0, 5, 10, 15], [0, 0, 0, 0], (40, 55))
+    bare = tuple(replace(own, frames=replace(own.frames, masks=[None] * 4)) for own in footage.cameras)
+    found, torso = follow_torso(fit, parameters, replace(footage, cameras=bare), quiet)
+    assert torso is None
+    assert all(found[timestep] is parameters[timestep] for timestep in parameters)
+
+
+def test_turning_the_root_leaves_the_head_in_its_place(head):
+    """Catches a neck that turns about another point than the model's."""
+    one, rng = person(head, np.zeros(head.model.n_identity)), np.random.default_rng(0)
+    zero = np.zeros(3)
+    frame = FlameFrame(rng.normal(0, 0.3, one.model.n_expression), rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3),
+                       zero, rng.normal(0, 1, 3), np.zeros(6))  # fmt: skip
+    model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))  # the throat's correctives are another thing
+    joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)
+    rotation = axis_angle_matrices(rng.normal(0, 0.5, (1, 3)))[0]
+    changed = with_root(parameters_of(frame), rotation, joints[NECK] - joints[ROOT])
+    before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, flame_frame(changed)))
+    apart = model.weights[:, ROOT] == 0
+    np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
+    np.testing.assert_allclose(axis_angle_matrices(flame_frame(changed).rotation[None])[0], rotation, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_track_writes_the_torso_as_flames_neck(tmp_path, head):
+    """Catches a torso that is followed and then not written, or not reported to those who train on the capture."""
+    fit, parameters, footage = take(head, SWING_DEG, 0 * SWING_DEG)
+    cameras = [own.camera for own in footage.cameras]
+    numbers = {camera.position.tobytes(): number for number, camera in enumerate(cameras)}
+
+    def picture(camera, timestep):
+        own = footage.cameras[numbers[camera.position.tobytes()]]
+        return np.dstack([own.image(timestep), own.mask(timestep)])
+
+    write_footage(tmp_path / "footage", cameras, TIMESTEPS, picture)
+    write_flame(head.model, tmp_path / "head.npz")
+    places = places_on(head, 200)
+    write_places(tmp_path / "points" / PLACES_FILE, places, np.ones(200, bool))
+    for number, camera in enumerate(cameras):
+        meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
+        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+        write_npz(tmp_path / f"points/cam{number}.npz", {"timesteps": np.arange(TIMESTEPS), "points": points})
+    out = tmp_path / "out"
+    result = track(open_footage(tmp_path / "footage"), tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
+    found = read_torso_motion(out)
+    assert found == result.torso
+    assert found.motion != "head"
+    sequence = open_capture(out, tmp_path / "head.npz").flame
+    necks = np.degrees([sequence.frame(timestep).neck_pose[1] for timestep in range(TIMESTEPS)])
+    assert np.ptp(necks) > 0.7 * np.ptp(SWING_DEG)
