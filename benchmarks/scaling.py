@@ -1,30 +1,48 @@
 """What one iteration's time grows with: splats, pixels, the selected share and threads.
 
-    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png]
+    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png] [--model] [--splats 60000]
 
 The demo's head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at 802×550, all in one
 process. More splats are smaller ones, as on a real head: their size falls with the square root of their number. Run it
 on an idle machine. Prints every figure, with the (splat, tile) pairs of the view, and draws them.
+
+--model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into for N
+threads are timed one after the other (time of the thread, median of repeats) and given to N threads as `threads.py`
+does: each takes the next piece when it is free. Added are what lies between the kernels, and for each kernel the
+measured time to wake N − 1 threads and to hear of the last one's end. Cores are taken to be alike and memory to keep
+up: the last column is the bandwidth that this needs.
 """
 
 import argparse
+import heapq
+import statistics
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from time import thread_time
+from typing import Any
+from unittest.mock import patch
 
 import matplotlib
 import numpy as np
 from iteration import demo_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
+from stga_addon.raster.cpu import threads as kernel_threads
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
-from stga_addon.raster.cpu.threads import set_threads, threads
+from stga_addon.raster.cpu.threads import parallel, set_threads, threads
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 SPLATS, WIDTH, HEIGHT = 60_000, 802, 550
+MODELLED_THREADS = (1, 2, 4, 8, 16)
+BYTES_PER_SPLAT, BYTES_PER_PAIR, BYTES_PER_PIXEL = 3_100, 140, 71
+"""What an iteration at least reads and writes, by the table of benchmarks/iteration.py."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +98,102 @@ def series(repeats: int) -> dict[str, list[Point]]:
     return found
 
 
+def pieces_ms(step: Callable[[], object]) -> tuple[list[tuple[str, list[float]]], float]:
+    """Runs an iteration on this thread, cut as for the threads that are set. Returns every kernel's pieces, in order,
+    and what lies between the kernels, all in milliseconds of this thread.
+    """
+    kernels: list[tuple[str, list[float]]] = []
+
+    def one_by_one(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> None:
+        times = []
+        for begin, end in kernel_threads.cut(units, pieces):
+            before = thread_time()
+            kernel(begin, end, *arguments)
+            times.append(1e3 * (thread_time() - before))
+        kernels.append((kernel.__name__, times))
+
+    with patch.object(kernel_threads, "_run", one_by_one):
+        before = thread_time()
+        step()
+        whole = 1e3 * (thread_time() - before)
+    return kernels, whole - sum(sum(times) for _, times in kernels)
+
+
+def makespan(times: list[float], count: int) -> float:
+    """When the last of `count` threads is done, if each takes the next of these pieces as soon as it is free."""
+    free = [0.0] * count
+    for ms in times:
+        heapq.heapreplace(free, free[0] + ms)
+    return max(free)
+
+
+def waking_ms(repeats: int = 200) -> float:
+    """What it takes a thread to give work to one that waits for it."""
+    queue: SimpleQueue[int] = SimpleQueue()
+    Thread(target=lambda: [None for _ in iter(queue.get, -1)], daemon=True).start()
+    times = []
+    for n in range(repeats):
+        before = thread_time()
+        queue.put(n)
+        times.append(1e3 * (thread_time() - before))
+        while not queue.empty():
+            pass
+    queue.put(-1)
+    return statistics.median(times)
+
+
+def dispatch_ms(repeats: int) -> float:
+    """What a kernel without work costs on two threads."""
+
+    @parallel(lambda: 16)
+    def nothing(begin: int, end: int) -> None:
+        pass
+
+    before = threads()
+    set_threads(2)
+    try:
+        return median_ms(nothing, 10 * repeats)
+    finally:
+        set_threads(before)
+
+
+def model(splats: int, repeats: int) -> None:
+    """Print what an iteration would take on more threads, and of the most threads each kernel's part."""
+    rng = np.random.default_rng(0)
+    head, mesh, faces = demo_head(splats, rng)
+    camera = front_camera(WIDTH, HEIGHT)
+    target = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    backend, batch = device_step("cpu", head, mesh, faces, camera, target)
+    arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
+    pairs = len(
+        render_forward(arrays, head.face, frames_in_camera(face_frames(mesh, faces, mesh), camera), 3).lists.pair_splat
+    )
+    moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
+    two, waking = dispatch_ms(repeats), waking_ms()
+    print(f"a kernel on two threads {1e3 * two:.0f} µs, each further one {1e3 * waking:.1f} µs")
+    print(f"{'threads':>7}{'work':>8}{'between':>9}{'dispatch':>10}{'ms':>8}{'efficiency':>12}{'GB/s':>7}")
+    single = 0.0
+    for count in MODELLED_THREADS:
+        set_threads(count)
+        runs = [pieces_ms(lambda: backend.step(batch)) for _ in range(repeats + 2)][2:]
+        spans: dict[str, float] = defaultdict(float)
+        work = 0.0
+        for n, (name, _) in enumerate(runs[0][0]):
+            times = [statistics.median(run[0][n][1][k] for run in runs) for k in range(len(runs[0][0][n][1]))]
+            spans[name] += makespan(times, count)
+            work += sum(times)
+        between = statistics.median(run[1] for run in runs)
+        dispatch = len(runs[0][0]) * (two + (count - 2) * waking if count > 1 else 0.0)
+        ms = sum(spans.values()) + between + dispatch
+        single = single or ms
+        print(
+            f"{count:>7}{work:>8.2f}{between:>9.2f}{dispatch:>10.2f}{ms:>8.2f}{single / ms / count:>12.2f}"
+            f"{moved / ms / 1e6:>7.0f}"
+        )
+    for name, span in spans.items():
+        print(f"    {name:<24}{span:>8.2f} ms on {count} threads")
+
+
 def draw(found: dict[str, list[Point]], path: Path) -> None:
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), constrained_layout=True)
     for axis, (name, points) in zip(axes, found.items(), strict=True):
@@ -101,7 +215,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--model", action="store_true")
+    parser.add_argument("--splats", type=int, default=SPLATS, help="of the model")
     options = parser.parse_args()
+    if options.model:
+        model(options.splats, options.repeats)
+        return
     found = series(options.repeats)
     if options.out:
         draw(found, options.out)

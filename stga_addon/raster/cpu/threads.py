@@ -49,17 +49,23 @@ def parallel(units: Callable[..., int], pieces: int = PIECES_PER_THREAD) -> Call
     return decorate
 
 
+def cut(units: int, pieces: int = PIECES_PER_THREAD) -> list[tuple[int, int]]:
+    """First and past-the-last unit of each piece of work, `pieces` a thread."""
+    size = max(1, -(-units // (pieces * _threads)))
+    return [(begin, min(begin + size, units)) for begin in range(0, units, size)]
+
+
 def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> None:
     if _threads == 1:
         kernel(0, units, *arguments)
         return
-    size = max(1, -(-units // (pieces * _threads)))
-    begins = iter(range(0, units, size))  # shared: under Python's lock, each piece is taken once
+    parts = cut(units, pieces)
+    remaining = iter(parts)  # shared: under Python's lock, each piece is taken once
     finished: SimpleQueue[BaseException | None] = SimpleQueue()
 
     def work() -> None:
-        for begin in begins:
-            kernel(begin, min(begin + size, units), *arguments)
+        for begin, end in remaining:
+            kernel(begin, end, *arguments)
 
     def assist() -> None:
         try:
@@ -69,7 +75,7 @@ def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> No
         else:
             finished.put(None)
 
-    helpers = min(_threads, -(-units // size)) - 1
+    helpers = min(_threads, len(parts)) - 1
     _start(helpers)
     for _ in range(helpers):
         _tasks.put(assist)
