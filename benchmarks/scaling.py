@@ -8,15 +8,14 @@ on an idle machine. Prints every figure, with the (splat, tile) pairs of the vie
 
 --model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into for N
 threads are timed one after the other (time of the thread, median of repeats) and given to N threads as `threads.py`
-does: each takes the next piece when it is free. Added are what lies between the kernels, and for each kernel the
-measured time to wake N − 1 threads and to hear of the last one's end. Cores are taken to be alike and memory to keep
-up: the last column is the bandwidth that this needs.
+does: each takes the next piece when it is free, and one at a time holds Python's lock to call a kernel. Added are what
+lies between the kernels, and for each kernel the measured time to wake N − 1 threads and to hear of the last one's end.
+Cores are taken to be alike and memory to keep up: the last column is the bandwidth that this needs.
 """
 
 import argparse
 import heapq
 import statistics
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -98,32 +97,59 @@ def series(repeats: int) -> dict[str, list[Point]]:
     return found
 
 
-def pieces_ms(step: Callable[[], object]) -> tuple[list[tuple[str, list[float]]], float]:
-    """Runs an iteration on this thread, cut as for the threads that are set. Returns every kernel's pieces, in order,
-    and what lies between the kernels, all in milliseconds of this thread.
-    """
-    kernels: list[tuple[str, list[float]]] = []
+@dataclass(frozen=True)
+class Kernel:
+    """A call of a kernel, in milliseconds: its pieces, and for how long each holds Python's lock to be called."""
 
-    def one_by_one(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> None:
+    name: str
+    pieces: list[float]
+    call: float
+
+
+def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
+    """Runs an iteration on this thread, cut as for the threads that are set. Returns its kernels, in order, and what
+    lies between them, in milliseconds of this thread.
+    """
+    found: list[Kernel] = []
+    aside = 0.0
+
+    def one_by_one(kernel: Any, parts: list[tuple[int, int]], arguments: tuple[Any, ...]) -> None:
+        nonlocal aside
+        begin = thread_time()
         times = []
-        for begin, end in kernel_threads.cut(units, pieces):
+        for first, past in parts:
             before = thread_time()
-            kernel(begin, end, *arguments)
+            kernel(first, past, *arguments)
             times.append(1e3 * (thread_time() - before))
-        kernels.append((kernel.__name__, times))
+        before = thread_time()
+        for _ in range(3):
+            kernel(0, 0, *arguments)
+        call = 1e3 * (thread_time() - before) / 3
+        found.append(Kernel(kernel.__name__, [max(call, ms) for ms in times], call))
+        aside += 1e3 * (thread_time() - begin)
 
     with patch.object(kernel_threads, "_run", one_by_one):
         before = thread_time()
         step()
         whole = 1e3 * (thread_time() - before)
-    return kernels, whole - sum(sum(times) for _, times in kernels)
+    return found, whole - aside
 
 
-def makespan(times: list[float], count: int) -> float:
-    """When the last of `count` threads is done, if each takes the next of these pieces as soon as it is free."""
-    free = [0.0] * count
-    for ms in times:
-        heapq.heapreplace(free, free[0] + ms)
+def span_ms(kernel: Kernel, count: int, two_threads: float, waking: float) -> float:
+    """How long a kernel takes `count` threads. Each takes the next piece as soon as it is free, and one at a time calls
+    the kernel; the calling thread first wakes the others, one after the other, and at the end hears of each.
+
+    two_threads: what a kernel without work costs on two threads; waking: what it takes to wake one.
+    """
+    helpers = min(count, len(kernel.pieces)) - 1
+    if not helpers:
+        return sum(kernel.pieces)
+    latency = two_threads - waking
+    free, lock = [helpers * waking, *(latency + n * waking for n in range(1, helpers + 1))], 0.0
+    heapq.heapify(free)
+    for ms in kernel.pieces:
+        lock = max(free[0], lock) + kernel.call
+        heapq.heapreplace(free, lock + ms - kernel.call)
     return max(free)
 
 
@@ -170,28 +196,30 @@ def model(splats: int, repeats: int) -> None:
     )
     moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
     two, waking = dispatch_ms(repeats), waking_ms()
-    print(f"a kernel on two threads {1e3 * two:.0f} µs, each further one {1e3 * waking:.1f} µs")
-    print(f"{'threads':>7}{'work':>8}{'between':>9}{'dispatch':>10}{'ms':>8}{'efficiency':>12}{'GB/s':>7}")
+    print(f"a kernel without work on two threads {1e3 * two:.0f} µs, to wake each further one {1e3 * waking:.1f} µs")
+    runs: dict[int, list[tuple[list[Kernel], float]]] = {count: [] for count in MODELLED_THREADS}
+    for _ in range(repeats + 2):
+        for count in runs:  # in turn, because the machine's speed changes
+            set_threads(count)
+            runs[count].append(kernels_of(lambda: backend.step(batch)))
+    print(f"{'threads':>7}{'work':>8}{'between':>9}{'ms':>8}{'efficiency':>12}{'GB/s':>7}")
     single = 0.0
-    for count in MODELLED_THREADS:
-        set_threads(count)
-        runs = [pieces_ms(lambda: backend.step(batch)) for _ in range(repeats + 2)][2:]
-        spans: dict[str, float] = defaultdict(float)
-        work = 0.0
-        for n, (name, _) in enumerate(runs[0][0]):
-            times = [statistics.median(run[0][n][1][k] for run in runs) for k in range(len(runs[0][0][n][1]))]
-            spans[name] += makespan(times, count)
-            work += sum(times)
-        between = statistics.median(run[1] for run in runs)
-        dispatch = len(runs[0][0]) * (two + (count - 2) * waking if count > 1 else 0.0)
-        ms = sum(spans.values()) + between + dispatch
+    for count, measured in runs.items():
+        kernels = [median_kernel(calls) for calls in zip(*(run[0] for run in measured[2:]), strict=True)]
+        between = statistics.median(run[1] for run in measured[2:])
+        spans = [span_ms(kernel, count, two, waking) for kernel in kernels]
+        work, ms = sum(sum(kernel.pieces) for kernel in kernels), sum(spans) + between
         single = single or ms
-        print(
-            f"{count:>7}{work:>8.2f}{between:>9.2f}{dispatch:>10.2f}{ms:>8.2f}{single / ms / count:>12.2f}"
-            f"{moved / ms / 1e6:>7.0f}"
-        )
-    for name, span in spans.items():
-        print(f"    {name:<24}{span:>8.2f} ms on {count} threads")
+        print(f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{single / ms / count:>12.2f}{moved / ms / 1e6:>7.0f}")
+    for kernel, span in zip(kernels, spans, strict=True):
+        share = sum(kernel.pieces) / span / count
+        print(f"    {kernel.name:<24}{span:>8.2f} ms on {count} threads, busy for {share:.2f} of it")
+
+
+def median_kernel(calls: tuple[Kernel, ...]) -> Kernel:
+    """Several runs of the same call as one."""
+    pieces = [statistics.median(times) for times in zip(*(call.pieces for call in calls), strict=True)]
+    return Kernel(calls[0].name, pieces, statistics.median(call.call for call in calls))
 
 
 def draw(found: dict[str, list[Point]], path: Path) -> None:

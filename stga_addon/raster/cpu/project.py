@@ -11,12 +11,12 @@ from . import jit, part_jit
 from . import splat_block as block
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
-from .threads import parallel
+from .threads import EVEN_PIECES, parallel
 
 COLUMN = np.uint64(BLOCK_SPLATS)
 
 
-@parallel(lambda origin, *_: len(origin))
+@parallel(lambda origin, *_: len(origin), EVEN_PIECES, least=4096)
 @jit
 def compose_frames(begin, end, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
     """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin = turn @ origin +
@@ -106,7 +106,7 @@ def _mark_seen(rows, rendered, rect, b):
     return count
 
 
-@parallel(lambda rows, *_: len(rows))
+@parallel(lambda rows, *_: len(rows), EVEN_PIECES)
 @jit
 def project_forward(
     begin, end, rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection
@@ -220,7 +220,7 @@ def _store_gradient(rows, b, gradients, screen_gradient):
         log_scale[i, 2], screen_gradient[i] = b[block.V_LOG_2 + q], b[block.V_SCREEN + q]
 
 
-@parallel(lambda visible, *_: len(visible))
+@parallel(lambda visible, *_: len(visible), EVEN_PIECES)
 @jit
 def project_backward(
     begin, end, visible, splats, face, frames, degree, depth_as_color, antialiased,
