@@ -17,6 +17,8 @@ from .threads import pieces_of
 from .tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, list_visible, mark_tiles
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
+RUN_TILES = 4
+"""Tiles in a row that the same thread renders one after the other."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +236,7 @@ def _dilate(tiles: np.ndarray, reach: int) -> np.ndarray:
 
 
 def interleave_tiles(tiles: np.ndarray) -> np.ndarray:
-    """Reorder tiles so that each thread's pieces of work are spread over the whole image, which balances the load."""
-    pieces = pieces_of()
-    return np.concatenate([tiles[k::pieces] for k in range(pieces)])
+    """Reorder tiles so that each thread's pieces of work are spread over the whole image, which balances the load; in
+    runs of neighbors, which share splats."""
+    pieces = np.arange(len(tiles)) // RUN_TILES % pieces_of()
+    return np.asarray(tiles[np.argsort(pieces, kind="stable")])
